@@ -1,0 +1,372 @@
+"""What does a scenario say, and is it sound?
+
+A scenario is a folder with a ``scenario.toml`` and the files that it names. The frozen models below are its only
+definition: each key with its unit in its name, each default written once. ``data_schemas/scenario.schema.json`` is made from them.
+
+Steps of :func:`load`: read the TOML file, lay the ``--set`` overrides over it, validate. Files that it names are
+found relative to the folder; ``$SUMO_HOME/`` in front names a file that SUMO ships.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib.util
+import json
+import os
+import tomllib
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, model_validator
+
+from pipeline.errors import InputError, MissingBackendError
+from pipeline.grid import Grid, Roi
+
+FILE = "scenario.toml"
+_SUMO = "$SUMO_HOME/"
+
+Positive = Annotated[float, Field(gt=0)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Point2 = tuple[float, float]
+Point3 = tuple[float, float, float]
+Name = Annotated[str, Field(min_length=1, pattern=r"^[^\s/\\:*?\"<>|]+$")]
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class RoiModel(_Model):
+    """The region of interest, a box in the world frame, and the voxels that it is cut into."""
+
+    center_m: Point3 = Field(description="Centre of the box, world frame (x east, y north, z up)")
+    size_m: tuple[Positive, Positive, Positive] = Field(description="Size along x, y, z; a whole number of voxels each")
+    voxel_m: Positive = Field(0.25, description="Edge length of a voxel")
+
+    @property
+    def box(self) -> Roi:
+        """The box alone, without voxels."""
+        return Roi.around(self.center_m, self.size_m)
+
+    @property
+    def grid(self) -> Grid:
+        """The box cut into voxels; raises InputError when they do not fit."""
+        return Grid.over(self.box, self.voxel_m)
+
+
+class VehicleKind(_Model):
+    """One row of the fleet: a SUMO vType with its real size and its share of the trips."""
+
+    name: Name = Field(description="Identifier of the SUMO vType; for a finished FCD file, the type that it names")
+    vclass: str = Field("passenger", description="SUMO vClass")
+    share: Positive = Field(1.0, description="Share of the trips, relative to the other kinds")
+    length_m: Positive
+    width_m: Positive
+    height_m: Positive
+    attributes: dict[str, str | float] = Field(
+        default_factory=dict, description="Further attributes of the SUMO vType, under SUMO's own names"
+    )
+
+
+_FLEET = (
+    VehicleKind(name="car", share=0.78, length_m=4.5, width_m=1.75, height_m=1.5),
+    VehicleKind(name="van", vclass="delivery", share=0.12, length_m=4.9, width_m=1.9, height_m=2.1),
+    VehicleKind(name="truck", vclass="truck", share=0.07, length_m=7.6, width_m=2.3, height_m=3.0),
+    VehicleKind(name="bus", vclass="bus", share=0.03, length_m=10.9, width_m=2.5, height_m=3.1),
+)
+
+
+class TrafficModel(_Model):
+    """Where vehicles come from: a network (with drawn or given demand), a SUMO configuration, or a finished FCD file."""
+
+    network: str | None = Field(None, description="A .net.xml(.gz); may start with $SUMO_HOME/")
+    routes: tuple[str, ...] = Field((), description="Route files for the network; none: trips are drawn between its fringe edges")
+    sumocfg: str | None = Field(None, description="A .sumocfg that names network and demand")
+    fcd: str | None = Field(None, description="A finished FCD file (XML, CSV or Parquet, may be gzipped); nothing is simulated")
+    vehicles: int = Field(50, ge=1, description="Vehicles in the whole network at all times")
+    hold: Literal["exactly", "at_most"] = Field("exactly", description="Whether a frame with fewer vehicles is an error")
+    frames: int = Field(5000, ge=1, le=2**32 - 1, description="Frames to record")
+    frame_period_s: Positive = Field(0.25, description="Time between two frames; a whole number of steps")
+    step_s: Positive = Field(0.25, description="SUMO's step length")
+    warmup_s: float = Field(300.0, ge=0, description="Time before the first frame")
+    lateral_resolution_m: float = Field(0.8, ge=0, description="SUMO's sublane width; 0 makes lane changes instant jumps")
+    trips_per_s: Positive = Field(4.0, description="Rate of drawn trips; more than the network takes, so that N is held")
+    max_depart_delay_s: Positive = Field(120.0, description="A trip that could not start for so long is given up")
+    min_trip_m: float = Field(0.0, ge=0, description="Drawn trips are at least so long as the crow flies")
+    kinds: tuple[VehicleKind, ...] = Field(_FLEET, min_length=1, description="The fleet of drawn trips; the sizes in a finished FCD file")
+
+    @model_validator(mode="after")
+    def _one_source(self) -> TrafficModel:
+        given = [key for key in ("network", "sumocfg", "fcd") if getattr(self, key) is not None]
+        if len(given) != 1:
+            raise ValueError(f"exactly one of network, sumocfg and fcd is needed, found {' and '.join(given) or 'none'}")
+        names = [kind.name for kind in self.kinds]
+        if len(set(names)) != len(names):
+            raise ValueError(f"two kinds have the same name: {', '.join(sorted({n for n in names if names.count(n) > 1}))}")
+        return self
+
+    def idle_keys(self) -> tuple[str, set[str]]:
+        """The source of the traffic, and the keys that the user set although they act on nothing with this source."""
+        drawn = {"trips_per_s", "min_trip_m", "kinds"}
+        simulated = {"vehicles", "hold", "step_s", "lateral_resolution_m", "max_depart_delay_s"}
+        if self.fcd is not None:
+            return "fcd", self.model_fields_set & ({"routes"} | simulated | drawn - {"kinds"})
+        if self.sumocfg is not None:
+            return "sumocfg", self.model_fields_set & ({"routes"} | drawn)
+        return "routes", self.model_fields_set & (drawn if self.routes else set())
+
+
+class MeshModel(_Model):
+    """A triangle mesh that trimesh loads (PLY, OBJ, STL, GLB), in metres, z up."""
+
+    file: str
+    offset_m: Point3 = Field((0.0, 0.0, 0.0), description="Added to every vertex to reach the world frame")
+    kind: str = Field("mesh", description="Shown in messages and in the report")
+
+
+class StaticsModel(_Model):
+    """The static world."""
+
+    footprints: tuple[str, ...] = Field((), description="GeoJSON files in world-frame metres; features have height_m and may have base_m, radius_m")
+    polygons: tuple[str, ...] = Field((), description="SUMO .poly.xml files")
+    polygon_height_m: Positive = Field(9.0, description="Height of polygons that name none")
+    meshes: tuple[MeshModel, ...] = ()
+    ground: bool = Field(True, description="A ground plane at z = 0")
+
+
+class TpogModel(_Model):
+    """How frames are counted."""
+
+    blocks: int = Field(10, ge=1, le=65535, description="Blocks of consecutive frames; divides traffic.frames")
+
+
+class SensorModel(_Model):
+    """A sensor of the user's. Elevations are listed, or uniform between two when ``channels`` is given."""
+
+    elevations_deg: tuple[Annotated[float, Field(ge=-90, le=90)], ...] = Field(min_length=1, description="One a ring; or the first and the last of `channels` uniform ones")
+    channels: int | None = Field(None, ge=1, description="Rings, uniform between two elevations_deg")
+    azimuth_offsets_deg: tuple[float, ...] = Field((), description="One a ring, added to each azimuth; none: all 0")
+    azimuth_step_deg: Positive = Field(description="Divides 360")
+    range_m: Positive
+
+    @model_validator(mode="after")
+    def _consistent(self) -> SensorModel:
+        listed = len(self.elevations_deg)
+        if self.channels not in (None, listed) and listed != 2:
+            raise ValueError(f"channels = {self.channels} needs elevations_deg with 2 values (uniform) or {self.channels}, found {listed}")
+        rings = self.channels or listed
+        if self.azimuth_offsets_deg and len(self.azimuth_offsets_deg) != rings:
+            raise ValueError(f"azimuth_offsets_deg has {len(self.azimuth_offsets_deg)} values, one for each of {rings} rings is needed")
+        turns = 360.0 / self.azimuth_step_deg
+        if abs(turns - round(turns)) > 1e-9 * turns:
+            raise ValueError(f"azimuth_step_deg = {self.azimuth_step_deg:g} does not divide 360")
+        return self
+
+
+class SiteGrid(_Model):
+    """Sites on a square lattice."""
+
+    low_m: Point2 = Field(description="South-west corner, where the first site stands")
+    high_m: Point2 = Field(description="No site beyond this corner")
+    spacing_m: Positive
+    heights_m: tuple[Positive, ...] = Field(min_length=1)
+
+
+class SiteLine(_Model):
+    """Sites along a line, the first at its start."""
+
+    line_m: tuple[Point2, ...] = Field(min_length=2)
+    spacing_m: Positive
+    heights_m: tuple[Positive, ...] = Field(min_length=1)
+
+
+class SitesModel(_Model):
+    """Candidate sites: a file, or a rule. Pose and sensor below hold for every site that names none of its own."""
+
+    file: str | None = Field(None, description="CSV (site, x_m, y_m, z_m, ...) or GeoJSON points")
+    grid: SiteGrid | None = None
+    along: tuple[SiteLine, ...] = ()
+    points: str | None = Field(None, description="A measured empty scan (PCD, PLY, LAS, LAZ, CSV; world frame) of the only site")
+    sensor: str = Field("VLP-32C", description="A name from `egvs sensors` or from [sensors]")
+    yaw_deg: float = Field(0.0, description="The sensor's x axis, counter-clockwise from +x")
+    pitch_deg: float = Field(0.0, ge=-90, le=90, description="Nose up positive")
+    roll_deg: float = 0.0
+
+    @model_validator(mode="after")
+    def _one_source(self) -> SitesModel:
+        given = [key for key in ("file", "grid", "along") if getattr(self, key)]
+        if len(given) != 1:
+            raise ValueError(f"exactly one of file, grid and along is needed, found {' and '.join(given) or 'none'}")
+        return self
+
+
+class ScanModel(_Model):
+    """How empty scans are kept."""
+
+    keep: bool = Field(True, description="false: no scans.parquet; score casts as it goes, for sweeps over thousands of sites")
+
+
+class ScoreModel(_Model):
+    """How a site is scored."""
+
+    gamma: float = Field(10.0, ge=0, allow_inf_nan=True, description="Beams in a voxel above this number count no more; may be inf")
+    keep_visibility: tuple[str, ...] | Literal["all"] = Field((), description="Sites whose hits in every voxel are written to visibility.parquet")
+
+
+class Scenario(_Model):
+    """Everything that a run depends on. Made by :func:`load`."""
+
+    name: Name = Field("", min_length=0, validate_default=False, description="Defaults to the folder's name")
+    description: str = ""
+    seed: int = Field(0, ge=0, le=2**63 - 1, description="The one seed; all randomness derives from it")
+    roi: RoiModel
+    traffic: TrafficModel
+    statics: StaticsModel = StaticsModel()
+    tpog: TpogModel = TpogModel()
+    sites: SitesModel
+    sensors: dict[str, SensorModel] = Field(default_factory=dict)
+    scan: ScanModel = ScanModel()
+    score: ScoreModel = ScoreModel()
+
+    _folder: Path = PrivateAttr(default=Path())
+
+    @model_validator(mode="after")
+    def _across(self) -> Scenario:
+        if self.traffic.frames % self.tpog.blocks:
+            raise ValueError(f"tpog.blocks = {self.tpog.blocks} does not divide traffic.frames = {self.traffic.frames}")
+        return self
+
+    @property
+    def folder(self) -> Path:
+        """The folder that relative file names start from."""
+        return self._folder
+
+    @property
+    def file(self) -> Path:
+        """The scenario file, for messages."""
+        return self._folder / FILE
+
+    def find(self, name: str, key: str) -> Path:
+        """The file ``name`` that the scenario names under ``key``; InputError when it is not there."""
+        if name.startswith(_SUMO):
+            path = sumo_home() / name.removeprefix(_SUMO)
+        else:
+            path = self._folder / name
+        if not path.is_file():
+            raise InputError(f"{self.file}: {key} = {name!r}", f"no such file ({path})", "a path relative to the scenario's folder")
+        return path
+
+
+def sumo_home() -> Path:
+    """SUMO's home: the environment's SUMO_HOME, else the installed wheel's."""
+    if home := os.environ.get("SUMO_HOME"):
+        return Path(home)
+    spec = importlib.util.find_spec("sumo")
+    if spec is None or not spec.submodule_search_locations:
+        raise MissingBackendError("SUMO is not installed: set SUMO_HOME, or pip install eclipse-sumo")
+    return Path(spec.submodule_search_locations[0])
+
+
+def load(path: str | Path, overrides: Iterable[str] = ()) -> Scenario:
+    """Read and check a scenario.
+
+    Parameters
+    ----------
+    path
+        The folder, or its ``scenario.toml``.
+    overrides
+        ``"key.key=value"``, the value as in TOML (a bare word is taken as a string).
+
+    Raises
+    ------
+    InputError
+        Naming file, key, value, and what would be right.
+    """
+    path = Path(path)
+    file = path / FILE if path.is_dir() else path
+    if not file.is_file():
+        raise InputError(path, f"no {FILE} there", f"a folder with a {FILE}, or the file itself")
+    try:
+        values = tomllib.loads(file.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(file, f"is not valid TOML: {error}") from None
+    for override in overrides:
+        _lay_over(values, override)
+    scenario = from_values(values, file.parent, str(file))
+    source, idle = scenario.traffic.idle_keys()
+    if idle:
+        raise InputError(f"{file}: traffic", f"{', '.join(sorted(idle))} would act on nothing beside {source}", "remove it")
+    return scenario
+
+
+def from_values(values: dict[str, Any], folder: Path, place: str) -> Scenario:
+    """Check a scenario that is at hand as nested values (as ``run.json`` holds it)."""
+    values.setdefault("name", folder.resolve().name)
+    try:
+        scenario = Scenario.model_validate(values)
+    except ValidationError as error:
+        raise _explain(error, place) from None
+    scenario._folder = folder
+    Grid.over(scenario.roi.box, scenario.roi.voxel_m, f"{place}: roi")
+    return scenario
+
+
+def json_schema() -> str:
+    """The JSON Schema that editors use to complete and check a scenario.toml."""
+    return json.dumps(Scenario.model_json_schema(), indent=2, ensure_ascii=False) + "\n"
+
+
+def _lay_over(values: dict[str, Any], override: str) -> None:
+    key, equals, text = override.partition("=")
+    if not equals or not key.strip():
+        raise InputError(f"--set {override}", "no key=value", "for example --set traffic.frames=500")
+    try:
+        value = tomllib.loads(f"v = {text}")["v"]
+    except tomllib.TOMLDecodeError:
+        value = text
+    *parents, last = key.strip().split(".")
+    for parent in parents:
+        values = values.setdefault(parent, {})
+        if not isinstance(values, dict):
+            raise InputError(f"--set {override}", f"'{parent}' is not a table", "a key that the scenario knows")
+    values[last] = value
+
+
+def _explain(error: ValidationError, place: str) -> InputError:
+    """One line for each thing that is wrong: key, value, what would be right."""
+    lines = []
+    for item in error.errors():
+        key = ".".join(str(part) for part in item["loc"])
+        if item["type"] == "extra_forbidden":
+            lines.append((key, "unknown key", _nearest(item["loc"])))
+        elif item["type"] == "missing":
+            lines.append((key, "missing", "this key is needed"))
+        elif item["type"] == "value_error":
+            lines.append((key or "scenario", str(item["ctx"]["error"]), ""))
+        else:
+            lines.append((key, f"{item['input']!r}", item["msg"][0].lower() + item["msg"][1:]))
+    key, found, right = lines[0]
+    more = "".join(f"\n{place}: {k}: {f}" + (f"; {r}" if r else "") for k, f, r in lines[1:])
+    return InputError(f"{place}: {key}", found, right + more)
+
+
+def _nearest(loc: Sequence[str | int]) -> str:
+    """What the user may have meant by an unknown key."""
+    model: Any = Scenario
+    for part in loc[:-1]:
+        if isinstance(part, str) and isinstance(model, type) and part in model.model_fields:
+            model = _model_of(model.model_fields[part].annotation)
+    known = sorted(model.model_fields) if isinstance(model, type) else []
+    near = difflib.get_close_matches(str(loc[-1]), known, 1, 0.5)
+    return f"did you mean {near[0]}?" if near else f"known here are {', '.join(known)}"
+
+
+def _model_of(annotation: Any) -> Any:
+    """The model inside an annotation such as ``tuple[SiteLine, ...]`` or ``SiteGrid | None``."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    for inner in getattr(annotation, "__args__", ()):
+        if found := _model_of(inner):
+            return found
+    return None

@@ -1,0 +1,51 @@
+"""What does every stage promise?
+
+A stage is a module = a verb of the command line = an artefact. It has
+
+- ``NAME`` and ``ARTEFACTS``: the verb, and the files that it may write into the run's folder;
+- ``inputs(scenario, out)``: a JSON value with everything that the stage reads (settings by value, files by sha256). Two
+  runs with equal inputs write equal bytes, so a stage whose inputs did not change is skipped;
+- ``run(scenario, out, ...)``: reads files, writes files, returns a small JSON value that says what came out.
+
+A stage imports no other stage.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import Any
+
+from pipeline import schemas, tables
+from pipeline.scenario import Scenario
+
+Progress = Callable[[str, int, int], None]
+"""Called with (what is counted, done, total) as work goes on, from any thread."""
+
+
+def silent(_what: str, _done: int, _total: int) -> None:
+    """A :data:`Progress` that shows nothing."""
+
+
+def threads(jobs: int | None) -> int:
+    """How many threads to use: as asked, else one a core that this process may use."""
+    if jobs is not None:
+        return max(1, jobs)
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def metadata(scenario: Scenario, inputs: dict[str, Any], **more: Any) -> dict[str, Any]:
+    """The metadata that every artefact carries.
+
+    ``scenario.hash`` covers the settings that this artefact depends on, ``inputs`` also the files: a setting that the stage
+    does not read changes no byte.
+    """
+    return {
+        "schema": schemas.VERSION,
+        "scenario": {"name": scenario.name, "hash": tables.hash_of(inputs.get("settings", {}))},
+        "inputs": tables.hash_of(inputs),
+        "seed": scenario.seed,
+        **more,
+    }

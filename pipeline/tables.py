@@ -1,0 +1,159 @@
+"""How do artefacts get onto disk whole, and back?
+
+The only module that reads and writes Parquet, and the only one that knows how a file is written: aside first
+(``.<name>.partial``), then renamed, so that a killed run leaves no half-written artefact.
+
+Metadata is one JSON object under the Parquet key ``egvs``. Nothing in a file depends on the clock, the machine, the number
+of threads or the path.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from pipeline import schemas
+from pipeline.errors import InputError
+
+_KEY = b"egvs"
+_WRITE = {"compression": "zstd", "compression_level": 3, "version": "2.6", "write_statistics": True}
+
+
+class TableWriter:
+    """Writes one artefact in pieces, each a row group. Made by :func:`writer`."""
+
+    def __init__(self, file: pq.ParquetWriter, schema: pa.Schema) -> None:
+        self._file, self._schema = file, schema
+
+    def write(self, columns: dict[str, Any]) -> None:
+        """Append one row group. ``columns`` maps every column's name to an array of equal length."""
+        arrays = [pa.array(columns[f.name], type=f.type) for f in self._schema]
+        table = pa.Table.from_arrays(arrays, schema=self._schema)
+        self._file.write_table(table, row_group_size=max(1, table.num_rows))
+
+    def describe(self, metadata: dict[str, Any]) -> None:
+        """Set the artefact's metadata; may be called last, when the rows are known."""
+        self._file.add_key_value_metadata({_KEY: _dump(metadata)})
+
+
+@contextmanager
+def writer(path: Path, artefact: str) -> Iterator[TableWriter]:
+    """Open an artefact for writing in pieces; the file appears under its name only when all went well."""
+    schema = schemas.arrow_schema(artefact)
+    strings = [f.name for f in schema if f.type == pa.string()]
+    with aside(path) as partial, pq.ParquetWriter(partial, schema, use_dictionary=strings, **_WRITE) as file:
+        yield TableWriter(file, schema)
+
+
+def write(path: Path, artefact: str, columns: dict[str, Any], metadata: dict[str, Any]) -> None:
+    """Write one artefact whole, as one row group."""
+    with writer(path, artefact) as out:
+        out.write(columns)
+        out.describe(metadata)
+
+
+def read(path: Path, artefact: str, columns: list[str] | None = None) -> tuple[pa.Table, dict[str, Any]]:
+    """Read an artefact: its Arrow table and its metadata.
+
+    Raises
+    ------
+    InputError
+        When the file is missing, corrupt, or does not have the artefact's columns and types.
+    """
+    with reader(path, artefact) as (file, metadata):
+        try:
+            return file.read(columns=columns, use_threads=False), metadata
+        except (pa.ArrowInvalid, OSError) as error:
+            raise _corrupt(path, error) from None
+
+
+@contextmanager
+def reader(path: Path, artefact: str) -> Iterator[tuple[pq.ParquetFile, dict[str, Any]]]:
+    """Open an artefact to read its row groups one by one; checks as :func:`read` does."""
+    if not path.is_file():
+        raise InputError(path, "no such file", f"run the stage that makes {path.name} first")
+    try:
+        file = pq.ParquetFile(path)
+    except (pa.ArrowInvalid, OSError) as error:
+        raise _corrupt(path, error) from None
+    with file:
+        _check_columns(path, artefact, file.schema_arrow)
+        raw = (file.metadata.metadata or {}).get(_KEY)
+        if raw is None:
+            raise InputError(path, "no metadata under the key 'egvs'", f"a {artefact} file written by egvs")
+        metadata = json.loads(raw)
+        if metadata.get("schema") != schemas.VERSION:
+            raise InputError(path, f"schema version {metadata.get('schema')}", f"version {schemas.VERSION}")
+        yield file, metadata
+
+
+def read_group(file: pq.ParquetFile, group: int, path: Path, columns: list[str] | None = None) -> pa.Table:
+    """Read one row group of an open artefact."""
+    try:
+        return file.read_row_group(group, columns=columns, use_threads=False)
+    except (pa.ArrowInvalid, OSError) as error:
+        raise _corrupt(path, error) from None
+
+
+def read_metadata(path: Path, artefact: str) -> dict[str, Any]:
+    """The JSON object under the key ``egvs`` alone."""
+    with reader(path, artefact) as (_, metadata):
+        return metadata
+
+
+@contextmanager
+def aside(path: Path) -> Iterator[Path]:
+    """Yield a path to write to; rename it to ``path`` when the block ends well, remove it when it does not."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        yield partial
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise
+    partial.replace(path)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file whole or not at all (UTF-8, line ends as given)."""
+    with aside(path) as partial:
+        partial.write_bytes(text.encode("utf-8"))
+
+
+def sha256_of(path: Path) -> str:
+    """Hex digest of a file's bytes."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def hash_of(value: Any) -> str:
+    """Hex digest of a JSON value, independent of the order of its keys."""
+    return hashlib.sha256(_dump(value)).hexdigest()
+
+
+def _dump(value: Any) -> bytes:
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False).encode("utf-8")
+
+
+def _check_columns(path: Path, artefact: str, found: pa.Schema) -> None:
+    wanted = schemas.arrow_schema(artefact)
+    for field in wanted:
+        index = found.get_field_index(field.name)
+        if index < 0:
+            raise InputError(path, f"column '{field.name}' is missing", f"the columns {', '.join(wanted.names)}")
+        if found.field(index).type != field.type:
+            raise InputError(path, f"column '{field.name}' is {found.field(index).type}", f"{field.type}")
+    extra = sorted(set(found.names) - set(wanted.names))
+    if extra:
+        raise InputError(path, f"unknown columns {', '.join(extra)}", f"the columns {', '.join(wanted.names)}")
+
+
+def _corrupt(path: Path, error: Exception) -> InputError:
+    return InputError(path, f"cannot be read as Parquet ({str(error).splitlines()[0]})", "a whole file; make it again")
