@@ -87,7 +87,8 @@ class Grid:
 
     def to_grid_m(self, points_world_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """World positions (..., 3) in metres, float64 -> positions in the grid's frame in metres, float64."""
-        return np.asarray(points_world_m, dtype=np.float64) - np.asarray(self.origin_m)
+        moved: NDArray[np.float64] = np.asarray(points_world_m, dtype=np.float64) - np.asarray(self.origin_m)
+        return moved
 
     def to_json(self) -> dict[str, Any]:
         """The form that the artefacts' metadata holds."""

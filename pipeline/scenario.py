@@ -94,7 +94,13 @@ class TrafficModel(_Model):
     trips_per_s: Positive = Field(4.0, description="Rate of drawn trips; more than the network takes, so that N is held")
     max_depart_delay_s: Positive = Field(120.0, description="A trip that could not start for so long is given up")
     min_trip_m: float = Field(0.0, ge=0, description="Drawn trips are at least so long as the crow flies")
-    kinds: tuple[VehicleKind, ...] = Field(_FLEET, min_length=1, description="The fleet of drawn trips; the sizes in a finished FCD file")
+    edge_weights: dict[str, Annotated[float, Field(ge=0)]] = Field(
+        default_factory=dict,
+        description="Drawn trips that start or end at an edge, relative to others; its number of lanes if not named",
+    )
+    kinds: tuple[VehicleKind, ...] = Field(
+        _FLEET, min_length=1, description="The fleet of drawn trips; the sizes in a finished FCD file"
+    )
 
     @model_validator(mode="after")
     def _one_source(self) -> TrafficModel:
@@ -108,7 +114,7 @@ class TrafficModel(_Model):
 
     def idle_keys(self) -> tuple[str, set[str]]:
         """The source of the traffic, and the keys that the user set although they act on nothing with this source."""
-        drawn = {"trips_per_s", "min_trip_m", "kinds"}
+        drawn = {"trips_per_s", "min_trip_m", "edge_weights", "kinds"}
         simulated = {"vehicles", "hold", "step_s", "lateral_resolution_m", "max_depart_delay_s"}
         if self.fcd is not None:
             return "fcd", self.model_fields_set & ({"routes"} | simulated | drawn - {"kinds"})
@@ -128,7 +134,9 @@ class MeshModel(_Model):
 class StaticsModel(_Model):
     """The static world."""
 
-    footprints: tuple[str, ...] = Field((), description="GeoJSON files in world-frame metres; features have height_m and may have base_m, radius_m")
+    footprints: tuple[str, ...] = Field(
+        (), description="GeoJSON files in world-frame metres; features have height_m and may have base_m, radius_m"
+    )
     polygons: tuple[str, ...] = Field((), description="SUMO .poly.xml files")
     polygon_height_m: Positive = Field(9.0, description="Height of polygons that name none")
     meshes: tuple[MeshModel, ...] = ()
@@ -144,7 +152,9 @@ class TpogModel(_Model):
 class SensorModel(_Model):
     """A sensor of the user's. Elevations are listed, or uniform between two when ``channels`` is given."""
 
-    elevations_deg: tuple[Annotated[float, Field(ge=-90, le=90)], ...] = Field(min_length=1, description="One a ring; or the first and the last of `channels` uniform ones")
+    elevations_deg: tuple[Annotated[float, Field(ge=-90, le=90)], ...] = Field(
+        min_length=1, description="One a ring; or the first and the last of `channels` uniform ones"
+    )
     channels: int | None = Field(None, ge=1, description="Rings, uniform between two elevations_deg")
     azimuth_offsets_deg: tuple[float, ...] = Field((), description="One a ring, added to each azimuth; none: all 0")
     azimuth_step_deg: Positive = Field(description="Divides 360")
@@ -154,10 +164,14 @@ class SensorModel(_Model):
     def _consistent(self) -> SensorModel:
         listed = len(self.elevations_deg)
         if self.channels not in (None, listed) and listed != 2:
-            raise ValueError(f"channels = {self.channels} needs elevations_deg with 2 values (uniform) or {self.channels}, found {listed}")
+            raise ValueError(
+                f"channels = {self.channels} needs elevations_deg with 2 values (uniform) or {self.channels}, found {listed}"
+            )
         rings = self.channels or listed
         if self.azimuth_offsets_deg and len(self.azimuth_offsets_deg) != rings:
-            raise ValueError(f"azimuth_offsets_deg has {len(self.azimuth_offsets_deg)} values, one for each of {rings} rings is needed")
+            raise ValueError(
+                f"azimuth_offsets_deg has {len(self.azimuth_offsets_deg)} values, one for each of {rings} rings is needed"
+            )
         turns = 360.0 / self.azimuth_step_deg
         if abs(turns - round(turns)) > 1e-9 * turns:
             raise ValueError(f"azimuth_step_deg = {self.azimuth_step_deg:g} does not divide 360")
@@ -211,7 +225,9 @@ class ScoreModel(_Model):
     """How a site is scored."""
 
     gamma: float = Field(10.0, ge=0, allow_inf_nan=True, description="Beams in a voxel above this number count no more; may be inf")
-    keep_visibility: tuple[str, ...] | Literal["all"] = Field((), description="Sites whose hits in every voxel are written to visibility.parquet")
+    keep_visibility: tuple[str, ...] | Literal["all"] = Field(
+        (), description="Sites whose hits in every voxel are written to visibility.parquet"
+    )
 
 
 class Scenario(_Model):
@@ -353,16 +369,16 @@ def _explain(error: ValidationError, place: str) -> InputError:
 
 def _nearest(loc: Sequence[str | int]) -> str:
     """What the user may have meant by an unknown key."""
-    model: Any = Scenario
+    model: type[BaseModel] | None = Scenario
     for part in loc[:-1]:
-        if isinstance(part, str) and isinstance(model, type) and part in model.model_fields:
-            model = _model_of(model.model_fields[part].annotation)
-    known = sorted(model.model_fields) if isinstance(model, type) else []
+        if model is not None and part in model.model_fields:
+            model = _model_of(model.model_fields[str(part)].annotation)
+    known = sorted(model.model_fields) if model is not None else []
     near = difflib.get_close_matches(str(loc[-1]), known, 1, 0.5)
     return f"did you mean {near[0]}?" if near else f"known here are {', '.join(known)}"
 
 
-def _model_of(annotation: Any) -> Any:
+def _model_of(annotation: Any) -> type[BaseModel] | None:
     """The model inside an annotation such as ``tuple[SiteLine, ...]`` or ``SiteGrid | None``."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation

@@ -45,6 +45,5 @@ def arrow_schema(artefact: str) -> pa.Schema:
     types = {"bool": pa.bool_()}
     fields = table_schema(artefact)["fields"]
     return pa.schema(
-        [pa.field(f["name"], types.get(f["arrow_type"]) or pa.type_for_alias(f["arrow_type"]), nullable=False)
-         for f in fields]
+        [pa.field(f["name"], types.get(f["arrow_type"]) or pa.type_for_alias(f["arrow_type"]), nullable=False) for f in fields]
     )

@@ -1,0 +1,60 @@
+"""What did a piece of work cost?
+
+Wall seconds, and the highest memory that the process held meanwhile (Linux lets the mark be reset; elsewhere it is the highest
+so far).
+"""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+_STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+
+
+@dataclass
+class Cost:
+    """Filled when the measured block ends."""
+
+    seconds: float = 0.0
+    peak_mb: float = 0.0
+
+    def to_json(self) -> dict[str, Any]:
+        """Rounded to what such a measurement is worth."""
+        return {"seconds": round(self.seconds, 3), "peak_mb": round(self.peak_mb, 1)}
+
+
+@contextmanager
+def measured() -> Iterator[Cost]:
+    """Measure the block; the yielded cost is filled at its end."""
+    cost, resettable = Cost(), _reset()
+    start = time.perf_counter()
+    try:
+        yield cost
+    finally:
+        cost.seconds = time.perf_counter() - start
+        cost.peak_mb = _high_water_mb() if resettable else _peak_so_far_mb()
+
+
+def _reset() -> bool:
+    try:
+        _RESET.write_text("5")
+    except OSError:
+        return False
+    return True
+
+
+def _high_water_mb() -> float:
+    line = next(line for line in _STATUS.read_text().splitlines() if line.startswith("VmHWM:"))
+    return int(line.split()[1]) / 1024
+
+
+def _peak_so_far_mb() -> float:
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1024 * 1024 if sys.platform == "darwin" else 1024)

@@ -1,0 +1,297 @@
+"""How does SUMO's point on a front bumper become a box, and how do the boxes of a recording behave?
+
+SUMO gives x, y (and z on networks with heights) of the middle of the front bumper, an angle a in degrees clockwise from
+north, and a slope p in degrees, uphill positive. The box of length L and height H has its centre at
+
+    front - L/2 (sin a cos p, cos a cos p, sin p) + (0, 0, H/2),      yaw = 90 deg - a,      pitch = p
+
+in the world frame (x east, y north, z up; yaw counter-clockwise from +x, in (-pi, pi]). Sines and cosines are taken of
+degrees, exact at multiples of 90. Positions are rounded to 1 micrometre, angles to 1 nanoradian.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from pipeline.errors import InputError
+from pipeline.fcd import Group
+
+STANDING_M_S = 0.1
+"""A vehicle slower than this stands."""
+
+_SHRINK_M = 1e-3
+_POSITION_DIGITS, _ANGLE_DIGITS = 6, 9
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Size:
+    """Size and vClass of a vehicle type."""
+
+    length_m: float
+    width_m: float
+    height_m: float
+    vclass: str
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """Vehicle boxes of consecutive frames, sorted by frame, then vehicle. Arrays have one element a row."""
+
+    first_frame: int
+    frames: int
+    frame: Ints
+    names: list[str]
+    code: Ints
+    """Position in ``names``, which is sorted."""
+    kinds: list[str]
+    kind: Ints
+    x_m: Floats
+    y_m: Floats
+    z_m: Floats
+    yaw_rad: Floats
+    pitch_rad: Floats
+    length_m: Floats
+    width_m: Floats
+    height_m: Floats
+    speed_m_s: Floats
+    """NaN where unknown."""
+
+    def columns(self) -> dict[str, Any]:
+        """As the artefact ``trajectories`` has them."""
+        n = self.frame.size
+        return {
+            "frame": self.frame.astype(np.uint32),
+            "part": np.zeros(n, np.uint8),
+            "vehicle": _strings(self.names, self.code),
+            "kind": _strings(self.kinds, self.kind),
+            **{
+                name: getattr(self, name)
+                for name in ("x_m", "y_m", "z_m", "yaw_rad", "pitch_rad", "length_m", "width_m", "height_m")
+            },
+        }
+
+
+def boxes(group: Group, sizes: Mapping[str, Size], period_s: float, place: str) -> Boxes:
+    """The boxes of a group of whole frames.
+
+    Raises
+    ------
+    InputError
+        When a vehicle is of a type without a known size, or is twice in a frame.
+    """
+    names, code = _sorted_codes(group.rows["id"])
+    types, type_code = _sorted_codes(group.rows["type"])
+    for name in types:
+        if name not in sizes:
+            raise InputError(
+                place,
+                f"vehicle type {name!r} has no known size",
+                f"a kind of that name with length_m, width_m and height_m (known: {', '.join(sorted(sizes))})",
+            )
+    order = np.lexsort((code, group.frame))
+    frame, code, type_code = group.frame[order], code[order], type_code[order]
+    twice = np.flatnonzero((np.diff(frame) == 0) & (np.diff(code) == 0))
+    if twice.size:
+        raise InputError(
+            place, f"vehicle {names[code[twice[0]]]!r} is twice in frame {frame[twice[0]]}", "one row a vehicle a frame"
+        )
+    kinds = sorted({sizes[name].vclass for name in types})
+    kind = np.array([kinds.index(sizes[name].vclass) for name in types], dtype=np.int64)[type_code]
+    length, width, height = (
+        np.array([getattr(sizes[name], key) for name in types], dtype=np.float64)[type_code]
+        for key in ("length_m", "width_m", "height_m")
+    )
+    x, y, z, angle, slope, speed = (group.rows[key].to_numpy()[order] for key in ("x", "y", "z", "angle", "slope", "speed"))
+    centre = centres(x, y, z, angle, slope, length, height)
+    found = Boxes(
+        group.first_frame,
+        group.frames,
+        frame,
+        names,
+        code,
+        kinds,
+        kind,
+        *centre,
+        yaw_rad(angle),
+        _tidy(np.deg2rad(slope), _ANGLE_DIGITS),
+        length,
+        width,
+        height,
+        speed,
+    )
+    return found if not np.isnan(speed).any() else _with_speed(found, period_s)
+
+
+def centres(
+    x: Floats, y: Floats, z: Floats, angle_deg: Floats, slope_deg: Floats, length_m: Floats, height_m: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Front bumpers (n,) -> box centres (n,), metres, rounded to 1 micrometre."""
+    from scipy.special import cosdg, sindg
+
+    half, flat = length_m / 2, cosdg(slope_deg)
+    return (
+        _tidy(x - half * flat * sindg(angle_deg), _POSITION_DIGITS),
+        _tidy(y - half * flat * cosdg(angle_deg), _POSITION_DIGITS),
+        _tidy(z - half * sindg(slope_deg) + height_m / 2, _POSITION_DIGITS),
+    )
+
+
+def yaw_rad(angle_deg: Floats) -> Floats:
+    """Degrees clockwise from north -> radians counter-clockwise from +x, in (-pi, pi], rounded to 1 nanoradian."""
+    degrees = 90.0 - np.asarray(angle_deg, dtype=np.float64)
+    degrees = degrees - 360.0 * np.ceil((degrees - 180.0) / 360.0)
+    rounded = _tidy(np.deg2rad(degrees), _ANGLE_DIGITS)
+    # pi itself lies between two nanoradians, and the upper one is outside the interval
+    return np.where(np.abs(rounded) > np.pi, np.pi, rounded)
+
+
+def _tidy(values: Floats, digits: int) -> Floats:
+    """Rounded, and without negative zeros."""
+    return np.round(values, digits) + 0.0
+
+
+def _with_speed(found: Boxes, period_s: float) -> Boxes:
+    """Fill speeds that the file does not give from the way to the next frame, or from the last one where there is none."""
+    order = np.lexsort((found.frame, found.code))
+    follows = (np.diff(found.code[order]) == 0) & (np.diff(found.frame[order]) == 1)
+    way = np.hypot(np.diff(found.x_m[order]), np.diff(found.y_m[order])) / period_s
+    way = np.where(follows, way, np.nan)
+    onward, back = np.append(way, np.nan), np.insert(way, 0, np.nan)
+    speed = np.empty(order.size)
+    speed[order] = np.where(np.isnan(onward), back, onward)
+    speed = np.where(np.isnan(found.speed_m_s), speed, found.speed_m_s)
+    return Boxes(**{**found.__dict__, "speed_m_s": speed})
+
+
+def _sorted_codes(column: pa.ChunkedArray) -> tuple[list[str], Ints]:
+    """Different values, sorted by code point, and each row's position among them."""
+    encoded = column.combine_chunks().dictionary_encode()
+    if isinstance(encoded, pa.ChunkedArray):
+        encoded = encoded.combine_chunks()
+    values = encoded.dictionary.to_pylist()
+    order = sorted(range(len(values)), key=values.__getitem__)
+    rank = np.empty(len(values), dtype=np.int64)
+    rank[order] = np.arange(len(values))
+    return [values[i] for i in order], rank[encoded.indices.to_numpy(zero_copy_only=False).astype(np.int64)]
+
+
+def _strings(values: list[str], code: Ints) -> pa.Array:
+    return pa.array(values, type=pa.string()).take(pa.array(code))
+
+
+def overlapping(found: Boxes) -> NDArray[np.int64]:
+    """Pairs of rows (n, 2) in the same frame whose boxes, made 1 mm smaller on each side, share area and height.
+
+    Exact for rectangles (separating axes). Candidates come from sorting each frame by x: neighbours at distance 1, 2, ...
+    in that order are tried for as long as any pair is closer along x than the two largest diagonals reach.
+    """
+    if not found.frame.size:
+        return np.empty((0, 2), dtype=np.int64)
+    order = np.lexsort((found.x_m, found.frame))
+    frame, x = found.frame[order], found.x_m[order]
+    reach = float(np.hypot(found.length_m, found.width_m).max())
+    first, hits, ahead = np.arange(order.size), [np.empty((0, 2), np.int64)], 0
+    while first.size:
+        ahead += 1
+        first = first[first + ahead < order.size]
+        second = first + ahead
+        near = (frame[first] == frame[second]) & (x[second] - x[first] < reach)
+        first = first[near]
+        a, b = order[first], order[first + ahead]
+        close = np.abs(found.y_m[a] - found.y_m[b]) < reach
+        a, b = a[close], b[close]
+        hit = _share_space(found, a, b)
+        hits.append(np.column_stack([np.minimum(a, b)[hit], np.maximum(a, b)[hit]]))
+    return np.concatenate(hits)
+
+
+def _share_space(found: Boxes, a: Ints, b: Ints) -> NDArray[np.bool_]:
+    dx, dy = found.x_m[b] - found.x_m[a], found.y_m[b] - found.y_m[a]
+    cos_a, sin_a = np.cos(found.yaw_rad[a]), np.sin(found.yaw_rad[a])
+    cos_b, sin_b = np.cos(found.yaw_rad[b]), np.sin(found.yaw_rad[b])
+    # of the angle between both headings: how much of the one's length and width points along the other's
+    along, across = np.abs(cos_a * cos_b + sin_a * sin_b), np.abs(cos_a * sin_b - sin_a * cos_b)
+    (long_a, wide_a), (long_b, wide_b) = ((found.length_m[i] / 2 - _SHRINK_M, found.width_m[i] / 2 - _SHRINK_M) for i in (a, b))
+    apart = np.abs(dx * cos_a + dy * sin_a) >= long_a + long_b * along + wide_b * across
+    apart |= np.abs(dy * cos_a - dx * sin_a) >= wide_a + long_b * across + wide_b * along
+    apart |= np.abs(dx * cos_b + dy * sin_b) >= long_b + long_a * along + wide_a * across
+    apart |= np.abs(dy * cos_b - dx * sin_b) >= wide_b + long_a * across + wide_a * along
+    apart |= np.abs(found.z_m[a] - found.z_m[b]) >= (found.height_m[a] + found.height_m[b]) / 2 - 2 * _SHRINK_M
+    together: NDArray[np.bool_] = np.logical_not(apart)
+    return together
+
+
+@dataclass
+class Tally:
+    """What a recording amounts to, added up group by group."""
+
+    frames: int
+    vehicles: Ints = field(init=False)
+    """Vehicles in each frame."""
+    different: set[str] = field(default_factory=set)
+    rows: int = 0
+    speed_sum: float = 0.0
+    standing: int = 0
+    overlapping_pairs: int = 0
+    frames_with_overlap: int = 0
+    longest_standing_frames: int = 0
+    stands_since: dict[str, int] = field(default_factory=dict)
+    """Vehicles that stand in the last frame added, and the frame since when."""
+
+    def __post_init__(self) -> None:
+        self.vehicles = np.zeros(self.frames, dtype=np.int64)
+
+    def add(self, found: Boxes) -> None:
+        """Count the next group."""
+        end = found.first_frame + found.frames
+        self.vehicles[found.first_frame : end] = np.bincount(found.frame - found.first_frame, minlength=found.frames)
+        self.different.update(found.names)
+        self.rows += found.frame.size
+        self.speed_sum += float(np.nansum(found.speed_m_s))
+        self.standing += int(np.count_nonzero(found.speed_m_s < STANDING_M_S))
+        pairs = overlapping(found)
+        self.overlapping_pairs += len(pairs)
+        self.frames_with_overlap += np.unique(found.frame[pairs[:, 0]]).size
+        self._add_standing(found, end)
+
+    def _add_standing(self, found: Boxes, end: int) -> None:
+        """Follow each vehicle's runs of standing frames, across groups."""
+        order = np.lexsort((found.frame, found.code))
+        stands = order[found.speed_m_s[order] < STANDING_M_S]
+        frame, code = found.frame[stands], found.code[stands]
+        begins = np.flatnonzero((np.diff(code, prepend=-1) != 0) | (np.diff(frame, prepend=-2) != 1))
+        ends = np.append(begins[1:], stands.size) - 1
+        still: dict[str, int] = {}
+        for first, last in zip(begins.tolist(), ends.tolist(), strict=True) if stands.size else ():
+            name, since = found.names[code[first]], int(frame[first])
+            if since == found.first_frame:
+                since = self.stands_since.get(name, since)
+            self.longest_standing_frames = max(self.longest_standing_frames, int(frame[last]) - since)
+            if frame[last] == end - 1:
+                still[name] = since
+        self.stands_since = still
+
+    def result(self, period_s: float) -> dict[str, Any]:
+        """As the stage reports it."""
+        return {
+            "frames": self.frames,
+            "vehicles": {
+                "fewest": int(self.vehicles.min()),
+                "most": int(self.vehicles.max()),
+                "different": len(self.different),
+            },
+            "rows": self.rows,
+            "mean_speed_m_s": round(self.speed_sum / self.rows, 4) if self.rows else 0.0,
+            "share_standing": round(self.standing / self.rows, 4) if self.rows else 0.0,
+            "longest_standing_s": round(self.longest_standing_frames * period_s, 3),
+            "overlapping_pairs": self.overlapping_pairs,
+            "frames_with_overlap": self.frames_with_overlap,
+        }

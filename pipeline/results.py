@@ -1,0 +1,86 @@
+"""How does one get artefacts back as arrays?
+
+Readers for notebooks, for the stages, and for people who want to compute further. Each checks what it reads and says which file is
+wrong. Tables come as Arrow tables (``.to_pandas()`` where pandas is installed), grids as NumPy arrays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from pipeline import tables
+from pipeline.errors import InputError
+from pipeline.grid import Grid
+
+
+@dataclass(frozen=True)
+class Tpog:
+    """A Traffic Probabilistic Occupancy Grid.
+
+    Attributes
+    ----------
+    grid
+        Where the voxels are.
+    frames
+        T, the number of frames.
+    counts
+        Frames in which each voxel is occupied, all blocks added up, (nx, ny, nz) int64.
+    """
+
+    grid: Grid
+    frames: int
+    counts: NDArray[np.int64]
+
+    @property
+    def p(self) -> NDArray[np.float64]:
+        """Share of the frames in which each voxel is occupied, (nx, ny, nz) float64."""
+        return self.counts / self.frames
+
+
+def read_tpog(path: str | Path) -> Tpog:
+    """Read ``tpog.parquet``; InputError when it is corrupt or a row lies outside the grid."""
+    path = Path(path)
+    table, about = tables.read(path, "tpog")
+    grid = Grid.from_json(about["grid"])
+    index = [table.column(name).to_numpy() for name in ("ix", "iy", "iz")]
+    for axis, (values, size) in enumerate(zip(index, grid.shape, strict=True)):
+        if len(values) and not (values.min() >= 0 and values.max() < size):
+            raise InputError(path, f"i{'xyz'[axis]} leaves the grid", f"0 to {size - 1}")
+    flat = np.ravel_multi_index(index, grid.shape) if len(table) else np.empty(0, dtype=np.int64)
+    counts = np.zeros(int(np.prod(grid.shape)), dtype=np.int64)
+    np.add.at(counts, flat, table.column("count").to_numpy())
+    if len(counts) and counts.max(initial=0) > about["frames"]:
+        raise InputError(path, f"a voxel is occupied in {counts.max()} of {about['frames']} frames", "counts up to the frames")
+    return Tpog(grid, int(about["frames"]), counts.reshape(grid.shape))
+
+
+def read_scores(path: str | Path) -> pa.Table:
+    """Read ``scores.parquet``."""
+    return tables.read(Path(path), "scores")[0]
+
+
+def read_trajectories(path: str | Path) -> pa.Table:
+    """Read ``trajectories.parquet``."""
+    return tables.read(Path(path), "trajectories")[0]
+
+
+def read_scans(path: str | Path) -> pa.Table:
+    """Read ``scans.parquet``."""
+    return tables.read(Path(path), "scans")[0]
+
+
+def read_visibility(path: str | Path, site: str) -> NDArray[np.float64]:
+    """Hits of one site in every voxel, (nx, ny, nz) float64, from ``visibility.parquet``."""
+    path = Path(path)
+    table, about = tables.read(path, "visibility")
+    mine = table.filter(pa.compute.equal(table.column("site"), site))
+    if len(mine) == 0 and site not in {s["site"] for s in about["sites"]}:
+        raise InputError(path, f"no site {site!r}", "a site that score.keep_visibility names")
+    hits = np.zeros(Grid.from_json(about["grid"]).shape)
+    hits[tuple(mine.column(name).to_numpy() for name in ("ix", "iy", "iz"))] = mine.column("hits").to_numpy()
+    return hits

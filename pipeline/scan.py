@@ -1,0 +1,104 @@
+"""What does each candidate site see of the static world alone?
+
+Steps: read ``statics.ply``; cast the beams of every site (or read its measured scan); write ``scans.parquet``, one row a beam
+that can meet the region of interest. The scan knows nothing of traffic, voxels or gamma, so none of these needs it made again.
+
+With ``scan.keep = false`` nothing is written here, and score casts as it goes.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from pipeline import clouds, survey, tables
+from pipeline.errors import InputError
+from pipeline.ordered import in_order
+from pipeline.scenario import Scenario
+from pipeline.stage import Progress, metadata, silent, threads
+from pipeline.survey import SiteScan, Survey
+from pipeline.world import read_ply
+
+NAME = "scan"
+ARTEFACTS = ("scans.parquet",)
+
+
+def inputs(scenario: Scenario, out: Path) -> dict[str, Any]:
+    """The region of interest without its voxels, sites, sensors; the statics and the sites' files by hash."""
+    return {"settings": {"keep": scenario.scan.keep, **survey.settings(scenario)}, "files": survey.files(scenario, out)}
+
+
+def run(
+    scenario: Scenario,
+    out: Path,
+    *,
+    jobs: int | None = None,
+    progress: Progress = silent,
+    points: tuple[str, ...] = (),
+    cloud: str = "ply",
+) -> dict[str, Any]:
+    """Scan all sites and write ``scans.parquet``.
+
+    Parameters
+    ----------
+    points
+        Sites whose empty scan is also written as a point cloud, ``scan_<site>.<cloud>``.
+    cloud
+        ``"ply"`` or ``"pcd"``.
+
+    Returns
+    -------
+    dict
+        ``sites``, ``beams`` (cast), ``returns``, ``settled_in_float64`` (beams that float32 alone left in doubt).
+    """
+    world, _ = read_ply(out / "statics.ply")
+    surveyed = Survey(scenario, world)
+    known = [site.site for site in surveyed.sites]
+    for name in points:
+        if name not in known:
+            raise InputError(f"--points {name}", "no such site", f"one of {', '.join(known)}")
+    if not scenario.scan.keep:
+        (out / ARTEFACTS[0]).unlink(missing_ok=True)
+        for site in surveyed.sites:
+            if site.site in points:
+                _write_cloud(out, surveyed.scan(site), cloud)
+        return {"sites": len(known), "kept": False}
+    about: list[dict[str, Any]] = []
+    doubtful = 0
+    with tables.writer(out / ARTEFACTS[0], "scans") as file:
+        for done in in_order(surveyed.scan, surveyed.sites, threads(jobs)):
+            file.write(_columns(done))
+            about.append(done.about)
+            doubtful += done.scan.doubtful
+            if done.site.site in points:
+                _write_cloud(out, done, cloud)
+            progress("sites", len(about), len(known))
+        file.describe(metadata(scenario, inputs(scenario, out), sites=about))
+    return {
+        "sites": len(known),
+        "kept": True,
+        "beams": sum(a["beams_in_roi"] for a in about),
+        "returns": sum(a["returns"] for a in about),
+        "settled_in_float64": doubtful,
+    }
+
+
+def _columns(done: SiteScan) -> dict[str, Any]:
+    ends = done.scan.ends_m
+    name = pa.DictionaryArray.from_arrays(np.zeros(len(ends), dtype=np.int32), [done.site.site])
+    return {
+        "site": name.cast(pa.string()),
+        "beam": done.scan.beam,
+        "dx_m": ends[:, 0],
+        "dy_m": ends[:, 1],
+        "dz_m": ends[:, 2],
+        "returned": done.scan.returned,
+    }
+
+
+def _write_cloud(out: Path, done: SiteScan, suffix: str) -> None:
+    ends = done.scan.ends_m[done.scan.returned]
+    clouds.write_points(out / f"scan_{done.site.site}.{suffix}", ends + np.asarray(done.site.position_m))

@@ -1,0 +1,198 @@
+r"""Which site sees most of what is uncertain?
+
+.. math:: EGVS(site) = \sum_v H(p(v)) \, \min(\gamma, hits(v))
+
+(arXiv 2504.06772, Eq. 4): ``hits`` are the beams of the site's empty scan that cross voxel v, p comes from the TPOG.
+
+Steps: read ``tpog.parquet``; read ``scans.parquet`` site by site (with ``scan.keep = false``: cast instead); march every beam through
+the grid and count; sum; rank. Another gamma, voxel size or TPOG needs this stage alone.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import survey, tables
+from pipeline.entropy import Field, Score
+from pipeline.errors import InputError
+from pipeline.kernels import march
+from pipeline.ordered import in_order
+from pipeline.results import read_tpog
+from pipeline.scenario import Scenario
+from pipeline.stage import Progress, metadata, silent, threads
+from pipeline.world import read_ply
+
+NAME = "score"
+ARTEFACTS = ("scores.parquet", "visibility.parquet")
+
+_POSE = ("site", "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg", "sensor")
+_COUNTS = ("beams", "beams_in_roi", "returns")
+
+
+@dataclass(frozen=True)
+class _Scored:
+    about: dict[str, Any]
+    score: Score
+    audit: tuple[float, float, int, int] | None
+    visible: dict[str, Any] | None
+
+
+def inputs(scenario: Scenario, out: Path) -> dict[str, Any]:
+    """Gamma and what to keep; TPOG and scans by hash (without kept scans: what a scan depends on)."""
+    own = {"name": scenario.name, "score": scenario.score.model_dump(mode="json")}
+    hashes = {"tpog.parquet": tables.sha256_of(out / "tpog.parquet")}
+    if scenario.scan.keep:
+        return {"settings": own, "files": hashes | {"scans.parquet": tables.sha256_of(out / "scans.parquet")}}
+    return {"settings": own | {"scan": survey.settings(scenario)}, "files": hashes | survey.files(scenario, out)}
+
+
+def run(
+    scenario: Scenario, out: Path, *, jobs: int | None = None, progress: Progress = silent, audit: bool = False
+) -> dict[str, Any]:
+    """Score and rank all sites; write ``scores.parquet``, and ``visibility.parquet`` where sites are to be kept.
+
+    Parameters
+    ----------
+    audit
+        Check for every beam that the chords of its voxels add up to the clipped segment and that no voxel comes twice.
+
+    Returns
+    -------
+    dict
+        ``sites``, ``best`` (names), ``egvs_limit``; with ``audit`` the worst case found.
+    """
+    tpog = read_tpog(out / "tpog.parquet")
+    field = Field.of(tpog.counts, tpog.frames, tpog.grid)
+    gamma, keep = scenario.score.gamma, scenario.score.keep_visibility
+    scorer = _Scorer(field, gamma, keep, audit)
+    done: list[_Scored] = []
+    visible: list[dict[str, Any]] = []
+    for scored in in_order(scorer.score, _scans(scenario, out), threads(jobs)):
+        done.append(scored)
+        if scored.visible is not None:
+            visible.append(scored.visible)
+        progress("sites", len(done), 0)
+    _check_kept(keep, [d.about["site"] for d in done], scenario)
+    limit = field.limit(gamma)
+    read = inputs(scenario, out)
+    about = metadata(scenario, read, gamma=gamma, grid=tpog.grid.to_json(), frames=tpog.frames, sites=[d.about for d in done])
+    _write_visibility(out / ARTEFACTS[1], visible, about)
+    columns = _columns(done, limit)
+    tables.write(out / ARTEFACTS[0], "scores", columns, about)
+    best = [d.about["site"] for d, rank in zip(done, columns["rank"], strict=True) if rank == 1]
+    summary: dict[str, Any] = {"sites": len(done), "best": best, "egvs_limit": limit}
+    if audit:
+        summary["audit"] = _worst([d.audit for d in done if d.audit is not None])
+    return summary
+
+
+class _Scorer:
+    """Scores one site after another; each thread keeps its own counters."""
+
+    def __init__(self, field: Field, gamma: float, keep: tuple[str, ...] | str, audit: bool) -> None:
+        self._field, self._gamma, self._keep, self._audit = field, gamma, keep, audit
+        self._local = threading.local()
+
+    def score(self, scan: tuple[dict[str, Any], NDArray[np.float64]]) -> _Scored:
+        about, ends_m = scan
+        hits = self._hits()
+        found = count_hits(about, ends_m, self._field, hits, self._audit)
+        kept = self._keep == "all" or about["site"] in self._keep
+        visible = self._visible(about["site"], hits) if kept else None
+        return _Scored(about, self._field.score(hits, self._gamma), found, visible)
+
+    def _hits(self) -> NDArray[np.uint32]:
+        if not hasattr(self._local, "hits"):
+            self._local.hits = np.zeros(int(np.prod(self._field.grid.shape)), dtype=np.uint32)
+        hits: NDArray[np.uint32] = self._local.hits
+        hits.fill(0)
+        return hits
+
+    def _visible(self, site: str, hits: NDArray[np.uint32]) -> dict[str, Any]:
+        flat = np.flatnonzero(hits)
+        ix, iy, iz = (axis.astype(np.int32) for axis in np.unravel_index(flat, self._field.grid.shape))
+        return {"site": [site] * len(flat), "ix": ix, "iy": iy, "iz": iz, "hits": hits[flat].astype(np.float64)}
+
+
+def count_hits(
+    about: dict[str, Any], ends_m: NDArray[np.float64], field: Field, hits: NDArray[np.uint32], audit: bool = False
+) -> tuple[float, float, int, int] | None:
+    """Add a site's beams to ``hits``; with ``audit`` check each of them."""
+    grid = field.grid
+    position_m = np.array([about["x_m"], about["y_m"], about["z_m"]])
+    o, d = grid.to_grid_m(position_m) / grid.voxel_m, ends_m / grid.voxel_m
+    if not (np.isfinite(o).all() and np.isfinite(d).all()):
+        raise InputError(f"scans.parquet: site {about['site']}", "a beam with an end that is no number", "finite metres")
+    shape = np.asarray(grid.shape, dtype=np.int64)
+    if len(d) > np.iinfo(np.uint32).max:
+        raise InputError(f"scans.parquet: site {about['site']}", f"{len(d)} beams", "fewer than 2**32")
+    march.count_hits(o, d, shape, grid.voxel_m, hits)
+    return march.audit(o, d, shape, grid.voxel_m, np.zeros_like(hits)) if audit else None
+
+
+def _scans(scenario: Scenario, out: Path) -> Iterator[tuple[dict[str, Any], NDArray[np.float64]]]:
+    """What is known of each site, and where its beams end (n, 3), in the order of the sites."""
+    if not scenario.scan.keep:
+        world, _ = read_ply(out / "statics.ply")
+        surveyed = survey.Survey(scenario, world)
+        for site in surveyed.sites:
+            done = surveyed.scan(site)
+            yield done.about, done.scan.ends_m
+        return
+    path = out / "scans.parquet"
+    with tables.reader(path, "scans") as (file, about):
+        if file.num_row_groups != len(about["sites"]):
+            raise InputError(path, f"{file.num_row_groups} row groups for {len(about['sites'])} sites", "one a site")
+        for group, site in enumerate(about["sites"]):
+            table = tables.read_group(file, group, path, ["dx_m", "dy_m", "dz_m"])
+            yield site, np.column_stack([table.column(name).to_numpy() for name in table.column_names])
+
+
+def _columns(done: list[_Scored], limit: float) -> dict[str, Any]:
+    scores = np.array([d.score.egvs for d in done])
+    columns: dict[str, Any] = {name: [d.about[name] for d in done] for name in (*_POSE, *_COUNTS)}
+    return columns | {
+        "egvs": scores,
+        "egvs_limit": np.full(len(done), limit),
+        "rank": ranks(scores),
+        "entropy_seen": np.array([d.score.entropy_seen for d in done]),
+    }
+
+
+def ranks(scores: NDArray[np.float64]) -> NDArray[np.uint32]:
+    """1 for the highest score; equal scores share a rank, and the next one is left out for each that shares."""
+    return np.array([1 + np.sum(scores > score) for score in scores], dtype=np.uint32)
+
+
+def _worst(audits: list[tuple[float, float, int, int]]) -> dict[str, float]:
+    """The worst case over all sites, see :func:`pipeline.kernels.march.audit`."""
+    sums, gaps, misplaced, doubled = zip(*audits, strict=True)
+    return {
+        "worst_sum": max(sums),
+        "longest_gap_m": max(gaps),
+        "misplaced_chords": sum(misplaced),
+        "voxels_visited_twice": sum(doubled),
+    }
+
+
+def _check_kept(keep: tuple[str, ...] | str, known: list[str], scenario: Scenario) -> None:
+    for name in () if keep == "all" else keep:
+        if name not in known:
+            raise InputError(f"{scenario.file}: score.keep_visibility", f"no site {name!r}", f"one of {', '.join(known)}, or 'all'")
+
+
+def _write_visibility(path: Path, visible: list[dict[str, Any]], about: dict[str, Any]) -> None:
+    if not visible:
+        path.unlink(missing_ok=True)
+        return
+    with tables.writer(path, "visibility") as file:
+        for columns in visible:
+            file.write(columns)
+        file.describe(about)

@@ -1,0 +1,147 @@
+"""How does a run look on a terminal, and in a log?
+
+A progress bar on a terminal, plain lines elsewhere; then tables. Standard output carries results, standard error progress.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from pipeline.sensors import Sensor
+
+
+class Screen:
+    """Shows a run as it goes on, and what came of it."""
+
+    def __init__(self) -> None:
+        self._out = Console(width=None if sys.stdout.isatty() else 120, highlight=False, soft_wrap=True)
+        self._err = Console(stderr=True, highlight=False, soft_wrap=True)
+        self._stage = ""
+        self._bar = Progress(
+            TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"), TimeElapsedColumn(),
+            console=self._err, transient=True,
+        )  # fmt: skip
+        self._task = self._bar.add_task("", total=None, visible=False)
+        self._lively = sys.stderr.isatty()
+
+    def __enter__(self) -> Screen:
+        if self._lively:
+            self._bar.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if self._lively:
+            self._bar.stop()
+
+    def progress(self, what: str, done: int, total: int) -> None:
+        """A :data:`pipeline.stage.Progress`."""
+        if self._lively:
+            self._bar.update(self._task, description=f"{self._stage}: {what}", completed=done, total=total or None, visible=True)
+
+    def told(self, stage: str, state: str, record: dict[str, Any]) -> None:
+        """A :data:`pipeline.workflow.Told`."""
+        self._stage = stage
+        if state == "runs":
+            if self._lively:
+                self._bar.update(self._task, description=stage, completed=0, total=None, visible=True)
+            return
+        if self._lively:
+            self._bar.update(self._task, visible=False)
+        took = "unchanged" if state == "skipped" else f"{record['cost']['seconds']:.2f} s"
+        self._err.print(f"{stage:<8} {took:>10}   {_in_words(record['said'])}", markup=False)
+
+    def result(self, folder: Path, record: dict[str, Any]) -> None:
+        """The ranking, the artefacts, and what each stage cost."""
+        from pipeline.results import read_scores
+
+        self._out.print(ranking(read_scores(folder / "scores.parquet").to_pylist()))
+        self._audit(record)
+        table = Table("stage", "artefact", "seconds", "peak MB", box=None, pad_edge=False)
+        for stage, done in record["stages"].items():
+            cost = done["cost"]
+            names = "\n".join(str(folder / name) for name in done["artefacts"])
+            table.add_row(stage, names, f"{cost['seconds']:.2f}", f"{cost['peak_mb']:.0f}")
+        self._out.print(table)
+
+    def stage(self, folder: Path, stage: str, record: dict[str, Any]) -> None:
+        """What one stage wrote."""
+        if stage == "score":
+            from pipeline.results import read_scores
+
+            self._out.print(ranking(read_scores(folder / "scores.parquet").to_pylist()))
+            self._audit(record)
+        for name in record["stages"][stage]["artefacts"]:
+            self._out.print(str(folder / name), markup=False)
+
+    def verdict(self, folder: Path, wrong: list[str]) -> None:
+        """What verify found."""
+        if not wrong:
+            self._out.print(f"{folder}: every artefact is as the run made it, and a second run makes the same bytes", markup=False)
+        for line in wrong:
+            self._out.print(f"{folder}: {line}", markup=False)
+
+    def _audit(self, record: dict[str, Any]) -> None:
+        found = record["stages"]["score"]["said"].get("audit")
+        if found:
+            self._out.print(
+                f"audit: chords add up to {found['worst_sum']:.1e} of a beam's length at worst, longest piece in no voxel "
+                f"{found['longest_gap_m'] * 1e6:.2f} micrometres, misplaced chords {found['misplaced_chords']}, "
+                f"voxels visited twice {found['voxels_visited_twice']}"
+            )
+
+
+def ranking(rows: list[dict[str, Any]]) -> Table:
+    """Sites by rank, as a table."""
+    table = Table(box=None, pad_edge=False)
+    for name in ("rank", "site", "x m", "y m", "z m", "sensor", "EGVS bit", "of best", "entropy seen", "beams in ROI"):
+        table.add_column(name, justify="left" if name in ("site", "sensor") else "right")
+    best = max((row["egvs"] for row in rows), default=0.0)
+    for row in sorted(rows, key=lambda row: row["rank"]):
+        share = f"{row['egvs'] / best:.1%}" if best > 0 else "-"
+        table.add_row(
+            str(row["rank"]), row["site"], f"{row['x_m']:.2f}", f"{row['y_m']:.2f}", f"{row['z_m']:.2f}", row["sensor"],
+            f"{row['egvs']:.1f}", share, f"{row['entropy_seen']:.1%}", str(row["beams_in_roi"]),
+        )  # fmt: skip
+    return table
+
+
+def catalogue(sensors: Iterable[Sensor]) -> None:
+    """The sensors that need no table of the user's."""
+    table = Table(box=None, pad_edge=False)
+    for name in ("sensor", "channels", "elevation deg", "azimuth step deg", "beams", "range m", "source"):
+        table.add_column(name, justify="left" if name in ("sensor", "source") else "right", overflow="fold")
+    for s in sensors:
+        span = f"{min(s.elevations_deg):g} to {max(s.elevations_deg):g}"
+        table.add_row(s.name, str(s.channels), span, f"{360 / s.azimuths:.6g}", str(s.beams), f"{s.range_m:g}", s.source)
+    Console(width=None if sys.stdout.isatty() else 160, highlight=False).print(table)
+
+
+def summary(folder: Path, found: dict[str, Any]) -> None:
+    """What ``egvs new`` made."""
+    console = Console(highlight=False, soft_wrap=True)
+    for key, value in found.items():
+        console.print(f"{key}: {_in_words(value) if isinstance(value, dict) else value}", markup=False)
+    console.print(f"next: egvs run {folder}", markup=False)
+
+
+def _in_words(said: dict[str, Any]) -> str:
+    """A stage's summary in one line: plain values, then tables of counts."""
+    parts = []
+    for key, value in said.items():
+        if isinstance(value, dict):
+            value = ", ".join(f"{v} {k}" for k, v in value.items())
+        if isinstance(value, float):
+            value = f"{value:.4g}"
+        if isinstance(value, list):
+            value = ", ".join(str(v) for v in value)
+        if value != "":
+            parts.append(f"{key.replace('_', ' ')} {value}")
+    return "; ".join(parts)

@@ -1,0 +1,240 @@
+"""Where is each vehicle in each frame?
+
+Steps: get rows of floating car data (FCD) - from SUMO as a subprocess, from a SUMO that is already running, or from a
+finished file; cut them into groups of whole frames; turn front bumpers into boxes; write a group as a row group of
+``trajectories.parquet``; check what the scenario promises: N vehicles in each frame, and nobody standing for good.
+
+World frame (x east, y north, z up), metres, radians, seconds. The folder ``sumo`` beside the artefact opens in sumo-gui.
+
+SUMO (https://eclipse.dev/sumo) stands in for the paper's game-engine simulator.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from pipeline import fcd, motion, network, simulation, sumo, tables
+from pipeline.errors import InputError, RunError
+from pipeline.motion import Size, Tally
+from pipeline.scenario import Scenario, TrafficModel, sumo_home
+from pipeline.stage import Progress, metadata, silent
+
+NAME = "traffic"
+ARTEFACTS = ("trajectories.parquet",)
+
+GROUP_FRAMES = 500
+"""Frames in a row group; fixed, so that the bytes do not depend on how the rows arrive."""
+
+_LEAST_PATIENCE_S = 180.0
+
+
+@dataclass
+class Recording:
+    """Rows of FCD as they arrive, and what is known about them. Of a running SUMO, ``on_purpose`` is filled as they come."""
+
+    rows: Iterable[pa.Table]
+    window: fcd.Window
+    sizes: Mapping[str, Size]
+    place: str
+    result: dict[str, Any] = field(default_factory=dict)
+    patience_s: float | None = None
+    on_purpose: set[str] = field(default_factory=set)
+
+
+def inputs(scenario: Scenario, out: Path) -> dict[str, Any]:
+    """Everything that the trajectories depend on."""
+    del out
+    traffic = scenario.traffic
+    if traffic.fcd is not None:
+        files = [scenario.find(traffic.fcd, "traffic.fcd")]
+    else:
+        files = simulation.sources(scenario).all()
+        if traffic.sumocfg is not None:
+            files.insert(0, scenario.find(traffic.sumocfg, "traffic.sumocfg"))
+    return {
+        "settings": {"seed": scenario.seed, "name": scenario.name, "traffic": traffic.model_dump(mode="json")},
+        "files": {_label(path, scenario): tables.sha256_of(path) for path in files},
+        "sumo": None if traffic.fcd is not None else sumo.version(),
+    }
+
+
+def _label(path: Path, scenario: Scenario) -> str:
+    """A file's name seen from the scenario's folder, so that it does not depend on where that is."""
+    if path.is_relative_to(sumo_home()):
+        return f"$SUMO_HOME/{path.relative_to(sumo_home()).as_posix()}"
+    return Path(os.path.relpath(path, scenario.folder)).as_posix()
+
+
+def run(
+    scenario: Scenario, out: Path, *, jobs: int | None = None, progress: Progress = silent, traci: tuple[str, int] | None = None
+) -> dict[str, Any]:
+    """Make the trajectories.
+
+    Parameters
+    ----------
+    traci
+        Host and port of a SUMO that is already running; nothing is started then.
+
+    Returns
+    -------
+    dict
+        What came out, as JSON: frames, vehicles, speeds, standing, collisions, overlaps, SUMO's flags and seconds.
+
+    Raises
+    ------
+    InputError
+        When the scenario or a file that it names is wrong.
+    RunError
+        When SUMO fails, N vehicles are not held, or a vehicle stands without end.
+    """
+    del jobs  # SUMO runs on one thread, so that its bytes do not depend on how many there are
+    about = inputs(scenario, out)
+    frames = scenario.traffic.frames
+    tally = Tally(frames)
+    with _recording(scenario, out, progress, traci) as recording, tables.writer(out / ARTEFACTS[0], "trajectories") as file:
+        period_s = recording.window.period_ms / 1000.0
+        for group in fcd.groups(recording.rows, recording.window, GROUP_FRAMES, recording.place):
+            boxes = motion.boxes(group, recording.sizes, period_s, recording.place)
+            if boxes.frame.size:
+                file.write(boxes.columns())
+            tally.add(boxes)
+            progress("frames written", group.first_frame + group.frames, frames)
+        _check(scenario.traffic, tally, recording)
+        file.describe(metadata(scenario, about, frames=frames, frame_period_s=period_s, sumo=about["sumo"]))
+    return tally.result(period_s) | recording.result
+
+
+def _recording(
+    scenario: Scenario, out: Path, progress: Progress, traci: tuple[str, int] | None
+) -> AbstractContextManager[Recording]:
+    if scenario.traffic.fcd is not None and traci is not None:
+        raise InputError("--traci", "the scenario names a finished FCD file", "network or sumocfg in [traffic]")
+    if scenario.traffic.fcd is not None:
+        return _finished(scenario)
+    if traci is not None:
+        return _running(scenario, *traci)
+    return _simulated(scenario, out / "sumo", progress)
+
+
+@contextmanager
+def _finished(scenario: Scenario) -> Iterator[Recording]:
+    """From a file; nothing is simulated, so nothing is promised about it."""
+    traffic, place = scenario.traffic, simulation.place(scenario)
+    assert traffic.fcd is not None
+    path = scenario.find(traffic.fcd, "traffic.fcd")
+    window = fcd.Window(
+        traffic.frames,
+        max(1, simulation.milliseconds(traffic.frame_period_s, f"{place}.frame_period_s")),
+        skip_ms=simulation.milliseconds(traffic.warmup_s, f"{place}.warmup_s"),
+    )
+    yield Recording(fcd.read(path), window, _kind_sizes(scenario), place)
+
+
+@contextmanager
+def _simulated(scenario: Scenario, folder: Path, progress: Progress) -> Iterator[Recording]:
+    """From SUMO as a subprocess; its FCD file is removed once it is read."""
+    prepared = simulation.prepare(scenario, folder)
+    sizes = _kind_sizes(scenario) if prepared.drawn else simulation.type_sizes(prepared)
+    path = folder / simulation.FCD
+    try:
+        seconds = simulation.simulate(prepared, progress)
+        yield Recording(
+            fcd.read(path),
+            prepared.timing.window(),
+            sizes,
+            simulation.place(scenario),
+            {
+                "sumo": sumo.version(),
+                "sumo_seconds": round(seconds, 3),
+                "flags": simulation.flags(prepared),
+                "collisions": simulation.collisions(prepared),
+                "notes": list(prepared.notes),
+            },
+            patience_s(prepared.cycle_s),
+            simulation.stopped_on_purpose(prepared),
+        )
+    finally:
+        path.unlink(missing_ok=True)
+
+
+@contextmanager
+def _running(scenario: Scenario, host: str, port: int) -> Iterator[Recording]:
+    """From a SUMO that somebody else started."""
+    given = simulation.sources(scenario)
+    when = simulation.timing(scenario.traffic, given.begin_s, simulation.place(scenario))
+    roads = given.files["net-file"][0]
+    cycle_s = 0.0 if simulation.is_osm(roads) else network.read(roads).cycle_s
+    seen = simulation.Seen()
+    with sumo.connected(host, port) as connection:
+        recording = Recording(
+            simulation.poll(connection, when, seen, f"{host}:{port}"),
+            when.window(),
+            seen.sizes,
+            simulation.place(scenario),
+            patience_s=patience_s(cycle_s),
+            on_purpose=seen.on_purpose,
+        )
+        version = sumo.version_in(connection.getVersion()[1])
+        yield recording
+        recording.result |= {
+            "sumo": version,
+            "sumo_seconds": None,
+            "flags": None,
+            "collisions": len(seen.collided),
+            "notes": [],
+        }
+
+
+def _kind_sizes(scenario: Scenario) -> dict[str, Size]:
+    return {k.name: Size(k.length_m, k.width_m, k.height_m, k.vclass) for k in scenario.traffic.kinds}
+
+
+def patience_s(cycle_s: float) -> float:
+    """How long a vehicle may stand through to the last frame: two signal cycles, and not less than three minutes."""
+    return max(_LEAST_PATIENCE_S, 2.0 * cycle_s)
+
+
+def _check(traffic: TrafficModel, tally: Tally, recording: Recording) -> None:
+    """Whether a simulated recording keeps the scenario's promises."""
+    if not tally.rows:
+        raise RunError(f"{recording.place}: no vehicle is in any of {tally.frames} frames; check the demand and warmup_s")
+    if traffic.fcd is None and traffic.hold == "exactly":
+        _check_held(traffic, tally, recording.place)
+    if recording.patience_s is not None:
+        _check_moving(tally, recording, recording.patience_s)
+
+
+def _check_held(traffic: TrafficModel, tally: Tally, place: str) -> None:
+    wrong = tally.vehicles != traffic.vehicles
+    if wrong.any():
+        first = int(wrong.argmax())
+        raise RunError(
+            f"{place}: {traffic.vehicles} vehicles are in {tally.frames - int(wrong.sum())} of {tally.frames} frames only;"
+            f" the fewest are {tally.vehicles.min()}, the most {tally.vehicles.max()}, frame {first} has"
+            f" {tally.vehicles[first]}. Lower traffic.vehicles, lengthen warmup_s, raise trips_per_s or the demand,"
+            ' or set hold = "at_most"'
+        )
+
+
+def _check_moving(tally: Tally, recording: Recording, patience_s: float) -> None:
+    period_s = recording.window.period_ms / 1000.0
+    stands_s = {
+        name: (tally.frames - 1 - frame) * period_s
+        for name, frame in tally.stands_since.items()
+        if name not in recording.on_purpose
+    }
+    stuck = [name for name, seconds in stands_s.items() if seconds > patience_s]
+    if stuck:
+        longest = max(stuck, key=lambda name: stands_s[name])
+        raise RunError(
+            f"{recording.place}: {len(stuck)} vehicles stand for more than {patience_s:g} s and through to the last frame,"
+            f" {longest!r} for {stands_s[longest]:g} s: the traffic is jammed for good. Lower traffic.vehicles, or mend"
+            " the network's signals and connections"
+        )
