@@ -1,0 +1,1 @@
+"""Measurements that are not tests: speed as ratios from one run, and long hunts for wrong decisions."""
