@@ -1,15 +1,15 @@
 """Which trips are drawn when the scenario names a network but no routes?
 
 Steps: for each kind of vehicle, find the pairs of edges that a trip may join; draw, for each departure, a kind by its
-share and one of its pairs by the weights of both ends (their lanes, unless the scenario says otherwise); write trips and vTypes as SUMO reads them. SUMO finds the way itself.
+share and one of its pairs by the weights of both ends (their lanes, unless the scenario says otherwise); write trips and
+vTypes as SUMO reads them. SUMO finds the way itself.
 
 A trip starts where nobody can come from elsewhere in the network (the fringe) and ends where nobody can go on; a turnaround
 is no way on. A network without such ends (a loop, a cut-out whose streets all turn back) gets trips between any two
 edges at least a quarter of the network's diagonal apart; the stage's result says so.
 
 Trips are more than the network takes, so that ``--max-num-vehicles`` holds N: the idea is that of SUMO's
-randomTrips.py.
-All randomness comes from the generator that is passed in.
+randomTrips.py. All randomness comes from the generator that is passed in.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from decimal import Decimal, localcontext
-from fractions import Fraction
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,9 +105,19 @@ class Field:
         capped, below, seen = (np.zeros(len(self.sizes), dtype=np.int64) for _ in range(3))
         march.tally(hits, self.cells, self.classes, gamma, capped, below, seen)
         egvs = self._sum(gamma, capped, below)
-        total = self._sum(1.0, self.sizes, np.zeros_like(self.sizes))
-        share = self._sum(1.0, seen, np.zeros_like(seen)) / total if total else 0.0
+        share = self._sum(1.0, seen, np.zeros_like(seen)) / self.total_bit if len(self.cells) else 0.0
         return Score(egvs, share)
+
+    @cached_property
+    def total_bit(self) -> float:
+        """The TPOG's entropy: the sum of H over all voxels."""
+        return self.limit(1.0)
+
+    @cached_property
+    def _scaled(self) -> list[int]:
+        """Each class' entropy times 2**_SCALE, a whole number."""
+        ratios = (entropy.as_integer_ratio() for entropy in self.entropies_bit.tolist())
+        return [(top << _SCALE) // bottom for top, bottom in ratios]
 
     def limit(self, gamma: float) -> float:
         """The same sum with gamma in every voxel."""
@@ -117,13 +127,10 @@ class Field:
 
     def _sum(self, gamma: float, capped: NDArray[np.int64], below: NDArray[np.int64]) -> float:
         """Sum over classes of H * (gamma * capped + below), exact, rounded once."""
-        cap = Fraction(0) if np.isinf(gamma) else Fraction(gamma)
-        total = 0
-        for entropy, full, part in zip(self.entropies_bit.tolist(), capped.tolist(), below.tolist(), strict=True):
-            if full or part:
-                top, bottom = entropy.as_integer_ratio()
-                total += ((top << _SCALE) // bottom) * (cap.numerator * full + cap.denominator * part)
-        return total / (cap.denominator << _SCALE)
+        cap, share = (0, 1) if np.isinf(gamma) else gamma.as_integer_ratio()
+        rows = zip(self._scaled, capped.tolist(), below.tolist(), strict=True)
+        total = sum(entropy * (cap * full + share * part) for entropy, full, part in rows if full or part)
+        return total / (share << _SCALE)
 
 
 @dataclass(frozen=True)

@@ -52,8 +52,9 @@ def read_tpog(path: str | Path) -> Tpog:
         if len(values) and not (values.min() >= 0 and values.max() < size):
             raise InputError(path, f"i{'xyz'[axis]} leaves the grid", f"0 to {size - 1}")
     flat = np.ravel_multi_index(index, grid.shape) if len(table) else np.empty(0, dtype=np.int64)
-    counts = np.zeros(int(np.prod(grid.shape)), dtype=np.int64)
-    np.add.at(counts, flat, table.column("count").to_numpy())
+    # bincount adds float64: exact, as no sum of counts reaches 2**53
+    weights = table.column("count").to_numpy()
+    counts = np.bincount(flat, weights=weights, minlength=int(np.prod(grid.shape))).astype(np.int64)
     if len(counts) and counts.max(initial=0) > about["frames"]:
         raise InputError(path, f"a voxel is occupied in {counts.max()} of {about['frames']} frames", "counts up to the frames")
     return Tpog(grid, int(about["frames"]), counts.reshape(grid.shape))

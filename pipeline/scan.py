@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from pipeline import clouds, survey, tables
+from pipeline import survey, tables
 from pipeline.errors import InputError
 from pipeline.ordered import in_order
 from pipeline.scenario import Scenario
@@ -100,5 +100,7 @@ def _columns(done: SiteScan) -> dict[str, Any]:
 
 
 def _write_cloud(out: Path, done: SiteScan, suffix: str) -> None:
+    from pipeline import clouds
+
     ends = done.scan.ends_m[done.scan.returned]
     clouds.write_points(out / f"scan_{done.site.site}.{suffix}", ends + np.asarray(done.site.position_m))

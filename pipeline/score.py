@@ -11,7 +11,6 @@ the grid and count; sum; rank. Another gamma, voxel size or TPOG needs this stag
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,15 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import survey, tables
+from pipeline import survey, tables, visibility
 from pipeline.entropy import Field, Score
-from pipeline.errors import InputError
 from pipeline.kernels import march
 from pipeline.ordered import in_order
 from pipeline.results import read_tpog
 from pipeline.scenario import Scenario
 from pipeline.stage import Progress, metadata, silent, threads
-from pipeline.world import read_ply
 
 NAME = "score"
 ARTEFACTS = ("scores.parquet", "visibility.parquet")
@@ -74,12 +71,11 @@ def run(
     scorer = _Scorer(field, gamma, keep, audit)
     done: list[_Scored] = []
     visible: list[dict[str, Any]] = []
-    for scored in in_order(scorer.score, _scans(scenario, out), threads(jobs)):
+    for scored in in_order(scorer.score, visibility.scans(scenario, out), threads(jobs)):
         done.append(scored)
         if scored.visible is not None:
             visible.append(scored.visible)
         progress("sites", len(done), 0)
-    _check_kept(keep, [d.about["site"] for d in done], scenario)
     limit = field.limit(gamma)
     read = inputs(scenario, out)
     about = metadata(scenario, read, gamma=gamma, grid=tpog.grid.to_json(), frames=tpog.frames, sites=[d.about for d in done])
@@ -125,34 +121,9 @@ def count_hits(
     about: dict[str, Any], ends_m: NDArray[np.float64], field: Field, hits: NDArray[np.uint32], audit: bool = False
 ) -> tuple[float, float, int, int] | None:
     """Add a site's beams to ``hits``; with ``audit`` check each of them."""
-    grid = field.grid
-    position_m = np.array([about["x_m"], about["y_m"], about["z_m"]])
-    o, d = grid.to_grid_m(position_m) / grid.voxel_m, ends_m / grid.voxel_m
-    if not (np.isfinite(o).all() and np.isfinite(d).all()):
-        raise InputError(f"scans.parquet: site {about['site']}", "a beam with an end that is no number", "finite metres")
-    shape = np.asarray(grid.shape, dtype=np.int64)
-    if len(d) > np.iinfo(np.uint32).max:
-        raise InputError(f"scans.parquet: site {about['site']}", f"{len(d)} beams", "fewer than 2**32")
-    march.count_hits(o, d, shape, grid.voxel_m, hits)
-    return march.audit(o, d, shape, grid.voxel_m, np.zeros_like(hits)) if audit else None
-
-
-def _scans(scenario: Scenario, out: Path) -> Iterator[tuple[dict[str, Any], NDArray[np.float64]]]:
-    """What is known of each site, and where its beams end (n, 3), in the order of the sites."""
-    if not scenario.scan.keep:
-        world, _ = read_ply(out / "statics.ply")
-        surveyed = survey.Survey(scenario, world)
-        for site in surveyed.sites:
-            done = surveyed.scan(site)
-            yield done.about, done.scan.ends_m
-        return
-    path = out / "scans.parquet"
-    with tables.reader(path, "scans") as (file, about):
-        if file.num_row_groups != len(about["sites"]):
-            raise InputError(path, f"{file.num_row_groups} row groups for {len(about['sites'])} sites", "one a site")
-        for group, site in enumerate(about["sites"]):
-            table = tables.read_group(file, group, path, ["dx_m", "dy_m", "dz_m"])
-            yield site, np.column_stack([table.column(name).to_numpy() for name in table.column_names])
+    o, d, shape = visibility.in_voxels(about, ends_m, field.grid)
+    march.count_hits(o, d, shape, field.grid.voxel_m, hits)
+    return march.audit(o, d, shape, field.grid.voxel_m, np.zeros_like(hits)) if audit else None
 
 
 def _columns(done: list[_Scored], limit: float) -> dict[str, Any]:
@@ -180,12 +151,6 @@ def _worst(audits: list[tuple[float, float, int, int]]) -> dict[str, float]:
         "misplaced_chords": sum(misplaced),
         "voxels_visited_twice": sum(doubled),
     }
-
-
-def _check_kept(keep: tuple[str, ...] | str, known: list[str], scenario: Scenario) -> None:
-    for name in () if keep == "all" else keep:
-        if name not in known:
-            raise InputError(f"{scenario.file}: score.keep_visibility", f"no site {name!r}", f"one of {', '.join(known)}, or 'all'")
 
 
 def _write_visibility(path: Path, visible: list[dict[str, Any]], about: dict[str, Any]) -> None:

@@ -71,6 +71,10 @@ def of(scenario: Scenario) -> tuple[Site, ...]:
         found[site.site] = site
     if not found:
         raise InputError(path, "holds no site", "at least one")
+    keep = scenario.score.keep_visibility
+    for name in () if keep == "all" else keep:
+        if name not in found:
+            raise InputError(f"{scenario.file}: score.keep_visibility", f"no site {name!r}", f"one of {', '.join(found)}, or 'all'")
     return _with_points(tuple(found.values()), scenario)
 
 

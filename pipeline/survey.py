@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import clouds, sensors, sites, tables
+from pipeline import sensors, sites, tables
 from pipeline.errors import InputError
 from pipeline.kernels import rays, solids
 from pipeline.raycast import Caster, EmptyScan
@@ -74,6 +74,8 @@ class Survey:
 
     def _measured(self, site: Site) -> tuple[EmptyScan, int]:
         """The returns of a measured scan, seen from the sensor; those that cannot meet the ROI are left out."""
+        from pipeline import clouds
+
         assert site.points is not None
         place = f"site {site.site}: points"
         points, _ = clouds.read_points(self._scenario.find(site.points, place), place)

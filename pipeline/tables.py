@@ -128,7 +128,9 @@ def write_text(path: Path, text: str) -> None:
 
 
 def sha256_of(path: Path) -> str:
-    """Hex digest of a file's bytes."""
+    """Hex digest of a file's bytes; InputError when it is not there."""
+    if not path.is_file():
+        raise InputError(path, "no such file", f"run the stage that makes {path.name} first")
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

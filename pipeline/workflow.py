@@ -1,6 +1,6 @@
 """How does a scenario become a ranking?
 
-:func:`run` is the whole program: traffic and statics, the TPOG from both, empty scans, scores, the report. A stage whose inputs
+:func:`run` is the whole program: static world and empty scans, traffic and the TPOG, scores, the report. A stage whose inputs
 (settings by value, files by hash) are those of the last run, and whose artefacts are still what it wrote, is skipped. After each
 stage ``run.json`` is written anew, so that an interrupted run goes on from the last whole stage.
 
@@ -25,7 +25,10 @@ from pipeline.errors import InputError, RunError
 from pipeline.scenario import Scenario, from_values
 from pipeline.stage import Progress, silent
 
-STAGES = ("traffic", "statics", "tpog", "scan", "score", "report")
+STAGES = ("statics", "scan", "traffic", "tpog", "score", "report")
+"""In the order of running. The two branches do not know each other; the quick one comes first, so that a site in a wall is told
+before traffic is simulated."""
+
 RECORD = "run.json"
 
 Told = Callable[[str, str, dict[str, Any]], None]

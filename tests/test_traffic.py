@@ -5,12 +5,12 @@ The end-to-end tests run real SUMO on small networks made here.
 
 import json
 import math
-import os
 import re
 import shutil
 import subprocess
-import warnings
+import sys
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from pipeline import demand, fcd, motion, network, simulation, sumo, tables, traffic
 from pipeline.errors import InputError, MissingBackendError, RunError
 from pipeline.motion import Size, Tally
-from pipeline.scenario import VehicleKind, from_values
+from pipeline.scenario import TrafficModel, VehicleKind, from_values
 
 SMALL = {"vehicles": 12, "frames": 240, "warmup_s": 60.0, "trips_per_s": 1.0}
 
@@ -245,6 +245,10 @@ def car(**keys):
     return VehicleKind(**({"name": "car", "length_m": 4, "width_m": 2, "height_m": 1.5} | keys))
 
 
+def drawn(**keys):
+    return TrafficModel(network="net.xml", **keys)
+
+
 def test_network_is_read(tmp_path):
     path = tmp_path / "n.net.xml"
     path.write_text(NET)
@@ -261,8 +265,18 @@ def test_network_is_read(tmp_path):
 def test_trips_join_the_fringe_and_do_not_turn_back(tmp_path):
     path = tmp_path / "n.net.xml"
     path.write_text(NET)
-    found = demand.pairs(network.read(path), car(), 0.0, np.random.default_rng(0), "place")
+    found = demand.pairs(network.read(path), car(), drawn(), np.random.default_rng(0), "place")
     assert (found.origin.tolist(), found.target.tolist(), found.fringe) == ([0], [2], True)
+
+
+def test_edge_weights_go_before_lanes(tmp_path):
+    path = tmp_path / "n.net.xml"
+    path.write_text(NET)
+    roads, rng = network.read(path), np.random.default_rng(0)
+    assert demand.pairs(roads, car(), drawn(), rng, "place").weight.tolist() == [1]
+    assert demand.pairs(roads, car(), drawn(edge_weights={"out": 7}), rng, "place").weight.tolist() == [7]
+    with pytest.raises(InputError, match=r"edge_weights: the network has no edge 'away'"):
+        demand.pairs(roads, car(), drawn(edge_weights={"away": 7}), rng, "place")
 
 
 def test_a_kind_that_can_go_nowhere_is_refused(tmp_path):
@@ -270,17 +284,17 @@ def test_a_kind_that_can_go_nowhere_is_refused(tmp_path):
     path.write_text(NET)
     roads, rng = network.read(path), np.random.default_rng(0)
     with pytest.raises(InputError, match=r"kind 'boat' \(vClass ship\) can go from no edge to another"):
-        demand.pairs(roads, car(name="boat", vclass="ship"), 150.0 * 2, rng, "place")
+        demand.pairs(roads, car(name="boat", vclass="ship"), drawn(min_trip_m=300), rng, "place")
     roads = network.Network(tuple(e for e in roads.edges if e.id == "in"), (), 0.0, False)
     with pytest.raises(InputError, match=r"kind 'bus' \(vClass bus\) may use no lane"):
-        demand.pairs(roads, car(name="bus", vclass="bus"), 0.0, rng, "place")
+        demand.pairs(roads, car(name="bus", vclass="bus"), drawn(), rng, "place")
 
 
 def test_trips_follow_shares_lanes_and_the_least_length(town):
     roads = network.read(town / "net.xml")
     rng = np.random.default_rng(0)
     kinds = [car(share=3), car(name="van", vclass="delivery")]
-    pairs = [demand.pairs(roads, kind, 200.0, rng, "place") for kind in kinds]
+    pairs = [demand.pairs(roads, kind, drawn(min_trip_m=200), rng, "place") for kind in kinds]
     departs_s = np.arange(4000) / 4
     trips = demand.draw(roads, kinds, pairs, departs_s, rng)
     assert Counter(kind for kind, _, _ in trips)["car"] == pytest.approx(3000, abs=150)
@@ -351,7 +365,7 @@ def test_vehicles_stay_on_the_roads_and_do_not_jump(recorded):
 def test_flags_name_no_place_of_this_machine_and_the_fcd_file_is_gone(recorded):
     result, _, _, out = recorded
     assert "--max-num-vehicles" in result["flags"] and "--seed" in result["flags"]
-    assert not [flag for flag in result["flags"] if os.path.isabs(flag)]
+    assert not [flag for flag in result["flags"] if Path(flag).is_absolute()]
     assert result["sumo_seconds"] > 0
     names = {p.name for p in (out / "sumo").iterdir()}
     assert {"run.sumocfg", "network.net.xml", "trips.rou.xml", "vtypes.add.xml"} <= names
@@ -382,17 +396,13 @@ def test_the_folder_can_be_moved_and_gives_the_same_traffic_as_a_finished_file(r
 
 
 def serve(folder, *flags):
-    """Start SUMO as a co-simulating user would; its port, once it says that it listens there."""
+    """Start SUMO as a co-simulating user would; its port. (What it prints waits in a buffer: nothing tells when it listens.)"""
     from sumolib.miscutils import getFreeSocketPort
 
     port = getFreeSocketPort()
     command = [str(sumo.binary("sumo")), "-c", "run.sumocfg", *flags, "--remote-port", str(port)]
-    process = subprocess.Popen(
-        command, cwd=folder, env=sumo.environment(), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-    )
-    for line in process.stdout:
-        if "Starting server" in line:
-            break
+    devnull = subprocess.DEVNULL
+    process = subprocess.Popen(command, cwd=folder, env=sumo.environment(), stdin=devnull, stdout=devnull, stderr=devnull)
     return process, port
 
 
@@ -407,11 +417,11 @@ def over_traci(scene, out, folder, *flags):
 
 @pytest.fixture
 def patient(monkeypatch):
-    """SUMO says that it listens a moment before it does."""
+    """SUMO listens a moment after it was started."""
     connect = sumo._connect
 
     def again(host, port):
-        return next(filter(None, (connect(host, port) for _ in range(100_000))))
+        return next(filter(None, (connect(host, port) for _ in range(1_000_000))))
 
     monkeypatch.setattr(sumo, "_connect", again)
 
@@ -455,7 +465,7 @@ ROUTES = """<routes>
 
 def routes_for(town):
     roads = network.read(town / "net.xml")
-    found = demand.pairs(roads, car(), 200.0, np.random.default_rng(0), "place")
+    found = demand.pairs(roads, car(), drawn(min_trip_m=200), np.random.default_rng(0), "place")
     origin, target = roads.edges[found.origin[0]], roads.edges[found.target[0]]
 
     def reverse(edge):
@@ -495,9 +505,7 @@ CONFIG = """<configuration>
 
 def configured(town, folder, additional="<additional/>", routes=None):
     (folder / "more").mkdir(parents=True)
-    (folder / "own.rou.xml").write_text(
-        (routes or routes_for(town)).replace('begin="0" end="100"', 'begin="25200" end="25300"')
-    )
+    (folder / "own.rou.xml").write_text((routes or routes_for(town)).replace('begin="0" end="100"', 'begin="25200" end="25300"'))
     (folder / "more" / "red.add.xml").write_text(additional)
     (folder / "town.sumocfg").write_text(CONFIG)
     shutil.copy(town / "net.xml", folder)
@@ -554,9 +562,7 @@ def test_no_vehicle_at_all_fails(town, tmp_path):
         traffic.run(scenario(tmp_path, network="net.xml", **keys), tmp_path / "out")
 
 
-NODES = (
-    """<nodes><node id="a" x="0" y="0" z="0"/><node id="b" x="400" y="0" z="40"/><node id="c" x="800" y="0" z="40"/></nodes>"""
-)
+NODES = """<nodes><node id="a" x="0" y="0" z="0"/><node id="b" x="400" y="0" z="40"/><node id="c" x="800" y="0" z="40"/></nodes>"""
 EDGES = """<edges><edge id="ab" from="a" to="b" numLanes="2"/><edge id="bc" from="b" to="c" numLanes="2"/></edges>"""
 
 
@@ -753,8 +759,5 @@ def test_inputs_depend_on_what_the_stage_reads_and_on_nothing_else(town, tmp_pat
 
 def test_importing_the_stage_loads_no_tool_of_sumo():
     code = "import sys, pipeline.traffic; print([m for m in ('sumolib', 'traci') if m in sys.modules])"
-    import sys
-
-    with warnings.catch_warnings():
-        found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "[]"

@@ -1,0 +1,111 @@
+"""A small scenario that needs no simulation, for tests that want every stage in a second."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from pathlib import Path
+
+import pytest
+
+SCENARIO = """\
+seed = 7
+
+[roi]
+center_m = [20, 0, 2.5]
+size_m = [40, 20, 5]
+voxel_m = 0.5
+
+[traffic]
+fcd = "fcd.csv"
+frames = 40
+frame_period_s = 0.5
+warmup_s = 0
+
+[[traffic.kinds]]
+name = "car"
+length_m = 4.5
+width_m = 1.8
+height_m = 1.5
+
+[statics]
+footprints = ["statics.geojson"]
+
+[tpog]
+blocks = 4
+
+[sites]
+file = "sites.csv"
+sensor = "small"
+
+[sensors.small]
+elevations_deg = [-15, 5]
+channels = 8
+azimuth_step_deg = 1.0
+range_m = 100
+
+[score]
+gamma = 4
+"""
+
+SITES = "site,x_m,y_m,z_m\npole_a,10,12,3\npole_b,30.5,-12,3\n"
+
+BUILDING = [[[14, 5], [18, 5], [18, 8], [14, 8], [14, 5]]]
+
+
+def feature(geometry: dict, **properties: object) -> dict:
+    """A GeoJSON feature."""
+    return {"type": "Feature", "geometry": geometry, "properties": properties}
+
+
+def collection(*features: dict) -> str:
+    """A GeoJSON FeatureCollection as text."""
+    return json.dumps({"type": "FeatureCollection", "features": list(features)})
+
+
+def fcd() -> str:
+    """Two cars that pass each other along y = +-2, one of them turning a little; SUMO's CSV form."""
+    lines = ["timestep_time;vehicle_id;vehicle_x;vehicle_y;vehicle_angle;vehicle_type;vehicle_speed"]
+    for frame in range(40):
+        t = 0.5 * frame
+        lines.append(f"{t:.2f};east;{t * 2 + 1:.6f};-2.0;90.0;car;2.0")
+        lines.append(f"{t:.2f};west;{39 - t * 1.7:.6f};{2 + 0.5 * math.sin(t):.6f};{270 - 5 * math.cos(t):.6f};car;1.7")
+    return "\n".join(lines) + "\n"
+
+
+@pytest.fixture
+def mini(tmp_path: Path) -> Path:
+    """A scenario folder: a finished FCD file, one building and a pole, two sites, a coarse sensor."""
+    folder = tmp_path / "mini"
+    folder.mkdir()
+    (folder / "scenario.toml").write_text(SCENARIO)
+    (folder / "fcd.csv").write_text(fcd())
+    (folder / "sites.csv").write_text(SITES)
+    (folder / "statics.geojson").write_text(
+        collection(
+            feature({"type": "Polygon", "coordinates": BUILDING}, name="house", kind="building", height_m=6),
+            feature({"type": "Point", "coordinates": [22, -5]}, name="lamp", kind="pole", height_m=5, radius_m=0.1),
+        )
+    )
+    return folder
+
+
+
+@pytest.fixture
+def egvs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    """Call the command line in this process: ``code, out, err = egvs("run", folder)``."""
+    from pipeline import cli
+
+    def call(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["egvs", *(str(a) for a in arguments)])
+        capsys.readouterr()
+        code = 0
+        try:
+            cli.main()
+        except SystemExit as end:
+            code = int(end.code or 0)
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return call
