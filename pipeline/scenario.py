@@ -80,7 +80,7 @@ _FLEET = (
 class TrafficModel(_Model):
     """Where vehicles come from: a network (with drawn or given demand), a SUMO configuration, or a finished FCD file."""
 
-    network: str | None = Field(None, description="A .net.xml(.gz); may start with $SUMO_HOME/")
+    network: str | None = Field(None, description="A .net.xml(.gz) or an OpenStreetMap file; may start with $SUMO_HOME/")
     routes: tuple[str, ...] = Field((), description="Route files for the network; none: trips are drawn between its fringe edges")
     sumocfg: str | None = Field(None, description="A .sumocfg that names network and demand")
     fcd: str | None = Field(None, description="A finished FCD file (XML, CSV or Parquet, may be gzipped); nothing is simulated")
@@ -91,7 +91,7 @@ class TrafficModel(_Model):
     step_s: Positive = Field(0.25, description="SUMO's step length")
     warmup_s: float = Field(300.0, ge=0, description="Time before the first frame")
     lateral_resolution_m: float = Field(0.8, ge=0, description="SUMO's sublane width; 0 makes lane changes instant jumps")
-    trips_per_s: Positive = Field(4.0, description="Rate of drawn trips; more than the network takes, so that N is held")
+    trips_per_s: Positive = Field(2.0, description="Rate of drawn trips; more than the network takes, so that N is held")
     max_depart_delay_s: Positive = Field(120.0, description="A trip that could not start for so long is given up")
     min_trip_m: float = Field(0.0, ge=0, description="Drawn trips are at least so long as the crow flies")
     edge_weights: dict[str, Annotated[float, Field(ge=0)]] = Field(

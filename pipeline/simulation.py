@@ -458,8 +458,7 @@ class _Watch:
     """Subscriptions to every vehicle on the road."""
 
     def __init__(self, connection: Any) -> None:
-        from traci import constants as tc
-
+        tc = sumo.constants()
         self._connection = connection
         self._wanted = (tc.VAR_POSITION3D, tc.VAR_ANGLE, tc.VAR_SLOPE, tc.VAR_SPEED, tc.VAR_TYPE)
         self._invalid = tc.INVALID_DOUBLE_VALUE

@@ -12,14 +12,15 @@ from __future__ import annotations
 import os
 import re
 import subprocess
+import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from pipeline.errors import InputError, MissingBackendError, RunError
 from pipeline.scenario import sumo_home
@@ -30,6 +31,7 @@ APT_LINE = "apt-get install libatomic1 libx11-6 libxext6 libxrender1 libgl1"
 _POLL_S = 0.1
 _LISTENS_S = 0.02
 _OPENS_WITHIN_S = 60.0
+_ENDS_WITHIN_S = 10.0
 _SHOWN_ERRORS = 12
 
 
@@ -87,6 +89,13 @@ def vehicle_classes() -> frozenset[str]:
     from sumolib.net.lane import SUMO_VEHICLE_CLASSES
 
     return frozenset(SUMO_VEHICLE_CLASSES)
+
+
+def constants() -> Any:
+    """The numbers that TraCI calls its variables by."""
+    from traci import constants
+
+    return constants
 
 
 def run(name: str, arguments: Sequence[str], folder: Path, log: Path | None = None, watch: Callable[[], None] | None = None) -> str:
@@ -182,10 +191,11 @@ def _close(connection: Any) -> None:
     """Close without a word when SUMO has hung up first."""
     import traci
 
-    try:
+    socket = connection._socket
+    with suppress(traci.exceptions.FatalTraCIError, OSError):
         connection.close(False)
-    except (traci.exceptions.FatalTraCIError, OSError):
-        connection.close = None
+    if socket is not None:
+        socket.close()
 
 
 @contextmanager
@@ -195,29 +205,40 @@ def served(arguments: Sequence[str], folder: Path) -> Iterator[Any]:
     from sumolib.miscutils import getFreeSocketPort
 
     port = getFreeSocketPort()
-    process = _start("sumo", [*arguments, "--remote-port", str(port)], folder, subprocess.DEVNULL, subprocess.PIPE)
+    # a file, because SUMO would wait for ever on a full pipe that nobody reads
+    with tempfile.TemporaryFile() as said:
+        process = _start("sumo", [*arguments, "--remote-port", str(port)], folder, subprocess.DEVNULL, said)
+        with process:
+            try:
+                connection = _attach(process, port)
+                try:
+                    yield connection
+                finally:
+                    _close(connection)
+            except traci.exceptions.FatalTraCIError:
+                raise _hung_up(process, said) from None
+            finally:
+                process.kill()
+
+
+def _hung_up(process: subprocess.Popen[bytes], said: IO[bytes]) -> RunError:
+    """Why SUMO closed its end: it says so on its way out."""
     try:
-        connection = _attach(process, port)
-        try:
-            yield connection
-        except traci.exceptions.FatalTraCIError:
-            process.kill()
-            _, said = process.communicate()
-            raise failure("sumo", process.returncode, said.decode("utf-8", "replace")) from None
-        finally:
-            _close(connection)
-    finally:
-        process.kill()
-        process.communicate()
+        process.wait(_ENDS_WITHIN_S)
+    except subprocess.TimeoutExpired:
+        return RunError("sumo closed its TraCI port, and did not say why")
+    said.seek(0)
+    return failure("sumo", process.returncode, said.read().decode("utf-8", "replace"))
 
 
 def _attach(process: subprocess.Popen[bytes], port: int) -> Any:
     """Connect as soon as SUMO listens; traci's own retries wait a whole second and print."""
+    import traci
+
     deadline = time.monotonic() + _OPENS_WITHIN_S
     while (connection := _connect("localhost", port)) is None:
         if process.poll() is not None:
-            said = process.stderr.read() if process.stderr else b""
-            raise failure("sumo", process.returncode, said.decode("utf-8", "replace"))
+            raise traci.exceptions.FatalTraCIError("sumo ended")
         if time.monotonic() > deadline:
             raise RunError(f"sumo did not open its TraCI port within {_OPENS_WITHIN_S:g} s")
         time.sleep(_LISTENS_S)
@@ -231,6 +252,11 @@ def _connect(host: str, port: int) -> Any:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ResourceWarning)
         try:
-            return traci.connect(port=port, host=host, numRetries=0)
+            connection = traci.connect(port=port, host=host, numRetries=0)
         except (traci.exceptions.FatalTraCIError, OSError):
             return None
+    socket = connection._socket
+    if socket.getsockname() == socket.getpeername():  # TCP may connect a free local port to itself, and wait for ever
+        socket.close()
+        return None
+    return connection

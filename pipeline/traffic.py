@@ -146,7 +146,7 @@ def _simulated(scenario: Scenario, folder: Path, progress: Progress) -> Iterator
     try:
         seconds = simulation.simulate(prepared, progress)
         yield Recording(
-            fcd.read(path),
+            fcd.read(path) if path.stat().st_size > 1 else (),  # where no vehicle drove, SUMO writes no header, only a line's end
             prepared.timing.window(),
             sizes,
             simulation.place(scenario),
