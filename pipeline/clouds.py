@@ -3,8 +3,8 @@ r"""How does a point cloud of an empty scan get in and out?
 Frame: the world's (right-handed, x east, y north, z up), metres, float64. Steps: read the file by its suffix; bring the points
 into the world frame; drop, and count, the returns that are missing (NaN) or infinite.
 
-- ``.pcd``: DATA ascii, binary or binary_compressed; fields in any order, of any TYPE, SIZE and COUNT. A VIEWPOINT other than the
-  identity is the sensor's pose in the world: the points then stand in the sensor's frame, and
+- ``.pcd``: DATA ascii, binary or binary_compressed; fields in any order, of any TYPE, SIZE and COUNT. A VIEWPOINT other than
+  the identity is the sensor's pose in the world: the points then stand in the sensor's frame, and
 
   .. math:: p_\mathrm{world} = R(q)\, p_\mathrm{sensor} + t, \qquad
             \mathrm{VIEWPOINT} = t_x\, t_y\, t_z\, q_w\, q_x\, q_y\, q_z.
@@ -385,7 +385,8 @@ def _read_ply(path: Path, where: str) -> NDArray[np.float64]:
     order, elements, start, lines = _ply_header(where, data)
     names = [element.name for element in elements]
     if "vertex" not in names:
-        raise InputError(where, f"has no element 'vertex' (its elements: {' '.join(names) or 'none'})", "vertices with x, y and z")
+        found = f"has no element 'vertex' (its elements: {' '.join(names) or 'none'})"
+        raise InputError(where, found, "vertices with x, y and z")
     at = names.index("vertex")
     vertex, last = elements[at], at == len(elements) - 1
     formats = _ply_formats(where, vertex, order)

@@ -1,0 +1,190 @@
+r"""Which effects exist, and what may one do?
+
+The plain scene has straight beams, opaque static geometry and no weather. Everything beyond it is an *effect*: a table
+``[effects.<name>]`` in the scenario, and one module of that name in this folder, imported only when it is named. An effect acts in one
+stage, in one of four ways:
+
+========== ======== ===========================================================================================
+kind       stage    what it does
+========== ======== ===========================================================================================
+expand     scan     turns a beam into weighted sub-beams; the weights of a beam add up to 1
+transmit   scan     cuts a cast beam into pieces, each with the share of the beam that gets there
+transmit   score    gives the share of a beam that gets as far as each voxel that it crosses
+detect     score    gives the chance that a target at a range sends a return that is noticed
+traffic    traffic  changes who moves, and how boxes are made of it
+========== ======== ===========================================================================================
+
+.. math:: hits(v) = \sum_{beams} \sum_{sub} w_{sub} \cdot transmit(beam, v) \cdot detect(range(v))
+
+Weights are expectations, not dice. Without effects each factor is 1, and hits counts beams.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from pipeline.errors import InputError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pipeline.crossings import Crossings
+    from pipeline.raycast import EmptyScan
+    from pipeline.scenario import Scenario
+    from pipeline.sensors import Sensor
+    from pipeline.sites import Site
+    from pipeline.world import World
+
+KINDS: dict[str, tuple[str, str]] = {
+    "range_limit": ("score", "detect"),
+    "rain": ("score", "detect"),
+    "fog": ("score", "detect"),
+    "dropout": ("score", "detect"),
+    "moving_occlusion": ("score", "transmit"),
+    "divergence": ("scan", "expand"),
+    "mount_sway": ("scan", "expand"),
+    "foliage": ("scan", "transmit"),
+    "slope": ("traffic", "traffic"),
+    "articulated": ("traffic", "traffic"),
+    "pedestrians_bicycles": ("traffic", "traffic"),
+}
+"""Every effect: the stage that it acts in, and its kind. Composed in this order within a stage."""
+
+SELF_ACTING = "slope"
+"""The one effect that switches itself on, when the network has relief: leaving it out would be wrong."""
+
+
+class Parameters(BaseModel):
+    """Base of an effect's parameters: frozen, unknown keys are errors."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+@dataclass(frozen=True)
+class Effect:
+    """Base of all effects.
+
+    Attributes
+    ----------
+    parameters
+        As the scenario names them, checked.
+    NAME, SOURCE
+        The effect's name, and where its model is published.
+    Model
+        The class of ``parameters``.
+    """
+
+    parameters: Any
+    NAME: ClassVar[str]
+    SOURCE: ClassVar[str]
+    Model: ClassVar[type[Parameters]]
+
+    def idle(self, scene: Scene) -> str | None:
+        """Why the effect provably cannot change the result in this scene; None when it can."""
+        del scene
+        return None
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What an effect may look at to tell whether it is called for."""
+
+    scenario: Scenario
+    world: World
+    sites: tuple[Site, ...]
+
+
+class Detect(Effect):
+    """The chance that a return is noticed."""
+
+    def detect(self, range_m: NDArray[np.float64], sensor: Sensor) -> NDArray[np.float64]:
+        """Chance (n,), 0 to 1, for targets at ``range_m`` (n,) metres from the sensor."""
+        raise NotImplementedError
+
+
+class Expand(Effect):
+    """One beam into weighted sub-beams."""
+
+    def expand(
+        self, directions: NDArray[np.float64], sensor: Sensor
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+        """Sub-beams (m, 3) along the world's axes, the row of ``directions`` (n, 3) that each comes from (m,), ascending, and
+        its weight (m,); the weights of one beam add up to 1."""
+        raise NotImplementedError
+
+
+class TransmitScan(Effect):
+    """What gets beyond static surfaces."""
+
+    def opaque(self, world: World) -> World:
+        """The world without what this effect lets beams through."""
+        raise NotImplementedError
+
+    def pieces(self, scan: EmptyScan, site: Site, world: World) -> EmptyScan:
+        """Cut beams that were cast at :meth:`opaque` into pieces, with ``from_m`` and ``weight``."""
+        raise NotImplementedError
+
+
+class TransmitScore(Effect):
+    """What gets as far as a voxel."""
+
+    def prepare(self, scenario: Scenario, out: Path) -> None:
+        """Read what :meth:`share` needs, once, before any site is scored."""
+        raise NotImplementedError
+
+    def share(self, crossings: Crossings) -> NDArray[np.float64]:
+        """Share (k,), 0 to 1, of its beam that gets as far as each crossing of ``crossings``."""
+        raise NotImplementedError
+
+
+class Traffic(Effect):
+    """Who moves, and how boxes are made of it; the traffic stage knows these by name."""
+
+
+def make(name: str, parameters: dict[str, Any], place: str) -> Effect:
+    """Import one effect and check its parameters.
+
+    Raises
+    ------
+    InputError
+        For an effect that does not exist (naming the nearest), or parameters that are wrong.
+    """
+    if name not in KINDS:
+        near = difflib.get_close_matches(name, KINDS, 1, 0.4)
+        right = f"did you mean {near[0]}?" if near else f"known are {', '.join(KINDS)}"
+        raise InputError(f"{place}.{name}", "unknown effect", right)
+    module = importlib.import_module(f"pipeline.effects.{name}")
+    kind: type[Effect] = module.EFFECT
+    try:
+        return kind(kind.Model.model_validate(parameters))
+    except ValidationError as error:
+        item = error.errors()[0]
+        key = ".".join(str(part) for part in item["loc"])
+        if item["type"] == "extra_forbidden":
+            known = list(kind.Model.model_fields)
+            near = difflib.get_close_matches(key, known, 1, 0.5)
+            right = f"did you mean {near[0]}?" if near else f"known here are {', '.join(known) or 'none'}"
+            raise InputError(f"{place}.{name}.{key}", "unknown key", right) from None
+        if item["type"] == "missing":
+            raise InputError(f"{place}.{name}.{key}", "missing", "this key is needed") from None
+        raise InputError(f"{place}.{name}.{key}".rstrip("."), f"{item['input']!r}", item["msg"]) from None
+
+
+def of(scenario: Scenario, stage: str) -> tuple[Effect, ...]:
+    """The effects that a scenario names and that act in ``stage``, in the order of :data:`KINDS`."""
+    place = f"{scenario.file}: effects"
+    named = [name for name, (where, _) in KINDS.items() if where == stage and name in scenario.effects]
+    return tuple(make(name, dict(scenario.effects[name]), place) for name in named)
+
+
+def settings(effects: Iterable[Effect]) -> dict[str, Any]:
+    """What a stage's inputs say of its effects: empty when there is none."""
+    return {effect.NAME: effect.parameters.model_dump(mode="json") for effect in effects}
