@@ -1,7 +1,6 @@
 """Which voxels does each beam of a site cross, and at which range?
 
-Where effects weight beams, counting is not enough: every crossing is listed, weighted, and added up in whole multiples of 2**-32,
-so that the sum does not depend on the order of beams.
+Where effects weight beams, counting is not enough: every crossing is listed with its range, a few thousand pieces at a time.
 """
 
 from __future__ import annotations
@@ -15,9 +14,6 @@ from numpy.typing import NDArray
 
 from pipeline.grid import Grid
 from pipeline.kernels import crossings as kernels
-
-UNIT = 2**32
-"""A weight of 1 in hits that are weighted."""
 
 _ROWS = 2048  # beams listed at once: bounds the memory
 
@@ -64,7 +60,9 @@ class Crossings:
         return np.repeat(np.arange(len(self.first) - 1), np.diff(self.first))
 
 
-def listed(site: dict[str, Any], ends_m: NDArray[np.float64], from_m: NDArray[np.float64] | None, grid: Grid) -> Iterator[Crossings]:
+def listed(
+    site: dict[str, Any], ends_m: NDArray[np.float64], from_m: NDArray[np.float64] | None, grid: Grid
+) -> Iterator[Crossings]:
     """All crossings of a site's beam pieces, a few thousand pieces at a time.
 
     ``from_m`` is how far along its beam each piece starts; None where all start at the sensor.
@@ -84,8 +82,3 @@ def listed(site: dict[str, Any], ends_m: NDArray[np.float64], from_m: NDArray[np
         cells, enter, leave = np.empty(total, dtype=np.int64), np.empty(total), np.empty(total)
         kernels.crossings(o, ends / grid.voxel_m, begin, shape, grid.voxel_m, first, cells, enter, leave)
         yield Crossings(site, grid, rows, first, ends, cells, enter, leave)
-
-
-def add(found: Crossings, weights: NDArray[np.float64], hits: NDArray[np.int64]) -> None:
-    """Add ``weights`` (k,), each 0 to 1, to ``hits`` (flat, int64, multiples of 2**-32)."""
-    kernels.accumulate(found.cells, np.rint(weights * UNIT).astype(np.int64), hits)

@@ -92,19 +92,19 @@ class Field:
         """Entropy of each voxel in ``cells``."""
         return self.entropies_bit[self.classes]
 
-    def score(self, hits: NDArray[np.uint32], gamma: float) -> Score:
+    def score(self, hits: NDArray[np.uint32] | NDArray[np.int64], gamma: float, unit: int = 1) -> Score:
         """The score of one site.
 
         Parameters
         ----------
         hits
-            Beams that cross each voxel, flat, (nx * ny * nz,) uint32.
+            Beams that cross each voxel, flat, (nx * ny * nz,) uint32, or int64 in multiples of 1 / ``unit``.
         gamma
             Cap, 0 or above, may be fractional or infinite.
         """
         capped, below, seen = (np.zeros(len(self.sizes), dtype=np.int64) for _ in range(3))
-        march.tally(hits, self.cells, self.classes, gamma, capped, below, seen)
-        egvs = self._sum(gamma, capped, below)
+        march.tally(hits, self.cells, self.classes, gamma * unit, capped, below, seen)
+        egvs = self._sum(gamma, capped, below, unit)
         share = self._sum(1.0, seen, np.zeros_like(seen)) / self.total_bit if len(self.cells) else 0.0
         return Score(egvs, share)
 
@@ -125,12 +125,12 @@ class Field:
             return float("inf") if len(self.cells) else 0.0
         return self._sum(gamma, self.sizes, np.zeros_like(self.sizes))
 
-    def _sum(self, gamma: float, capped: NDArray[np.int64], below: NDArray[np.int64]) -> float:
-        """Sum over classes of H * (gamma * capped + below), exact, rounded once."""
+    def _sum(self, gamma: float, capped: NDArray[np.int64], below: NDArray[np.int64], unit: int = 1) -> float:
+        """Sum over classes of H * (gamma * capped + below / unit), exact, rounded once."""
         cap, share = (0, 1) if np.isinf(gamma) else gamma.as_integer_ratio()
         rows = zip(self._scaled, capped.tolist(), below.tolist(), strict=True)
-        total = sum(entropy * (cap * full + share * part) for entropy, full, part in rows if full or part)
-        return total / (share << _SCALE)
+        total = sum(entropy * (cap * unit * full + share * part) for entropy, full, part in rows if full or part)
+        return float(total / (share * unit << _SCALE))
 
 
 @dataclass(frozen=True)

@@ -1,14 +1,14 @@
 """How does a run look from above?
 
-Each figure is SVG text, made of world-frame metres (x east, y north; up on the page is north), for the report and for any other page:
+Each figure is SVG text, made of world-frame metres (x east, y north; north is up), for the report and for any other page:
 
 - :func:`occupancy`: a field over the region, summed along z, with the static footprints and the sites;
 - :func:`site_map`: the sites, coloured by score, numbered by rank;
 - :func:`view`: what one site sees or misses; :func:`scale` is the colour scale that such figures share.
 
 The text is written here, not by a plotting library: colours then follow the page (light, dark, print) through the classes in
-``STYLE``, lettering stays text, and the bytes depend on no installed font. Rasters are indexed PNG images, one for light and one for
-dark pages, whose darkest (brightest) colour is the largest value, so that what matters stands out on both.
+``STYLE``, lettering stays text, and the bytes depend on no installed font. Rasters are indexed PNG images, one for light pages,
+where the largest value is darkest, and one for dark pages, where it is brightest: what matters stands out on both.
 :func:`standalone` makes a file of a figure.
 """
 
@@ -90,7 +90,6 @@ def _style() -> str:
 .plan .spot {{ fill: var(--halo); stroke: currentColor; stroke-width: 1.3; }}
 .plan .lead {{ stroke: currentColor; stroke-width: .9; fill: none; }}
 .plan .sensor {{ fill: #e8590c; stroke: var(--halo); stroke-width: 1.5; }}
-.plan .shade {{ fill: rgb({_SHADE[0]} {_SHADE[1]} {_SHADE[2]} / {_SHADE[3] / 255:.2f}); }}
 .plan image {{ image-rendering: pixelated; }}
 .plan .night {{ display: none; }}
 {light}
@@ -127,6 +126,16 @@ class Spot:
     z_m: float
     egvs: float
     rank: int
+
+
+@dataclass(frozen=True)
+class Stand:
+    """A sensor in its place: where it stands, which voxels its beams cross, (nx, ny, nz) bool, and what a figure of it shows."""
+
+    spot: Spot
+    crossed: NDArray[np.bool_]
+    layers: Sequence[Layer]
+    box: Box
 
 
 # ---- what stands there
@@ -210,13 +219,11 @@ def site_map(grid: Grid, field: Field2, layers: Sequence[Layer], spots: Sequence
     parts += [_place(plan, place, low, high, radius, crowded) for place in reversed(places)]
     named = places if not crowded else [*places[:10], places[-1]]
     parts += _labels(plan, places, named, radius)
-    return plan.svg(parts, alt, bar=_Bar(low, high, "EGVS (bit)", even=True))
+    return plan.svg(parts, alt, bar=_Bar(low, high, "EGVS (bit)", even=True) if high > low else None)
 
 
-def view(
-    grid: Grid, field: Field2, peak: float, unseen: NDArray[np.bool_], layers: Sequence[Layer], spot: Spot, box: Box, name: str, alt: str
-) -> str:
-    """Entropy from above that one site sees, or misses.
+def view(grid: Grid, field: Field2, peak: float, stand: Stand, name: str, alt: str) -> str:
+    """Entropy from above that one site sees, or misses; columns of voxels that no beam crosses at any height are shaded.
 
     Parameters
     ----------
@@ -224,20 +231,17 @@ def view(
         Entropy summed along z, bits, (nx, ny).
     peak
         The value at the end of the colour scale.
-    unseen
-        Columns of voxels that no beam crosses at any height, (nx, ny); shaded.
-    box
-        What the figure shows.
     name
         Makes ids unique on a page.
     """
-    plan = _Plan(box, name, width=460.0, tallest=420.0)
-    shade = _png(_halve(unseen.astype(np.float64), np.min).T[::-1] > 0, bytes((*_SHADE[:3], *_SHADE[:3])), bytes((0, _SHADE[3])))
+    plan, spot = _Plan(stand.box, name, width=460.0, tallest=420.0), stand.spot
+    unseen = _fewer(np.asarray(~stand.crossed.any(axis=2), dtype=np.float64), np.min)
+    shade = _png(unseen.T[::-1] > 0, bytes((*_SHADE[:3], *_SHADE[:3])), bytes((0, _SHADE[3])))
     x, y = plan.x(spot.x_m), plan.y(spot.y_m)
     parts = [
-        plan.image(grid, shade, ""),
+        plan.image(grid, shade, "shadow"),
         _image(plan, grid, field, peak),
-        _outlines(plan, layers),
+        _outlines(plan, stand.layers),
         plan.roi(grid),
         _group(f'<path class="sensor" d="M{x:.1f} {y - 9:.1f}l7.8 13.5h-15.6z"/>', f"{spot.site}, the sensor"),
     ]
@@ -292,15 +296,15 @@ class _Plan:
     def image(self, grid: Grid, png: str, look: str) -> str:
         """A raster over the region of interest."""
         x, y, w, h = self.rectangle(grid)
-        return (
-            f'<image class="{look}" x="{x:.2f}" y="{y:.2f}" width="{w:.2f}" height="{h:.2f}" preserveAspectRatio="none" href="{png}"/>'
-        )
+        place = f'x="{x:.2f}" y="{y:.2f}" width="{w:.2f}" height="{h:.2f}"'
+        return f'<image class="{look}" {place} preserveAspectRatio="none" href="{png}"/>'
 
     def svg(self, parts: Iterable[str], alt: str, bar: _Bar | None = None) -> str:
         """The whole figure."""
         base = self.top + self.h
         tall = base + 40.0 + (56.0 if bar else 0.0)
-        clip = f'<clipPath id="{self.name}-clip"><rect x="{self.left:.1f}" y="{self.top:.1f}" width="{self.w:.1f}" height="{self.h:.1f}"/></clipPath>'
+        frame = f'<rect x="{self.left:.1f}" y="{self.top:.1f}" width="{self.w:.1f}" height="{self.h:.1f}"/>'
+        clip = f'<clipPath id="{self.name}-clip">{frame}</clipPath>'
         drawing = "\n".join(parts)
         return "\n".join(
             (
@@ -328,9 +332,7 @@ class _Plan:
         wide = 7.0 * max(len(t) for _, t in self._ticks[1])
         side, middle = self.left - 16.0 - wide, self.top + self.h / 2
         texts.append(f'<text x="{self.left + self.w / 2:.1f}" y="{base + 34:.1f}" text-anchor="middle">x, east (m)</text>')
-        texts.append(
-            f'<text transform="translate({side:.1f} {middle:.1f}) rotate(-90)" text-anchor="middle">y, north (m)</text>'
-        )
+        texts.append(f'<text transform="translate({side:.1f} {middle:.1f}) rotate(-90)" text-anchor="middle">y, north (m)</text>')
         return f'<path class="grid" d="{"".join(lines)}"/><path class="axis" d="{"".join(ticks)}"/>{"".join(texts)}'
 
     def _north(self) -> str:
@@ -341,7 +343,7 @@ class _Plan:
 
 @dataclass(frozen=True)
 class _Bar:
-    """A colour bar: from ``low`` to ``high``, with a square-root scale unless ``even``."""
+    """A colour bar: from ``low`` to ``high`` (above it), with a square-root scale unless ``even``."""
 
     low: float
     high: float
@@ -353,7 +355,8 @@ class _Bar:
         fill = f'<linearGradient id="{name}-scale">{stops}</linearGradient>'
         bar = f'<rect class="axis" style="fill:url(#{name}-scale)" x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="12"/>'
         ticks = "".join(
-            f'<path class="axis" d="M{at:.1f} {y + 12:.1f}v4"/><text x="{at:.1f}" y="{y + 28:.1f}" text-anchor="middle">{text}</text>'
+            f'<path class="axis" d="M{at:.1f} {y + 12:.1f}v4"/>'
+            f'<text x="{at:.1f}" y="{y + 28:.1f}" text-anchor="middle">{text}</text>'
             for at, text in self._ticks(x, width)
         )
         note = "" if self.even else " · square-root scale"
@@ -367,8 +370,6 @@ class _Bar:
     def _ticks(self, x: float, width: float) -> list[tuple[float, str]]:
         """Round values, no closer to each other than their lettering allows; on a square-root scale, finer towards zero."""
         span = self.high - self.low
-        if not span > 0:
-            return [(x + width, f"{self.high:,.6g}")]
         values = _nice(self.low, self.high, 6)
         if not self.even:
             values = [*_nice(0.0, span / 25, 2), *_nice(0.0, span / 4, 4), *values]
@@ -500,7 +501,7 @@ def _image(plan: _Plan, grid: Grid, field: Field2, peak: float) -> str:
     """A field as two images, one for light pages and one for dark ones."""
     if not peak > 0:
         return ""
-    share = np.sqrt(np.minimum(_halve(field, np.mean) / peak, 1.0))
+    share = np.sqrt(np.minimum(_fewer(field, np.mean) / peak, 1.0))
     index = np.where(share > 0, 1 + np.floor(share * 253.999), 0).astype(np.uint8).T[::-1]
     alpha = bytes([0, *(round(255 * _opacity(i / 254)) for i in range(255))])
     return "".join(
@@ -509,7 +510,7 @@ def _image(plan: _Plan, grid: Grid, field: Field2, peak: float) -> str:
     )
 
 
-def _halve(field: Field2, how: Callable[..., Any]) -> Field2:
+def _fewer(field: Field2, how: Callable[..., Any]) -> Field2:
     """Fewer, larger pixels where there are more than ``_PIXELS``; those at the far edges stand for the columns that are left."""
     factor = math.ceil(math.sqrt(field.size / _PIXELS))
     if factor <= 1:
@@ -544,5 +545,5 @@ def _png(index: NDArray[Any], palette: bytes, alpha: bytes) -> str:
 
 def _deflate(data: bytes) -> bytes:
     """A zlib stream from Arrow's compressor, which comes with the package: the system's may give other bytes elsewhere."""
-    gzip = pa.Codec("gzip", compression_level=6).compress(data, asbytes=True)
+    gzip: bytes = pa.Codec("gzip", compression_level=6).compress(data, asbytes=True)
     return b"\x78\x9c" + gzip[10:-8] + zlib.adler32(data).to_bytes(4, "big")

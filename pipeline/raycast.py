@@ -5,10 +5,12 @@ Embree (float32) answers *which triangle*, float64 *where*:
 1. The world is moved to the region of interest's own frame in float64.
 2. Embree holds every triangle enlarged by a rim that is wider than float32's error. What a beam truly meets, it meets there
    too; no beam leaks through a shared edge or vertex.
-3. Each proposed hit is placed in float64 on the true triangle. A beam that met only a rim is doubtful (a few in 10,000); its
-   first hit is searched among all true triangles in float64.
+3. Each proposed hit is placed in float64 on the true triangle. A beam that met only a rim, or came within 0.02 mm of an edge, is
+   doubtful (one in a thousand); its first hit is searched among all true triangles in float64.
 
-So the outcome is that of float64 throughout, with the two rules of :mod:`pipeline.kernels.rays`, at Embree's speed.
+So which surface comes first is float32's choice only away from the edges of what it proposes. What that leaves: where a
+surface stands on the middle of another (a wall on the ground), a beam within some 1e-5 m of the line between them may be
+given the farther of the two.
 """
 
 from __future__ import annotations
@@ -19,13 +21,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.errors import InputError
 from pipeline.grid import Roi
 from pipeline.kernels import rays
 from pipeline.world import World
 
 _RIM_M = 1e-4
-_RIM_SHARE = 2.0**-21  # of the scene's extent: eight times float32's rounding
-_MAX_SHIFT_M = 1.0  # how far a needle's tip may move when the needle is enlarged
+_RIM_SHARE = 2.0**-21  # of the triangle's largest coordinate: eight times float32's rounding
+_MAX_SHIFT_M = 1.0  # a needle whose tip would move further when it is enlarged is held as a rectangle
+_PAD_M = 1e-5  # more than the rules of kernels.rays and float64's rounding ask for
 
 
 @dataclass(frozen=True)
@@ -42,12 +46,16 @@ class EmptyScan:
         False where nothing was met within the sensor's range, (n,) bool.
     doubtful
         How many beams float32 alone would not have settled.
+    from_m, weight
+        Only where effects cut or weight beams: where along its beam each piece starts, and its share of the beam, (n,) float64.
     """
 
     beam: NDArray[np.uint32]
     ends_m: NDArray[np.float64]
     returned: NDArray[np.bool_]
     doubtful: int = 0
+    from_m: NDArray[np.float64] | None = None
+    weight: NDArray[np.float64] | None = None
 
 
 class Caster:
@@ -65,12 +73,14 @@ class Caster:
         self._origin_m = np.asarray(roi.origin_m, dtype=np.float64)
         self._size_m = np.asarray(roi.size_m, dtype=np.float64)
         triangles = world.triangles_m - self._origin_m
-        cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-        area2 = np.sqrt((cross**2).sum(axis=1))
-        solid = area2 > 0.0
-        self._triangles, self._normals = triangles[solid], cross[solid] / area2[solid, None]
-        self._balls, self._groups = _balls(self._triangles, 1), _balls(self._triangles, rays.GROUP)
-        self._scene = _tree(self._triangles, area2[solid]) if len(self._triangles) else None
+        if not np.isfinite(triangles).all():
+            raise InputError("statics", "a triangle has a corner that is no number", "finite metres")
+        met = np.flatnonzero(_cross(triangles).any(axis=1))  # the others have no plane, and what is beside them is met
+        met = met[_along_curve(triangles[met].mean(axis=1))]
+        self._triangles = triangles[met]
+        self._planes = _planes(self._triangles)
+        self._boxes, self._starts = _boxes(self._triangles)
+        self._owner, self._scene = _tree(self._triangles) if len(met) else (np.empty(0, dtype=np.int64), None)
 
     def scan(self, position_m: tuple[float, float, float], directions: NDArray[np.float64], range_m: float) -> EmptyScan:
         """Cast the beams of one sensor.
@@ -103,36 +113,100 @@ class Caster:
         if self._scene is None or len(d) == 0:
             return ranges, 0
         start = np.broadcast_to(o_roi_m.astype(np.float32), d.shape)
-        proposed = self._scene.run(np.ascontiguousarray(start), d.astype(np.float32))
+        found = self._scene.run(np.ascontiguousarray(start), d.astype(np.float32))
+        proposed = self._owner[found]
         doubtful = np.empty(len(d), dtype=np.int64)
-        count = rays.settle(proposed, self._triangles, self._normals, o_roi_m, d, ranges, doubtful)
-        rays.search(doubtful[:count], self._triangles, self._normals, self._balls, self._groups, o_roi_m, d, ranges)
+        count = rays.settle(proposed, self._triangles, self._planes, o_roi_m, d, ranges, doubtful)
+        rays.search(doubtful[:count], self._triangles, self._planes, self._boxes, self._starts, o_roi_m, d, ranges)
         return ranges, int(count)
 
 
-def _balls(triangles: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """A ball round each ``size`` consecutive triangles, (groups, 4): centre and radius."""
-    starts = np.arange(0, len(triangles), size)
-    if len(starts) == 0:
-        return np.empty((0, 4))
-    low = np.minimum.reduceat(triangles.min(axis=1), starts)
-    high = np.maximum.reduceat(triangles.max(axis=1), starts)
-    radius = np.sqrt(((high - low) ** 2).sum(axis=1)) / 2
-    return np.column_stack([(low + high) / 2, radius * (1 + 1e-9) + 2 * rays.EDGE_M])
+def standing_on(triangles: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which triangles (n, 3, 3), seen from a sensor, it stands on (to 1 micrometre), (n,) bool."""
+    met = np.flatnonzero(_cross(triangles).any(axis=1))
+    touched, on = np.empty(len(met), dtype=np.bool_), np.zeros(len(triangles), dtype=np.bool_)
+    rays.stands_on(triangles[met], _planes(triangles[met]), np.zeros(3), touched)
+    on[met] = touched
+    return on
 
 
-def _tree(triangles: NDArray[np.float64], area2: NDArray[np.float64]) -> Any:
-    """Embree's tree over the triangles, each scaled from its incentre so that its sides move out by the rim."""
+def _cross(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Normals as long as twice the area, (n, 3); exactly zero where there is none."""
+    cross: NDArray[np.float64] = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    return np.where(((cross**2).sum(axis=1) > 0.0)[:, None], cross, 0.0)
+
+
+def _planes(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The four planes of each triangle, see :func:`pipeline.kernels.rays.planes`."""
+    cross, found = _cross(triangles), np.empty((len(triangles), 4, 4))
+    rays.planes(triangles, cross / np.sqrt((cross**2).sum(axis=1))[:, None], found)
+    return found
+
+
+def _along_curve(points: NDArray[np.float64]) -> NDArray[np.int64]:
+    """An order of the points (n, 3) in which neighbours in space lie together: along a Z-shaped curve (Morton 1966)."""
+    low = points.min(axis=0, initial=np.inf)
+    cells = ((points - low) * (2.0**20 / max(float((points - low).max(initial=0.0)), _PAD_M) * (1 - 1e-9))).astype(np.int64)
+    key = np.zeros(len(points), dtype=np.int64)
+    for bit in range(20):
+        for axis in range(3):
+            key |= (cells[:, axis] >> bit & 1) << (3 * bit + axis)
+    return np.argsort(key, kind="stable")
+
+
+def _boxes(triangles: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Boxes round the triangles, round groups of these, and so on up to one; and where each level starts."""
+    low, high = triangles.min(axis=1) - _PAD_M, triangles.max(axis=1) + _PAD_M
+    levels = [np.column_stack([low, high])]
+    while len(low) > 1:
+        firsts = np.arange(0, len(low), rays.GROUP)
+        low, high = np.minimum.reduceat(low, firsts), np.maximum.reduceat(high, firsts)
+        levels.append(np.column_stack([low, high]))
+    return np.concatenate(levels), np.cumsum([0, *map(len, levels)])
+
+
+def _tree(triangles: NDArray[np.float64]) -> tuple[NDArray[np.int64], Any]:
+    """Embree's tree over the enlarged triangles; and the triangle behind each of its own, the last one being none (-1).
+
+    A triangle is scaled from its incentre so that its sides move out by the rim. That moves a needle's tip far; a needle is
+    held as the two triangles of a rectangle that covers it.
+    """
     from embreex.mesh_construction import TriangleMesh
     from embreex.rtcore_scene import EmbreeScene
 
-    rim = max(_RIM_M, _RIM_SHARE * float(np.abs(triangles).max()))
-    sides = np.sqrt(((np.roll(triangles, -1, axis=1) - np.roll(triangles, -2, axis=1)) ** 2).sum(axis=2))  # opposite corner i
-    perimeter = sides.sum(axis=1)
-    incentre = (triangles * sides[:, :, None]).sum(axis=1) / perimeter[:, None]
+    rim = _RIM_M + _RIM_SHARE * np.abs(triangles).max(axis=(1, 2))
+    sides = np.roll(triangles, -2, axis=1) - np.roll(triangles, -1, axis=1)  # opposite corner i
+    lengths = np.sqrt((sides**2).sum(axis=2))
+    perimeter = lengths.sum(axis=1)
+    incentre = (triangles * lengths[:, :, None]).sum(axis=1) / perimeter[:, None]
     from_centre = triangles - incentre[:, None]
     reach = np.sqrt((from_centre**2).sum(axis=2)).max(axis=1)
-    share = np.minimum(rim * perimeter / area2, _MAX_SHIFT_M / reach)  # inradius = area2 / perimeter
+    cross = _cross(triangles)
+    share = rim * perimeter / np.sqrt((cross**2).sum(axis=1))  # inradius = 2 area / perimeter
+    needles = np.flatnonzero(share * reach > _MAX_SHIFT_M)
+    share[needles] = 0.0
+    enlarged = triangles + from_centre * share[:, None, None]
+    first, second = _rectangles(triangles[needles], sides[needles], cross[needles], rim[needles])
+    enlarged[needles] = first
     scene = EmbreeScene()
-    TriangleMesh(scene, (triangles + from_centre * share[:, None, None]).astype(np.float32))
-    return scene
+    TriangleMesh(scene, np.concatenate([enlarged, second]).astype(np.float32))
+    return np.concatenate([np.arange(len(triangles)), needles, [-1]]), scene
+
+
+def _rectangles(
+    triangles: NDArray[np.float64], sides: NDArray[np.float64], cross: NDArray[np.float64], rim: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Two triangles each, (n, 3, 3), that together cover a triangle and a rim round it; one side along its longest."""
+    rows = np.arange(len(triangles))
+    u = sides[rows, (sides**2).sum(axis=2).argmax(axis=1)]
+    u = u / np.sqrt((u**2).sum(axis=1))[:, None]
+    v = np.cross(cross, u)
+    v = v / np.sqrt((v**2).sum(axis=1))[:, None]
+    base = triangles[:, 0]
+    along, across = (((triangles - base[:, None]) * axis[:, None]).sum(axis=2) for axis in (u, v))
+    corners = [
+        base + u * (at_u + turn_u * rim)[:, None] + v * (at_v + turn_v * rim)[:, None]
+        for at_u, turn_u in ((along.min(axis=1), -1), (along.max(axis=1), 1))
+        for at_v, turn_v in ((across.min(axis=1), -1), (across.max(axis=1), 1))
+    ]
+    return np.stack([corners[0], corners[2], corners[3]], axis=1), np.stack([corners[0], corners[3], corners[1]], axis=1)

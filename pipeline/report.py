@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,6 +41,17 @@ CLOSE = 0.01
 _STAGES = ("traffic", "statics", "tpog", "scan", "score")
 _UNSTABLE = ("sumo_seconds",)
 """What a stage says that another run says differently."""
+
+_LEFT_OUT = (
+    ("vehicles that hide one another", "moving_occlusion"),
+    ("rain", "rain"),
+    ("fog", "fog"),
+    ("the weakening of a beam with distance", "range_limit"),
+    ("leaves that let some light through", "foliage"),
+    ("people on foot and on bicycles", "pedestrians_bicycles"),
+    ("dirt and glare", ""),
+)
+"""What no plain scene models, and the effect that does."""
 
 Row = dict[str, Any]
 
@@ -72,6 +84,7 @@ def _shown(scenario: Scenario) -> dict[str, Any]:
         "frame_period_s": scenario.traffic.frame_period_s,
         "vehicles": scenario.traffic.vehicles,
         "gamma": repr(scenario.score.gamma),
+        "effects": scenario.effects,
     }
 
 
@@ -185,7 +198,8 @@ def _figures(scenario: Scenario, out: Path, ranking: Ranking, tpog: Tpog) -> Dra
     occupied = tpog.counts.sum(axis=2) / tpog.frames
     top = ranking.best[0]
     field = Field.of(tpog.counts, tpog.frames, grid)
-    tpog_figure, views, scale = "", (), ""
+    tpog_figure, scale = "", ""
+    views: tuple[View, ...] = ()
     if tpog.counts.any():
         busiest = np.unravel_index(int(occupied.argmax()), occupied.shape)
         x, y = (o + (i + 0.5) * grid.voxel_m for o, i in zip(grid.origin_m, busiest, strict=False))
@@ -193,7 +207,7 @@ def _figures(scenario: Scenario, out: Path, ranking: Ranking, tpog: Tpog) -> Dra
             f"Occupancy of the region of interest by traffic, seen from above: {np.count_nonzero(occupied) / occupied.size:.0%} of "
             f"its area is used by vehicles; the busiest place is near x = {x:.0f} m, y = {y:.0f} m."
         )
-        label = "Mean height of traffic in the column, in voxels: occupancy probabilities summed along z"
+        label = "Occupied voxels in the column, on average: probabilities summed along z"
         tpog_figure = figures.occupancy(grid, occupied, label, layers, spots, alt)
     if len(field.cells):
         views, scale = _views(scenario, out, ranking, field, layers)
@@ -207,33 +221,34 @@ def _figures(scenario: Scenario, out: Path, ranking: Ranking, tpog: Tpog) -> Dra
 def _views(
     scenario: Scenario, out: Path, ranking: Ranking, field: Field, layers: Sequence[figures.Layer]
 ) -> tuple[tuple[View, ...], str]:
-    grid = field.grid
-    rows = {row["site"]: row for row in ranking.extremes}
-    everything = _columns(field, np.ones(len(field.cells), dtype=np.bool_))
-    peak = float(everything.max())
-    box = figures.extent(grid, [s for s in ranking.spots if s.site in rows])
+    """What the best and the worst site see and miss, and the colour scale of these figures."""
+    names = [row["site"] for row in ranking.extremes]
+    spots = {spot.site: spot for spot in ranking.spots if spot.site in names}
+    peak = float(_columns(field, np.ones(len(field.cells), dtype=np.bool_)).max())
+    box = figures.extent(field.grid, list(spots.values()))
     found: dict[str, View] = {}
-    for name, hits in visibility.hits_of(scenario, out, grid, rows):
-        row, crossed = rows[name], hits.ravel()[field.cells] > 0
-        unseen, spot = ~(hits > 0).any(axis=2), next(s for s in ranking.spots if s.site == name)
-        number = list(rows).index(name)
+    for name, hits in visibility.hits_of(scenario, out, field.grid, names):
+        place = names.index(name)
+        stand = figures.Stand(spots[name], hits > 0, layers, box)
+        found[name] = _view(ranking.extremes[place], field, peak, stand, place, len(ranking.rows) == 1)
+    return tuple(found[name] for name in names), figures.scale(peak, "Entropy in the column (bit)")
 
-        def draw(which: NDArray[np.bool_], word: str, share: float) -> str:
-            alt = f"{share:.1%} of the entropy, {word} by {spot.site}, seen from above; {unseen.mean():.0%} of the area is in its shade."  # noqa: B023
-            columns = _columns(field, which)
-            return figures.view(grid, columns, peak, unseen, layers, spot, box, f"view-{number}-{word}", alt)  # noqa: B023
 
-        title = ("Best site" if len(ranking.rows) > 1 else "The site") if number == 0 else "Last site"
-        seen, missed = draw(crossed, "seen", row["entropy_seen"]), draw(~crossed, "missed", 1 - row["entropy_seen"])
-        found[name] = View(row, title, seen, missed, int(crossed.sum()), len(crossed))
-    return tuple(found[name] for name in rows), figures.scale(peak, "Entropy in the column (bit)")
+def _view(row: Row, field: Field, peak: float, stand: figures.Stand, place: int, alone: bool) -> View:
+    crossed = stand.crossed.ravel()[field.cells]
+    drawn: dict[str, str] = {}
+    for word, which, share in (("seen", crossed, row["entropy_seen"]), ("missed", ~crossed, 1 - row["entropy_seen"])):
+        alt = f"From above: the {share:.1%} of the entropy {word} by {row['site']} at x = {row['x_m']:g} m, y = {row['y_m']:g} m."
+        drawn[word] = figures.view(field.grid, _columns(field, which), peak, stand, f"view-{place}-{word}", alt)
+    title = "Last site" if place else "The site" if alone else "Best site"
+    return View(row, title, drawn["seen"], drawn["missed"], int(crossed.sum()), len(crossed))
 
 
 def _columns(field: Field, which: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Entropy summed along z over some of the voxels, (nx, ny) bits; added up in the order of the voxels."""
     nx, ny, nz = field.grid.shape
     summed = np.bincount(field.cells[which] // nz, weights=field.per_cell_bit[which], minlength=nx * ny)
-    return summed.reshape(nx, ny)
+    return summed.astype(np.float64).reshape(nx, ny)
 
 
 # ---- the page
@@ -251,7 +266,7 @@ def _page(scenario: Scenario, ranking: Ranking, tpog: Tpog, drawn: Drawn, record
         lstrip_blocks=True,
     )
     environment.filters |= {"svg": Markup, "share": _share, "whole": lambda value: f"{value:,.0f}", "plain": _plain}
-    rows = ranking.rows
+    rows, effects = ranking.rows, _effects(scenario, record)
     crowded = len(rows) > LISTED
     return environment.get_template("report.html.j2").render(
         scenario=scenario,
@@ -259,7 +274,7 @@ def _page(scenario: Scenario, ranking: Ranking, tpog: Tpog, drawn: Drawn, record
         first=rows[:FIRST] if crowded else rows,
         last=rows[-LAST:] if crowded else (),
         hidden=len(rows) - FIRST - LAST if crowded else 0,
-        shared={row["rank"] for row in rows if [r["rank"] for r in rows].count(row["rank"]) > 1},
+        shared={rank for rank, count in Counter(row["rank"] for row in rows).items() if count > 1},
         headline=_headline(ranking, tpog),
         nearest=_nearest(ranking),
         limit_share=_limit_share(rows[0]),
@@ -274,9 +289,16 @@ def _page(scenario: Scenario, ranking: Ranking, tpog: Tpog, drawn: Drawn, record
         costs=_costs(record),
         total_s=math.fsum(cost["seconds"] or 0.0 for cost in _costs(record)),
         artefacts=[(a, digest) for name in _STAGES for a, digest in _stage(record, name).get("artefacts", {}).items()],
-        effects=[e if isinstance(e, str) else str(e.get("name", e)) for e in record.get("effects", [])],
+        effects=effects,
+        left_out=[what for what, effect in _LEFT_OUT if effect not in effects],
         version=__version__,
     )
+
+
+def _effects(scenario: Scenario, record: dict[str, Any]) -> list[str]:
+    """Names of the effects that the scenario or the record names, each once."""
+    noted = [e if isinstance(e, str) else str(e["name"]) for e in record.get("effects", [])]
+    return list(dict.fromkeys([*scenario.effects, *noted]))
 
 
 def _headline(ranking: Ranking, tpog: Tpog) -> str:
@@ -286,8 +308,7 @@ def _headline(ranking: Ranking, tpog: Tpog) -> str:
     if not tpog.counts.any():
         return "No traffic in the region: the sites cannot be ranked"
     if not top["egvs"] > 0:
-        what = "has" if others else "sees"
-        return f"No site {what} anything to see of the traffic: all score 0" if others else f"{top['site']} sees nothing of the traffic"
+        return "No site sees anything of the traffic" if others else f"{top['site']} sees nothing of the traffic"
     sees = f"sees {_share(top['entropy_seen'])} of the traffic’s uncertainty"
     if not others:
         return f"{top['site']}, the only site, {sees}"

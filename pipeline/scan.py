@@ -68,7 +68,7 @@ def run(
         return {"sites": len(known), "kept": False}
     about: list[dict[str, Any]] = []
     doubtful = 0
-    with tables.writer(out / ARTEFACTS[0], "scans") as file:
+    with tables.writer(out / ARTEFACTS[0], "scans", surveyed.columns) as file:
         for done in in_order(surveyed.scan, surveyed.sites, threads(jobs)):
             file.write(_columns(done))
             about.append(done.about)
@@ -89,7 +89,7 @@ def run(
 def _columns(done: SiteScan) -> dict[str, Any]:
     ends = done.scan.ends_m
     name = pa.DictionaryArray.from_arrays(np.zeros(len(ends), dtype=np.int32), [done.site.site])
-    return {
+    columns = {
         "site": name.cast(pa.string()),
         "beam": done.scan.beam,
         "dx_m": ends[:, 0],
@@ -97,6 +97,7 @@ def _columns(done: SiteScan) -> dict[str, Any]:
         "dz_m": ends[:, 2],
         "returned": done.scan.returned,
     }
+    return columns | {"from_m": done.scan.from_m, "weight": done.scan.weight}
 
 
 def _write_cloud(out: Path, done: SiteScan, suffix: str) -> None:

@@ -10,6 +10,7 @@ found relative to the folder; ``$SUMO_HOME/`` in front names a file that SUMO sh
 from __future__ import annotations
 
 import difflib
+import importlib
 import importlib.util
 import json
 import os
@@ -244,6 +245,9 @@ class Scenario(_Model):
     sensors: dict[str, SensorModel] = Field(default_factory=dict)
     scan: ScanModel = ScanModel()
     score: ScoreModel = ScoreModel()
+    effects: dict[str, dict[str, Any]] = Field(
+        default_factory=dict, description="What goes beyond the plain scene; `egvs effects` prints names and parameters"
+    )
 
     _folder: Path = PrivateAttr(default=Path())
 
@@ -310,6 +314,10 @@ def load(path: str | Path, overrides: Iterable[str] = ()) -> Scenario:
     for override in overrides:
         _lay_over(values, override)
     scenario = from_values(values, file.parent, str(file))
+    if scenario.effects:
+        registry = importlib.import_module("pipeline.effects")
+        for name, parameters in scenario.effects.items():
+            registry.make(name, parameters, f"{file}: effects")
     source, idle = scenario.traffic.idle_keys()
     if idle:
         raise InputError(f"{file}: traffic", f"{', '.join(sorted(idle))} would act on nothing beside {source}", "remove it")

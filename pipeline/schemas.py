@@ -38,12 +38,17 @@ def table_schema(artefact: str) -> dict[str, Any]:
 
 
 @cache
-def arrow_schema(artefact: str) -> pa.Schema:
-    """The Arrow schema of an artefact, without metadata. No column may hold nulls."""
+def arrow_schema(artefact: str, optional: tuple[str, ...] = ()) -> pa.Schema:
+    """The Arrow schema of an artefact with its needed columns and those named in ``optional``. No column may hold nulls."""
     import pyarrow as pa
 
     types = {"bool": pa.bool_()}
-    fields = table_schema(artefact)["fields"]
+    fields = [f for f in table_schema(artefact)["fields"] if f["constraints"]["required"] or f["name"] in optional]
     return pa.schema(
         [pa.field(f["name"], types.get(f["arrow_type"]) or pa.type_for_alias(f["arrow_type"]), nullable=False) for f in fields]
     )
+
+
+def optional_columns(artefact: str) -> tuple[str, ...]:
+    """The columns that exist only where an effect calls for them."""
+    return tuple(f["name"] for f in table_schema(artefact)["fields"] if not f["constraints"]["required"])

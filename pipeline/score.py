@@ -10,7 +10,6 @@ the grid and count; sum; rank. Another gamma, voxel size or TPOG needs this stag
 
 from __future__ import annotations
 
-import threading
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,9 +21,11 @@ from pipeline import survey, tables, visibility
 from pipeline.entropy import Field, Score
 from pipeline.kernels import march
 from pipeline.ordered import in_order
+from pipeline.grid import Grid
 from pipeline.results import read_tpog
 from pipeline.scenario import Scenario
 from pipeline.stage import Progress, metadata, silent, threads
+from pipeline.visibility import Beams, Hits, Visibility
 
 NAME = "score"
 ARTEFACTS = ("scores.parquet", "visibility.parquet")
@@ -43,7 +44,7 @@ class _Scored:
 
 def inputs(scenario: Scenario, out: Path) -> dict[str, Any]:
     """Gamma and what to keep; TPOG and scans by hash (without kept scans: what a scan depends on)."""
-    own = {"name": scenario.name, "score": scenario.score.model_dump(mode="json")}
+    own = {"name": scenario.name, "score": scenario.score.model_dump(mode="json"), **_effects(scenario)}
     hashes = {"tpog.parquet": tables.sha256_of(out / "tpog.parquet")}
     if scenario.scan.keep:
         return {"settings": own, "files": hashes | {"scans.parquet": tables.sha256_of(out / "scans.parquet")}}
@@ -67,11 +68,12 @@ def run(
     """
     tpog = read_tpog(out / "tpog.parquet")
     field = Field.of(tpog.counts, tpog.frames, tpog.grid)
-    gamma, keep = scenario.score.gamma, scenario.score.keep_visibility
-    scorer = _Scorer(field, gamma, keep, audit)
+    gamma = scenario.score.gamma
+    visible_from = Visibility(scenario, out, tpog.grid)
+    scorer = _Scorer(visible_from, field, scenario, audit)
     done: list[_Scored] = []
     visible: list[dict[str, Any]] = []
-    for scored in in_order(scorer.score, visibility.scans(scenario, out), threads(jobs)):
+    for scored in in_order(scorer.score, visible_from.beams(), threads(jobs)):
         done.append(scored)
         if scored.visible is not None:
             visible.append(scored.visible)
@@ -90,40 +92,32 @@ def run(
 
 
 class _Scorer:
-    """Scores one site after another; each thread keeps its own counters."""
+    """Scores one site after another, on any thread."""
 
-    def __init__(self, field: Field, gamma: float, keep: tuple[str, ...] | str, audit: bool) -> None:
-        self._field, self._gamma, self._keep, self._audit = field, gamma, keep, audit
-        self._local = threading.local()
+    def __init__(self, visible: Visibility, field: Field, scenario: Scenario, audit: bool) -> None:
+        self._visibility, self._field, self._audit = visible, field, audit
+        self._gamma, self._keep = scenario.score.gamma, scenario.score.keep_visibility
 
-    def score(self, scan: tuple[dict[str, Any], NDArray[np.float64]]) -> _Scored:
-        about, ends_m = scan
-        hits = self._hits()
-        found = count_hits(about, ends_m, self._field, hits, self._audit)
-        kept = self._keep == "all" or about["site"] in self._keep
-        visible = self._visible(about["site"], hits) if kept else None
-        return _Scored(about, self._field.score(hits, self._gamma), found, visible)
+    def score(self, beams: Beams) -> _Scored:
+        name, unit = beams.site["site"], self._visibility.unit
+        hits = self._visibility.hits(beams)
+        visible = self._visible(name, hits, unit) if self._keep == "all" or name in self._keep else None
+        found = audit(beams, self._field.grid) if self._audit else None
+        return _Scored(beams.site, self._field.score(hits, self._gamma, unit), found, visible)
 
-    def _hits(self) -> NDArray[np.uint32]:
-        if not hasattr(self._local, "hits"):
-            self._local.hits = np.zeros(int(np.prod(self._field.grid.shape)), dtype=np.uint32)
-        hits: NDArray[np.uint32] = self._local.hits
-        hits.fill(0)
-        return hits
-
-    def _visible(self, site: str, hits: NDArray[np.uint32]) -> dict[str, Any]:
+    def _visible(self, site: str, hits: Hits, unit: int) -> dict[str, Any]:
         flat = np.flatnonzero(hits)
         ix, iy, iz = (axis.astype(np.int32) for axis in np.unravel_index(flat, self._field.grid.shape))
-        return {"site": [site] * len(flat), "ix": ix, "iy": iy, "iz": iz, "hits": hits[flat].astype(np.float64)}
+        return {"site": [site] * len(flat), "ix": ix, "iy": iy, "iz": iz, "hits": hits[flat] / unit}
 
 
-def count_hits(
-    about: dict[str, Any], ends_m: NDArray[np.float64], field: Field, hits: NDArray[np.uint32], audit: bool = False
-) -> tuple[float, float, int, int] | None:
-    """Add a site's beams to ``hits``; with ``audit`` check each of them."""
-    o, d, shape = visibility.in_voxels(about, ends_m, field.grid)
-    march.count_hits(o, d, shape, field.grid.voxel_m, hits)
-    return march.audit(o, d, shape, field.grid.voxel_m, np.zeros_like(hits)) if audit else None
+def audit(beams: Beams, grid: Grid) -> tuple[float, float, int, int]:
+    """Check each beam of a site, see :func:`pipeline.kernels.march.audit`."""
+    o, d, shape = visibility.in_voxels(beams, grid)
+    found: tuple[float, float, int, int] = march.audit(
+        o, d, shape, grid.voxel_m, np.zeros(int(np.prod(grid.shape)), dtype=np.uint32)
+    )
+    return found
 
 
 def _columns(done: list[_Scored], limit: float) -> dict[str, Any]:
@@ -135,6 +129,17 @@ def _columns(done: list[_Scored], limit: float) -> dict[str, Any]:
         "rank": ranks(scores),
         "entropy_seen": np.array([d.score.entropy_seen for d in done]),
     }
+
+
+def _effects(scenario: Scenario) -> dict[str, Any]:
+    """The effects that act in this stage, and the sensors that they ask; nothing when the scenario names none."""
+    if not scenario.effects:
+        return {}
+    from pipeline import effects
+
+    named = effects.settings(effects.of(scenario, NAME))
+    sensors = {name: model.model_dump(mode="json") for name, model in scenario.sensors.items()}
+    return {"effects": named, "sensors": sensors} if named else {}
 
 
 def ranks(scores: NDArray[np.float64]) -> NDArray[np.uint32]:

@@ -40,6 +40,10 @@ class Sensor:
         Maximum range.
     source
         Where the table is from.
+    wavelength_nm, divergence_mrad
+        Of the laser; the full angle across and along the elevation, in milliradians. Only effects ask for them.
+    rated_range_m, rated_reflectivity
+        A target of this reflectivity (0 to 1), met squarely, is still noticed at this range. Only effects ask for them.
     """
 
     name: str
@@ -48,6 +52,10 @@ class Sensor:
     azimuths: int
     range_m: float
     source: str
+    wavelength_nm: float = 905.0
+    divergence_mrad: tuple[float, float] = (3.0, 1.5)
+    rated_range_m: float | None = None
+    rated_reflectivity: float = 0.8
 
     @property
     def channels(self) -> int:

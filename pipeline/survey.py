@@ -9,9 +9,9 @@ A measured scan holds returns only: it cannot tell which beams met nothing, so t
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +19,15 @@ from numpy.typing import NDArray
 from pipeline import sensors, sites, tables
 from pipeline.errors import InputError
 from pipeline.kernels import rays, solids
-from pipeline.raycast import Caster, EmptyScan
+from pipeline.raycast import Caster, EmptyScan, standing_on
 from pipeline.scenario import Scenario
+from pipeline.sensors import Sensor
 from pipeline.sites import Site
 from pipeline.world import World
+
+
+if TYPE_CHECKING:
+    from pipeline.effects import Expand, TransmitScan
 
 
 @dataclass(frozen=True)
@@ -49,9 +54,17 @@ class Survey:
         self._sensors = {s.site: sensors.resolve(s.sensor, scenario.sensors, f"site {s.site}") for s in self.sites}
         for site in self.sites:
             self._check(site)
+        self._expand, self._transmit = _effects(scenario, world, self.sites)
+        for effect in self._transmit:
+            world = effect.opaque(world)
         self._caster = Caster(world, self._roi)
         self._tables: dict[tuple[str, float, float, float], NDArray[np.float64]] = {}
         self._lock = threading.Lock()
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The optional columns that these scans have."""
+        return (("from_m",) if self._transmit else ()) + (("weight",) if self._transmit or self._expand else ())
 
     def scan(self, site: Site) -> SiteScan:
         """The empty scan of one site, simulated or measured."""
@@ -60,9 +73,24 @@ class Survey:
             scan, beams = self._measured(site)
         else:
             beams = sensor.beams
-            scan = self._caster.scan(site.position_m, self._directions(site), sensor.range_m)
-        counts = {"beams": beams, "beams_in_roi": len(scan.beam), "returns": int(scan.returned.sum())}
+            scan = self._simulated(site, sensor)
+        cast, back = np.unique(scan.beam), np.unique(scan.beam[scan.returned])
+        counts = {"beams": beams, "beams_in_roi": len(cast), "returns": len(back)}
         return SiteScan(site, scan, site.to_json() | counts)
+
+    def _simulated(self, site: Site, sensor: Sensor) -> EmptyScan:
+        """Cast all beams; where effects say so, as weighted sub-beams, cut into pieces."""
+        directions, beam, weight = self._directions(site), None, None
+        for effect in self._expand:
+            directions, parent, share = effect.expand(directions, sensor)
+            beam = parent if beam is None else beam[parent]
+            weight = share if weight is None else weight[parent] * share
+        scan = self._caster.scan(site.position_m, directions, sensor.range_m)
+        if beam is not None and weight is not None:
+            scan = replace(scan, beam=beam[scan.beam].astype(np.uint32), weight=weight[scan.beam])
+        for cut in self._transmit:
+            scan = cut.pieces(scan, site, self._world)
+        return scan
 
     def _directions(self, site: Site) -> NDArray[np.float64]:
         """Beams in the world's axes; sites with one sensor and pose share them."""
@@ -90,7 +118,7 @@ class Survey:
 
     def _check(self, site: Site) -> None:
         place, sensor, box = f"site {site.site}", self._sensors[site.site], self._roi
-        if self._scenario.statics.ground and not site.z_m > 0:
+        if self._scenario.statics.ground and not site.z_m > rays.EDGE_M:
             raise InputError(place, f"z_m = {site.z_m:g} is not above the ground (z = 0)", "a height above 0 m")
         gap = np.maximum(np.subtract(box.origin_m, site.position_m), np.subtract(site.position_m, np.add(box.origin_m, box.size_m)))
         far = float(np.sqrt((np.maximum(gap, 0.0) ** 2).sum()))
@@ -104,14 +132,15 @@ class Survey:
             raise InputError(place, f"({site.x_m:g}, {site.y_m:g}, {site.z_m:g}) stands inside {name} ({kind})", "a free place")
 
     def _solid_round(self, site: Site) -> int | None:
-        """The first solid that the site stands in, by its winding number."""
-        world = self._world
+        """The first solid that the site stands in, by its winding number; not one whose surface it stands on."""
+        world, at = self._world, np.asarray(site.position_m)
         low, high = world.bounds_xy_m
-        at = np.asarray(site.position_m[:2])
-        over = np.flatnonzero(np.all((low <= at) & (at <= high), axis=1))
+        over = np.flatnonzero(np.all((low - rays.EDGE_M <= at[:2]) & (at[:2] <= high + rays.EDGE_M), axis=1))
         totals = np.zeros(len(world.solids), dtype=np.int64)
         owner = world.solid_of_face[over]
-        solids.windings_at(np.asarray(site.position_m), world.triangles_m[over], owner.astype(np.int64), world.signs[owner], totals)
+        solids.windings_at(at, world.triangles_m[over], owner.astype(np.int64), world.signs[owner], totals)
+        if totals.any():
+            totals[owner[standing_on(world.triangles_m[over] - at)]] = 0
         inside = np.flatnonzero((totals != 0) & world.closed)
         return int(inside[0]) if len(inside) else None
 
@@ -125,7 +154,17 @@ def settings(scenario: Scenario) -> dict[str, Any]:
         "ground": scenario.statics.ground,
         "sites": scenario.sites.model_dump(mode="json"),
         "sensors": {name: model.model_dump(mode="json") for name, model in scenario.sensors.items()},
+        **_effect_settings(scenario),
     }
+
+
+def _effect_settings(scenario: Scenario) -> dict[str, Any]:
+    if not scenario.effects:
+        return {}
+    from pipeline import effects
+
+    named = effects.settings(effects.of(scenario, "scan"))
+    return {"effects": named} if named else {}
 
 
 def files(scenario: Scenario, out: Path) -> dict[str, str]:

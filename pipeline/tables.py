@@ -44,9 +44,12 @@ class TableWriter:
 
 
 @contextmanager
-def writer(path: Path, artefact: str) -> Iterator[TableWriter]:
-    """Open an artefact for writing in pieces; the file appears under its name only when all went well."""
-    schema = schemas.arrow_schema(artefact)
+def writer(path: Path, artefact: str, optional: tuple[str, ...] = ()) -> Iterator[TableWriter]:
+    """Open an artefact for writing in pieces; the file appears under its name only when all went well.
+
+    ``optional`` names the columns beyond the needed ones that this file has.
+    """
+    schema = schemas.arrow_schema(artefact, optional)
     strings = [f.name for f in schema if f.type == pa.string()]
     with aside(path) as partial, pq.ParquetWriter(partial, schema, use_dictionary=strings, **_WRITE) as file:
         yield TableWriter(file, schema)
@@ -152,7 +155,11 @@ def _check_columns(path: Path, artefact: str, found: pa.Schema) -> None:
             raise InputError(path, f"column '{field.name}' is missing", f"the columns {', '.join(wanted.names)}")
         if found.field(index).type != field.type:
             raise InputError(path, f"column '{field.name}' is {found.field(index).type}", f"{field.type}")
-    extra = sorted(set(found.names) - set(wanted.names))
+    for field in schemas.arrow_schema(artefact, schemas.optional_columns(artefact)):
+        index = found.get_field_index(field.name)
+        if index >= 0 and found.field(index).type != field.type:
+            raise InputError(path, f"column '{field.name}' is {found.field(index).type}", f"{field.type}")
+    extra = sorted(set(found.names) - set(wanted.names) - set(schemas.optional_columns(artefact)))
     if extra:
         raise InputError(path, f"unknown columns {', '.join(extra)}", f"the columns {', '.join(wanted.names)}")
 

@@ -1,14 +1,17 @@
-"""Which voxels do a site's beams cross?
+"""How many beams of a site cross each voxel?
 
 Steps: take the site's empty scan from ``scans.parquet`` (with ``scan.keep = false``: cast it instead), move it into the grid's
-frame in float64, march every beam, count.
+frame in float64, march every beam, count. Where the scan has weighted pieces, or effects of the score stage are named, the crossings are
+listed, weighted, and added up in whole multiples of 2**-32 instead.
 """
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Collection, Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,41 +23,103 @@ from pipeline.kernels import march
 from pipeline.scenario import Scenario
 from pipeline.world import read_ply
 
+if TYPE_CHECKING:
+    from pipeline.effects import Effect
 
-def hits_of(scenario: Scenario, out: Path, grid: Grid, sites: Collection[str]) -> Iterator[tuple[str, NDArray[np.uint32]]]:
-    """Beams that cross each voxel, (nx, ny, nz) uint32, with the site's name; for the named sites, in the order of the scans."""
-    for about, ends_m in scans(scenario, out, sites):
-        hits = np.zeros(int(np.prod(grid.shape)), dtype=np.uint32)
-        count_hits(about, ends_m, grid, hits)
-        yield about["site"], hits.reshape(grid.shape)
+Hits = NDArray[np.uint32] | NDArray[np.int64]
+
+UNIT = 2**32
+"""What a whole beam adds to a voxel where beams are weighted: weights are rounded to whole multiples of 2**-32."""
 
 
-def scans(
-    scenario: Scenario, out: Path, only: Collection[str] | None = None
-) -> Iterator[tuple[dict[str, Any], NDArray[np.float64]]]:
-    """What is known of each site, and where its beams end, (n, 3) metres from the sensor, in the order of the sites.
+@dataclass(frozen=True)
+class Beams:
+    """One site's empty scan, as the march needs it.
 
-    Parameters
+    Attributes
     ----------
-    only
-        The sites that are wanted; all when None.
+    site
+        What the scan's metadata says of the site.
+    ends_m
+        Where each piece ends, seen from the sensor along the world's axes, (n, 3) float64.
+    from_m, weight
+        How far along the beam the piece starts, and its weight, (n,) float64; None where beams are whole.
     """
-    return _kept(out / "scans.parquet", only) if scenario.scan.keep else _cast(scenario, out, only)
+
+    site: dict[str, Any]
+    ends_m: NDArray[np.float64]
+    from_m: NDArray[np.float64] | None = None
+    weight: NDArray[np.float64] | None = None
 
 
-def count_hits(about: dict[str, Any], ends_m: NDArray[np.float64], grid: Grid, hits: NDArray[np.uint32]) -> None:
-    """Add a site's beams to ``hits``, flat, (nx * ny * nz,) uint32."""
-    o, d, shape = in_voxels(about, ends_m, grid)
-    march.count_hits(o, d, shape, grid.voxel_m, hits)
+class Visibility:
+    """Counts the hits of one site after another. Threads may share one.
+
+    Attributes
+    ----------
+    unit
+        What a whole beam adds to a voxel: 1 (counters are uint32), or ``UNIT`` where effects weight beams (int64).
+    """
+
+    def __init__(self, scenario: Scenario, out: Path, grid: Grid) -> None:
+        self._scenario, self._out, self._grid = scenario, out, grid
+        self._effects = _score_effects(scenario, out)
+        self.unit = UNIT if _weighted(scenario) else 1
+        self._local = threading.local()
+
+    def beams(self, only: Collection[str] | None = None) -> Iterator[Beams]:
+        """The scans in the order of the sites; of the sites named in ``only``, or of all."""
+        if self._scenario.scan.keep:
+            return _kept(self._out / "scans.parquet", only)
+        return _cast(self._scenario, self._out, only)
+
+    def hits(self, beams: Beams) -> Hits:
+        """Hits of one site in each voxel, flat, (nx * ny * nz,), in ``unit``; valid until this thread's next call."""
+        hits = self._counters()
+        o, d, shape = in_voxels(beams, self._grid)
+        if self.unit == 1:
+            march.count_hits(o, d, shape, self._grid.voxel_m, hits)
+        else:
+            self._add_weighted(beams, hits)
+        return hits
+
+    def _counters(self) -> Hits:
+        """This thread's counters, set to 0."""
+        if not hasattr(self._local, "hits"):
+            kind = np.uint32 if self.unit == 1 else np.int64
+            self._local.hits = np.zeros(int(np.prod(self._grid.shape)), dtype=kind)
+        hits: Hits = self._local.hits
+        hits.fill(0)
+        return hits
+
+    def _add_weighted(self, beams: Beams, hits: Hits) -> None:
+        from pipeline import crossings, sensors
+        from pipeline.kernels.crossings import accumulate
+        from pipeline.effects import Detect, TransmitScore
+
+        sensor = sensors.resolve(beams.site["sensor"], self._scenario.sensors, f"site {beams.site['site']}")
+        for found in crossings.listed(beams.site, beams.ends_m, beams.from_m, self._grid):
+            share = np.ones(len(found.cells)) if beams.weight is None else beams.weight[found.rows][found.piece]
+            for effect in self._effects:
+                if isinstance(effect, Detect):
+                    share = share * effect.detect(found.middle_m, sensor)
+                elif isinstance(effect, TransmitScore):
+                    share = share * effect.share(found)
+            accumulate(found.cells, np.rint(share * UNIT).astype(np.int64), hits)
 
 
-def in_voxels(
-    about: dict[str, Any], ends_m: NDArray[np.float64], grid: Grid
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+def hits_of(scenario: Scenario, out: Path, grid: Grid, sites: Collection[str]) -> Iterator[tuple[str, NDArray[np.float64]]]:
+    """Beams that cross each voxel, (nx, ny, nz) float64, with the site's name; for the named sites, in the order of the scans."""
+    visibility = Visibility(scenario, out, grid)
+    for beams in visibility.beams(sites):
+        yield beams.site["site"], (visibility.hits(beams) / visibility.unit).reshape(grid.shape)
+
+
+def in_voxels(beams: Beams, grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
     """Sensor (3,), beams (n, 3) and shape (3,) as :mod:`pipeline.kernels.march` wants them; InputError for what no grid holds."""
-    place = f"scans.parquet: site {about['site']}"
-    position_m = np.array([about["x_m"], about["y_m"], about["z_m"]])
-    o, d = grid.to_grid_m(position_m) / grid.voxel_m, ends_m / grid.voxel_m
+    place = f"scans.parquet: site {beams.site['site']}"
+    position_m = np.array([beams.site["x_m"], beams.site["y_m"], beams.site["z_m"]])
+    o, d = grid.to_grid_m(position_m) / grid.voxel_m, beams.ends_m / grid.voxel_m
     if not (np.isfinite(o).all() and np.isfinite(d).all()):
         raise InputError(place, "a beam with an end that is no number", "finite metres")
     if len(d) > np.iinfo(np.uint32).max:
@@ -62,17 +127,42 @@ def in_voxels(
     return o, d, np.asarray(grid.shape, dtype=np.int64)
 
 
-def _kept(path: Path, only: Collection[str] | None) -> Iterator[tuple[dict[str, Any], NDArray[np.float64]]]:
+def _weighted(scenario: Scenario) -> bool:
+    """Whether effects make hits a sum of weights."""
+    if not scenario.effects:
+        return False
+    from pipeline import effects
+
+    return any(effects.KINDS[name][0] in ("scan", "score") for name in scenario.effects)
+
+
+def _score_effects(scenario: Scenario, out: Path) -> tuple[Effect, ...]:
+    """The effects that act here, prepared; nothing is imported when the scenario names none."""
+    if not scenario.effects:
+        return ()
+    from pipeline import effects
+
+    found = effects.of(scenario, "score")
+    for effect in found:
+        if isinstance(effect, effects.TransmitScore):
+            effect.prepare(scenario, out)
+    return found
+
+
+def _kept(path: Path, only: Collection[str] | None) -> Iterator[Beams]:
     with tables.reader(path, "scans") as (file, about):
         if file.num_row_groups != len(about["sites"]):
             raise InputError(path, f"{file.num_row_groups} row groups for {len(about['sites'])} sites", "one a site")
+        wanted = [c for c in ("dx_m", "dy_m", "dz_m", "from_m", "weight") if c in file.schema_arrow.names]
         for group, site in enumerate(about["sites"]):
             if only is None or site["site"] in only:
-                table = tables.read_group(file, group, path, ["dx_m", "dy_m", "dz_m"])
-                yield site, np.column_stack([table.column(name).to_numpy() for name in table.column_names])
+                table = tables.read_group(file, group, path, wanted)
+                columns = {name: table.column(name).to_numpy() for name in wanted}
+                ends = np.column_stack([columns[name] for name in ("dx_m", "dy_m", "dz_m")])
+                yield Beams(site, ends, columns.get("from_m"), columns.get("weight"))
 
 
-def _cast(scenario: Scenario, out: Path, only: Collection[str] | None) -> Iterator[tuple[dict[str, Any], NDArray[np.float64]]]:
+def _cast(scenario: Scenario, out: Path, only: Collection[str] | None) -> Iterator[Beams]:
     from pipeline import survey  # brings Embree, which kept scans do not need
 
     world, _ = read_ply(out / "statics.ply")
@@ -80,4 +170,4 @@ def _cast(scenario: Scenario, out: Path, only: Collection[str] | None) -> Iterat
     for site in surveyed.sites:
         if only is None or site.site in only:
             done = surveyed.scan(site)
-            yield done.about, done.scan.ends_m
+            yield Beams(done.about, done.scan.ends_m, done.scan.from_m, done.scan.weight)

@@ -23,7 +23,8 @@ LAYERS = (
     ("grid", "schemas"),
     ("scenario", "tables", "cost"),
     ("kernels", "safexml", "stage", "ordered"),
-    ("sumo", "network", "world", "sensors", "sites", "clouds", "results", "entropy", "fcd", "motion", "demand", "raycast"),
+    ("sumo", "network", "world", "sensors", "sites", "clouds", "results", "entropy", "fcd", "motion", "demand", "raycast", "crossings"),
+    ("effects",),
     ("osm_reader", "osm_footprints", "osm_junction", "simulation", "survey", "visibility", "figures"),
     ("osm", *STAGES),
     ("workflow",),
@@ -35,7 +36,7 @@ LAYER_OF = {name: level for level, names in enumerate(LAYERS) for name in names}
 
 
 def modules() -> dict[str, Path]:
-    """Name -> file of every module; everything under kernels/ counts as "kernels"."""
+    """Name -> file of every module; everything under kernels/ counts as "kernels", everything under effects/ as "effects"."""
     return {str(p.relative_to(PACKAGE).with_suffix("")): p for p in sorted(PACKAGE.rglob("*.py"))}
 
 
@@ -53,7 +54,7 @@ def imported(path: Path) -> set[str]:
 
 
 def top(name: str) -> str:
-    return "kernels" if name.startswith("kernels") else name
+    return name.split("/")[0] if "/" in name else name
 
 
 def test_every_module_has_a_layer() -> None:
