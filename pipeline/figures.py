@@ -65,7 +65,7 @@ _WIDTH, _TALLEST = 760.0, 560.0
 _SMALL = 4.0
 """Square metres of footprint below which a solid is street furniture."""
 _GREEN = ("tree", "crown", "canopy", "hedge", "bush", "vegetation", "forest", "wood")
-_LONGEST_LABEL = 18
+_LONGEST_LABEL, _CROWDED = 18, 40
 
 
 def _style() -> str:
@@ -209,7 +209,7 @@ def site_map(grid: Grid, field: Field2, layers: Sequence[Layer], spots: Sequence
     plan = _Plan(extent(grid, spots), "sites", north=True)
     places = _places(spots)
     low, high = min(s.egvs for s in spots), max(s.egvs for s in spots)
-    crowded = len(places) > 40
+    crowded = is_crowded(spots)
     radius = 8.5 if not crowded else 6.0 if len(places) <= 120 else 4.0
     parts = [
         f'<g class="faint">{_image(plan, grid, field, float(field.max(initial=0.0)))}</g>',
@@ -220,6 +220,16 @@ def site_map(grid: Grid, field: Field2, layers: Sequence[Layer], spots: Sequence
     named = places if not crowded else [*places[:10], places[-1]]
     parts += _labels(plan, places, named, radius)
     return plan.svg(parts, alt, bar=_Bar(low, high, "EGVS (bit)", even=True) if high > low else None)
+
+
+def is_crowded(spots: Sequence[Spot]) -> bool:
+    """Whether the sites stand at too many places for numbers and names."""
+    return len(_places(spots)) > _CROWDED
+
+
+def has_rings(spots: Sequence[Spot]) -> bool:
+    """Whether some sites share a place."""
+    return len(_places(spots)) < len(spots)
 
 
 def view(grid: Grid, field: Field2, peak: float, stand: Stand, name: str, alt: str) -> str:
@@ -374,7 +384,8 @@ class _Bar:
         if not self.even:
             values = [*_nice(0.0, span / 25, 2), *_nice(0.0, span / 4, 4), *values]
         placed: list[tuple[float, str]] = []
-        for value, text in sorted(set(values), key=lambda v: (-abs(v[0]), v[1])):
+        for value in sorted({value for value, _ in values}, reverse=True):
+            text = f"{value:,.6g}"
             share = (value - self.low) / span
             at = x + width * (share if self.even else math.sqrt(share))
             if all(abs(at - other) > 5.0 * (len(text) + len(shown)) for other, shown in placed):

@@ -57,7 +57,7 @@ Row = dict[str, Any]
 
 
 def inputs(scenario: Scenario, out: Path) -> dict[str, Any]:
-    """The artefacts by hash, what the earlier stages said, and the settings that are shown; not what they cost."""
+    """The artefacts by hash, what the earlier stages said, and what they cost, and the settings that are shown."""
     read = ["trajectories.parquet", "tpog.parquet", "statics.ply", "scores.parquet"]
     if scenario.scan.keep:
         read.append("scans.parquet")
@@ -69,6 +69,7 @@ def inputs(scenario: Scenario, out: Path) -> dict[str, Any]:
         more = {"scan": survey.settings(scenario), "scan_files": survey.files(scenario, out)}
     return {
         "settings": {"shown": _shown(scenario), "keep": scenario.scan.keep, **more},
+        "costs": _costs(record),
         "files": {name: tables.sha256_of(out / name) for name in read if (out / name).is_file()},
         "said": {name: _said(record, name) for name in _STAGES},
         "effects": record.get("effects", []),
@@ -267,13 +268,13 @@ def _page(scenario: Scenario, ranking: Ranking, tpog: Tpog, drawn: Drawn, record
     )
     environment.filters |= {"svg": Markup, "share": _share, "whole": lambda value: f"{value:,.0f}", "plain": _plain}
     rows, effects = ranking.rows, _effects(scenario, record)
-    crowded = len(rows) > LISTED
+    shortened = len(rows) > LISTED
     return environment.get_template("report.html.j2").render(
         scenario=scenario,
         ranking=ranking,
-        first=rows[:FIRST] if crowded else rows,
-        last=rows[-LAST:] if crowded else (),
-        hidden=len(rows) - FIRST - LAST if crowded else 0,
+        first=rows[:FIRST] if shortened else rows,
+        last=rows[-LAST:] if shortened else (),
+        hidden=len(rows) - FIRST - LAST if shortened else 0,
         shared={rank for rank, count in Counter(row["rank"] for row in rows).items() if count > 1},
         headline=_headline(ranking, tpog),
         nearest=_nearest(ranking),
@@ -281,6 +282,8 @@ def _page(scenario: Scenario, ranking: Ranking, tpog: Tpog, drawn: Drawn, record
         tpog=tpog,
         busy=bool(tpog.counts.any()),
         drawn=drawn,
+        crowded=figures.is_crowded(ranking.spots),
+        rings=figures.has_rings(ranking.spots),
         style=Markup(figures.STYLE),
         gamma="∞" if math.isinf(scenario.score.gamma) else f"{scenario.score.gamma:g}",
         uncapped=math.isinf(scenario.score.gamma),

@@ -145,6 +145,18 @@ class Survey:
         return int(inside[0]) if len(inside) else None
 
 
+def _effects(scenario: Scenario, world: World, where: tuple[Site, ...]) -> tuple[tuple[Expand, ...], tuple[TransmitScan, ...]]:
+    """The effects that act on scans and can change one; nothing is imported when the scenario names none."""
+    if not scenario.effects:
+        return (), ()
+    from pipeline import effects
+
+    scene = effects.Scene(scenario, world, where)
+    named = [effect for effect in effects.of(scenario, "scan") if effect.idle(scene) is None]
+    expand = tuple(effect for effect in named if isinstance(effect, effects.Expand))
+    return expand, tuple(effect for effect in named if isinstance(effect, effects.TransmitScan))
+
+
 def settings(scenario: Scenario) -> dict[str, Any]:
     """The settings that an empty scan depends on."""
     box = scenario.roi.box
