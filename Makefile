@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: run test lint bench schema clean
+.PHONY: run test lint bench numerics pictures schema clean
 
 run: $(VENV)/.installed
 	$(BIN)/egvs run scenarios/nishishinjuku
@@ -19,6 +19,12 @@ lint: $(VENV)/.installed-dev
 
 bench: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks
+
+numerics: $(VENV)/.installed-dev
+	$(BIN)/python -m benchmarks.numerics --markdown docs/numerics-table.md
+
+pictures: $(VENV)/.installed-dev
+	$(BIN)/python -m benchmarks.pictures
 
 schema: $(VENV)/.installed
 	$(BIN)/python -c "from pipeline.scenario import json_schema; print(json_schema(), end='')" > data_schemas/scenario.schema.json

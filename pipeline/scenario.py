@@ -15,11 +15,20 @@ import importlib.util
 import json
 import os
 import tomllib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    PrivateAttr,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+    model_validator,
+)
 
 from pipeline.errors import InputError, MissingBackendError
 from pipeline.grid import Grid, Roi
@@ -28,6 +37,7 @@ FILE = "scenario.toml"
 _SUMO = "$SUMO_HOME/"
 
 Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Point2 = tuple[float, float]
 Point3 = tuple[float, float, float]
@@ -150,6 +160,9 @@ class TpogModel(_Model):
     blocks: int = Field(10, ge=1, le=65535, description="Blocks of consecutive frames; divides traffic.frames")
 
 
+_OPTICS = ("wavelength_nm", "divergence_mrad", "rated_range_m", "rated_reflectivity")
+
+
 class SensorModel(_Model):
     """A sensor of the user's. Elevations are listed, or uniform between two when ``channels`` is given."""
 
@@ -160,6 +173,25 @@ class SensorModel(_Model):
     azimuth_offsets_deg: tuple[float, ...] = Field((), description="One a ring, added to each azimuth; none: all 0")
     azimuth_step_deg: Positive = Field(description="Divides 360")
     range_m: Positive
+    wavelength_nm: Positive | None = Field(None, description="Of the laser; only effects ask")
+    divergence_mrad: tuple[NotNegative, NotNegative] | None = Field(
+        None, description="Full angle of a beam across and along the elevation; only effects ask"
+    )
+    rated_range_m: Positive | None = Field(
+        None, description="A target of rated_reflectivity, met squarely, is just noticed here; only effects ask"
+    )
+    rated_reflectivity: Positive | None = Field(None, description="See rated_range_m; only effects ask")
+
+    @property
+    def optics(self) -> dict[str, Any]:
+        """What the user said of the laser and the receiver; :class:`pipeline.sensors.Sensor` knows the rest."""
+        said = {name: getattr(self, name) for name in _OPTICS}
+        return {name: value for name, value in said.items() if value is not None}
+
+    @model_serializer(mode="wrap")
+    def _said(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Without the optics that the user left out: what no effect asks for changes no artefact."""
+        return {name: value for name, value in plain(self).items() if name not in _OPTICS or value is not None}
 
     @model_validator(mode="after")
     def _consistent(self) -> SensorModel:
@@ -236,6 +268,9 @@ class Scenario(_Model):
 
     name: Name = Field("", min_length=0, validate_default=False, description="Defaults to the folder's name")
     description: str = ""
+    extends: str = Field(
+        "", description="A scenario folder whose keys hold where this one says nothing; tables merge, lists replace"
+    )
     seed: int = Field(0, ge=0, le=2**63 - 1, description="The one seed; all randomness derives from it")
     roi: RoiModel
     traffic: TrafficModel
@@ -249,7 +284,7 @@ class Scenario(_Model):
         default_factory=dict, description="What goes beyond the plain scene; `egvs effects` prints names and parameters"
     )
 
-    _folder: Path = PrivateAttr(default=Path())
+    _folders: tuple[Path, ...] = PrivateAttr(default=(Path(),))
 
     @model_validator(mode="after")
     def _across(self) -> Scenario:
@@ -260,22 +295,21 @@ class Scenario(_Model):
     @property
     def folder(self) -> Path:
         """The folder that relative file names start from."""
-        return self._folder
+        return self._folders[0]
 
     @property
     def file(self) -> Path:
         """The scenario file, for messages."""
-        return self._folder / FILE
+        return self.folder / FILE
 
     def find(self, name: str, key: str) -> Path:
-        """The file ``name`` that the scenario names under ``key``; InputError when it is not there."""
-        if name.startswith(_SUMO):
-            path = sumo_home() / name.removeprefix(_SUMO)
-        else:
-            path = self._folder / name
-        if not path.is_file():
-            raise InputError(f"{self.file}: {key} = {name!r}", f"no such file ({path})", "a path relative to the scenario's folder")
-        return path
+        """The file that the scenario, or one that it extends, names under ``key``; InputError when it is not there."""
+        folders = (sumo_home(),) if name.startswith(_SUMO) else self._folders
+        for folder in folders:
+            if (path := folder / name.removeprefix(_SUMO)).is_file():
+                return path
+        shown = folders[0] / name.removeprefix(_SUMO)
+        raise InputError(f"{self.file}: {key} = {name!r}", f"no such file ({shown})", "a path relative to the scenario's folder")
 
 
 def sumo_home() -> Path:
@@ -305,12 +339,7 @@ def load(path: str | Path, overrides: Iterable[str] = ()) -> Scenario:
     """
     path = Path(path)
     file = path / FILE if path.is_dir() else path
-    if not file.is_file():
-        raise InputError(path, f"no {FILE} there", f"a folder with a {FILE}, or the file itself")
-    try:
-        values = tomllib.loads(file.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(file, f"is not valid TOML: {error}") from None
+    values = _read(file, ())
     for override in overrides:
         _lay_over(values, override)
     scenario = from_values(values, file.parent, str(file))
@@ -324,6 +353,42 @@ def load(path: str | Path, overrides: Iterable[str] = ()) -> Scenario:
     return scenario
 
 
+def _read(file: Path, heirs: tuple[Path, ...]) -> dict[str, Any]:
+    """The values of a scenario file, laid over those of the scenario that it extends."""
+    if not file.is_file():
+        raise InputError(
+            file.parent if file.name == FILE else file, f"no {FILE} there", f"a folder with a {FILE}, or the file itself"
+        )
+    if file.resolve() in heirs:
+        raise InputError(f"{file}: extends", "leads back to itself", "a scenario that does not extend this one")
+    try:
+        values = tomllib.loads(file.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(file, f"is not valid TOML: {error}") from None
+    if not isinstance(base := values.get("extends", ""), str):
+        raise InputError(f"{file}: extends", f"{base!r}", "the path of a scenario's folder")
+    return _merged(_read(file.parent / base / FILE, (*heirs, file.resolve())), values) if base else values
+
+
+def _merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    merged = dict(below)
+    for key, value in above.items():
+        both = isinstance(value, dict) and isinstance(below.get(key), dict)
+        merged[key] = _merged(below[key], value) if both else value
+    return merged
+
+
+def _bases(folder: Path, extends: str, place: str) -> Iterator[Path]:
+    """The scenario's folder, then those of the scenarios that it extends."""
+    yield folder
+    while extends:
+        folder = folder / extends
+        if not (folder / FILE).is_file():
+            raise InputError(f"{place}: extends", f"no {FILE} in {folder}", "the path of a scenario's folder")
+        yield folder
+        extends = tomllib.loads((folder / FILE).read_text(encoding="utf-8")).get("extends", "")
+
+
 def from_values(values: dict[str, Any], folder: Path, place: str) -> Scenario:
     """Check a scenario that is at hand as nested values (as ``run.json`` holds it)."""
     values.setdefault("name", folder.resolve().name)
@@ -331,7 +396,7 @@ def from_values(values: dict[str, Any], folder: Path, place: str) -> Scenario:
         scenario = Scenario.model_validate(values)
     except ValidationError as error:
         raise _explain(error, place) from None
-    scenario._folder = folder
+    scenario._folders = tuple(_bases(folder, scenario.extends, place))
     Grid.over(scenario.roi.box, scenario.roi.voxel_m, f"{place}: roi")
     return scenario
 

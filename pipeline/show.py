@@ -24,7 +24,7 @@ class Screen:
     def __init__(self) -> None:
         self._out = Console(width=None if sys.stdout.isatty() else 120, highlight=False, soft_wrap=True)
         self._err = Console(stderr=True, highlight=False, soft_wrap=True)
-        self._stage = ""
+        self._stage, self._ran = "", False
         self._bar = Progress(
             TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"), TimeElapsedColumn(),
             console=self._err, transient=True,
@@ -50,6 +50,7 @@ class Screen:
         """A :data:`pipeline.workflow.Told`."""
         self._stage = stage
         if state == "runs":
+            self._ran = True
             if self._lively:
                 self._bar.update(self._task, description=stage, completed=0, total=None, visible=True)
             return
@@ -70,6 +71,8 @@ class Screen:
             names = "\n".join(str(folder / name) for name in done["artefacts"])
             table.add_row(stage, names, f"{cost['seconds']:.2f}", f"{cost['peak_mb']:.0f}")
         self._out.print(table)
+        if not self._ran:
+            self._out.print("nothing to do: no stage's inputs changed since the last run")
 
     def stage(self, folder: Path, stage: str, record: dict[str, Any]) -> None:
         """What one stage wrote."""
@@ -128,20 +131,21 @@ def summary(folder: Path, found: dict[str, Any]) -> None:
     """What ``egvs new`` made."""
     console = Console(highlight=False, soft_wrap=True)
     for key, value in found.items():
-        console.print(f"{key}: {_in_words(value) if isinstance(value, dict) else value}", markup=False)
+        console.print(f"{key}: {_in_words(value) if isinstance(value, dict) else _plain(value)}", markup=False)
     console.print(f"next: egvs run {folder}", markup=False)
 
 
 def _in_words(said: dict[str, Any]) -> str:
     """A stage's summary in one line: plain values, then tables of counts."""
-    parts = []
-    for key, value in said.items():
-        if isinstance(value, dict):
-            value = ", ".join(f"{v} {k}" for k, v in value.items())
-        if isinstance(value, float):
-            value = f"{value:.4g}"
-        if isinstance(value, list):
-            value = ", ".join(str(v) for v in value)
-        if value != "":
-            parts.append(f"{key.replace('_', ' ')} {value}")
-    return "; ".join(parts)
+    return "; ".join(f"{key.replace('_', ' ')} {_plain(value)}" for key, value in said.items() if value not in ("", [], {}, None))
+
+
+def _plain(value: Any) -> str:
+    """One value in words; a table of counts as "3 pole, 2 sign"."""
+    if isinstance(value, dict):
+        return ", ".join(f"{k} ({_plain(v)})" if isinstance(v, dict) else f"{_plain(v)} {k.replace('_', ' ')}" for k, v in value.items())
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, list | tuple):
+        return ", ".join(_plain(v) for v in value)
+    return str(value)
