@@ -171,6 +171,33 @@ def sensors() -> None:
 
 
 @app.command()
+def effects(
+    scenario: Annotated[Path | None, typer.Argument(metavar="[SCENARIO]", help="Without it: which effects exist.")] = None,
+    set_: Set = None,
+    ablation: Annotated[bool, typer.Option("--ablation", help="Run each named effect alone, and show what it changes.")] = False,
+    out: Out = None,
+    jobs: Jobs = None,
+) -> None:
+    """Print which effects exist; for a scenario, which it calls for, and why."""
+    from pipeline import callings, show, workflow
+
+    if scenario is None:
+        if ablation:
+            raise InputError("--ablation", "without a scenario", "egvs effects SCENARIO --ablation")
+        show.effects(callings.catalogue())
+        return
+    resolved = _load(scenario, set_)
+    show.effects(callings.called(resolved))
+    if ablation:
+        if not resolved.effects:
+            raise InputError("--ablation", "the scenario names no effect", "name one, e.g. --set effects.rain.rate_mm_h=20")
+        folder = out or workflow.default_folder(resolved)
+        with show.Screen() as screen:
+            changes = callings.ablation(resolved, folder, jobs=jobs, progress=screen.progress)
+        show.ablation(changes)
+
+
+@app.command()
 def new(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="The scenario's folder, to be made.")],
     osm: Annotated[Path, typer.Option(metavar="FILE", help="An OpenStreetMap extract (.osm, .osm.xml).")],

@@ -302,6 +302,12 @@ class Scenario(_Model):
         """The scenario file, for messages."""
         return self.folder / FILE
 
+    def with_effects(self, effects: dict[str, dict[str, Any]]) -> Scenario:
+        """The same scenario with these effects instead of its own."""
+        other = self.model_copy(update={"effects": effects})
+        other._folders = self._folders
+        return other
+
     def find(self, name: str, key: str) -> Path:
         """The file that the scenario, or one that it extends, names under ``key``; InputError when it is not there."""
         folders = (sumo_home(),) if name.startswith(_SUMO) else self._folders

@@ -6,16 +6,19 @@ A progress bar on a terminal, plain lines elsewhere; then tables. Standard outpu
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from pipeline.sensors import Sensor
+
+if TYPE_CHECKING:
+    from pipeline.callings import Call, Change
 
 
 class Screen:
@@ -127,6 +130,35 @@ def catalogue(sensors: Iterable[Sensor]) -> None:
     Console(width=None if sys.stdout.isatty() else 160, highlight=False).print(table)
 
 
+def effects(calls: Sequence[Call]) -> None:
+    """Effects, whether they are on, and why."""
+    table = Table(box=None, pad_edge=False)
+    for name in ("effect", "acts in", "kind", "state", "why", "source"):
+        table.add_column(name, overflow="fold")
+    for call in calls:
+        table.add_row(call.name, call.stage, call.kind, call.state, call.why, call.source)
+    Console(width=None if sys.stdout.isatty() else 160, highlight=False).print(table)
+
+
+def ablation(changes: Sequence[Change]) -> None:
+    """What each effect changes: scores against the plain scene, and ranks where they differ."""
+    plain = changes[0]
+    table = Table(box=None, pad_edge=False, title="change of each site's score against the plain scene (rank, where it changes)")
+    table.add_column("site")
+    table.add_column("plain, bit", justify="right")
+    for change in changes[1:]:
+        table.add_column(change.effect, justify="right")
+    parts = [[100 * (a / b - 1) if b else float("nan") for a, b in zip(c.scores, plain.scores, strict=True)] for c in changes[1:]]
+    for row, site in enumerate(plain.sites):
+        cells = []
+        for change, part in zip(changes[1:], parts, strict=True):
+            moved = f" ({plain.ranks[row]} to {change.ranks[row]})" if change.ranks[row] != plain.ranks[row] else ""
+            cells.append(f"{part[row]:+.2f} %{moved}")
+        table.add_row(site, f"{plain.scores[row]:.1f} ({plain.ranks[row]})", *cells)
+    table.add_row("seconds", f"{plain.seconds:.2f}", *(f"{change.seconds:.2f}" for change in changes[1:]))
+    Console(width=None if sys.stdout.isatty() else 160, highlight=False).print(table)
+
+
 def summary(folder: Path, found: dict[str, Any]) -> None:
     """What ``egvs new`` made."""
     console = Console(highlight=False, soft_wrap=True)
@@ -143,7 +175,8 @@ def _in_words(said: dict[str, Any]) -> str:
 def _plain(value: Any) -> str:
     """One value in words; a table of counts as "3 pole, 2 sign"."""
     if isinstance(value, dict):
-        return ", ".join(f"{k} ({_plain(v)})" if isinstance(v, dict) else f"{_plain(v)} {k.replace('_', ' ')}" for k, v in value.items())
+        parts = ((str(k).replace("_", " "), v) for k, v in value.items())
+        return ", ".join(f"{k} ({_plain(v)})" if isinstance(v, dict) else f"{_plain(v)} {k}" for k, v in parts)
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, list | tuple):

@@ -28,6 +28,7 @@ LAYERS = (
     ("osm_reader", "osm_footprints", "osm_junction", "simulation", "survey", "visibility", "figures"),
     ("osm", *STAGES),
     ("workflow",),
+    ("callings",),
     ("show",),
     ("cli",),
     ("__init__",),

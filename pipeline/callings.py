@@ -1,0 +1,114 @@
+"""Which effects exist, which does a scene call for, and what do they change?
+
+Steps of :func:`called`: build the static world in memory; ask every named effect whether it can change the result; say for each
+effect whether it is on, and why. Steps of :func:`ablation`: run the plain scene, then the scene with one named effect at a time,
+and all of them; stages that an effect does not touch are not run again.
+"""
+
+from __future__ import annotations
+
+import importlib
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline import effects, sites, statics, workflow
+from pipeline.results import read_scores
+from pipeline.scenario import Scenario
+from pipeline.stage import Progress, silent
+
+
+@dataclass(frozen=True)
+class Call:
+    """One effect, before one scene: "on", "off" or "skipped", and why."""
+
+    name: str
+    stage: str
+    kind: str
+    state: str
+    why: str
+    source: str
+
+
+@dataclass(frozen=True)
+class Change:
+    """What one effect (or all) does to the scores.
+
+    Attributes
+    ----------
+    effect
+        Its name; "all" for all that the scenario names together; "none" for the plain scene.
+    seconds
+        Time of scan and score, and of other stages where the effect made them run again (in the plain scene: of all).
+    sites, scores, ranks
+        Of each site, in the order of the sites.
+    """
+
+    effect: str
+    seconds: float
+    sites: tuple[str, ...]
+    scores: tuple[float, ...]
+    ranks: tuple[int, ...]
+
+
+def catalogue() -> list[Call]:
+    """Every effect that exists."""
+    return [Call(name, *effects.KINDS[name], "", _summary(name), _source(name)) for name in effects.KINDS]
+
+
+def called(scenario: Scenario) -> list[Call]:
+    """Every effect before ``scenario``: on, off, or skipped because it provably changes nothing, and why."""
+    scene = effects.Scene(scenario, statics.build(scenario, statics.Tally.empty()), sites.of(scenario))
+    return [_call(name, scene) for name in effects.KINDS]
+
+
+def _call(name: str, scene: effects.Scene) -> Call:
+    stage, kind = effects.KINDS[name]
+    if name == effects.SELF_ACTING:
+        on, why = importlib.import_module(f"pipeline.effects.{name}").decide(scene.scenario)
+        return Call(name, stage, kind, "on" if on else "off", why, _source(name))
+    if name not in scene.scenario.effects:
+        return Call(name, stage, kind, "off", "not named", _source(name))
+    effect = effects.make(name, dict(scene.scenario.effects[name]), f"{scene.scenario.file}: effects")
+    reason = effect.idle(scene)
+    if reason is not None:
+        return Call(name, stage, kind, "skipped", f"named, but {reason}: the result is the same without it", effect.SOURCE)
+    set_ = ", ".join(f"{key} = {value}" for key, value in effect.parameters.model_dump(mode="json").items())
+    return Call(name, stage, kind, "on", f"named, with {set_}" if set_ else "named", effect.SOURCE)
+
+
+def _module(name: str) -> Any:
+    return importlib.import_module(f"pipeline.effects.{name}")
+
+
+def _source(name: str) -> str:
+    return str(_module(name).EFFECT.SOURCE)
+
+
+def _summary(name: str) -> str:
+    return str(_module(name).__doc__).strip().splitlines()[0]
+
+
+def ablation(scenario: Scenario, out: Path, *, jobs: int | None = None, progress: Progress = silent) -> list[Change]:
+    """Run the plain scene, each named effect alone, and all together, under ``out / "ablation"``; a run is resumed as any other."""
+    alone = {name: {name: parameters} for name, parameters in scenario.effects.items()}
+    variants: dict[str, dict[str, Any]] = {"none": {}, **alone}
+    if len(alone) > 1:
+        variants["all"] = dict(scenario.effects)
+    plain, changes = out / "ablation" / "none", []
+    for name, named in variants.items():
+        folder = out / "ablation" / name
+        if not folder.exists() and plain.exists():
+            shutil.copytree(plain, folder, ignore=shutil.ignore_patterns(".lock"))
+        ran: dict[str, str] = {}
+        record = workflow.run(
+            scenario.with_effects(named), folder, jobs=jobs, progress=progress,
+            told=lambda stage, state, _, ran=ran: ran.__setitem__(stage, state),
+        )  # fmt: skip
+        counted = [s for s in record["stages"] if s in ("scan", "score") or (ran[s] == "done" and s not in ("report", "statics"))]
+        seconds = sum(record["stages"][s]["cost"]["seconds"] for s in counted)
+        scores = read_scores(folder / "scores.parquet")
+        names = tuple(scores["site"].to_pylist())
+        changes.append(Change(name, seconds, names, tuple(scores["egvs"].to_pylist()), tuple(scores["rank"].to_pylist())))
+    return changes
