@@ -126,7 +126,9 @@ def sites(folder: Path) -> list[tuple[str, str, str, bool]]:
 
 def main() -> None:
     """Measure all, print one table."""
-    table = Table("what", "measured", "must reach", "reached", title=f"egvs {pipeline.__version__}, {os.cpu_count()} cores", box=None)
+    table = Table(
+        "what", "measured", "must reach", "reached", title=f"egvs {pipeline.__version__}, {os.cpu_count()} cores", box=None
+    )
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         rows, sumo = whole_run(folder)

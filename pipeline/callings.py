@@ -102,10 +102,11 @@ def ablation(scenario: Scenario, out: Path, *, jobs: int | None = None, progress
         if not folder.exists() and plain.exists():
             shutil.copytree(plain, folder, ignore=shutil.ignore_patterns(".lock"))
         ran: dict[str, str] = {}
-        record = workflow.run(
-            scenario.with_effects(named), folder, jobs=jobs, progress=progress,
-            told=lambda stage, state, _, ran=ran: ran.__setitem__(stage, state),
-        )  # fmt: skip
+
+        def note(stage: str, state: str, _: dict[str, Any], ran: dict[str, str] = ran) -> None:
+            ran[stage] = state
+
+        record = workflow.run(scenario.with_effects(named), folder, jobs=jobs, progress=progress, told=note)
         counted = [s for s in record["stages"] if s in ("scan", "score") or (ran[s] == "done" and s not in ("report", "statics"))]
         seconds = sum(record["stages"][s]["cost"]["seconds"] for s in counted)
         scores = read_scores(folder / "scores.parquet")

@@ -162,6 +162,32 @@ def verify(
 
 
 @app.command()
+def accuracy(
+    scenario: ScenarioPath,
+    out: Out = None,
+    set_: Set = None,
+    jobs: Jobs = None,
+    tolerance: Annotated[float, typer.Option(help="Largest error that the recommended setting may have.")] = 0.02,
+    budget: Annotated[str, typer.Option(metavar="TIME", help="How long the study may take, e.g. 60s or 10m.")] = "10m",
+    seeds: Annotated[
+        int, typer.Option(min=0, help="Also check the standard errors by so many independent runs, at least 2; takes its own time.")
+    ] = 0,
+) -> None:
+    """What accuracy costs in time, and the cheapest setting within a tolerance."""
+    from pipeline import accuracy as what_it_costs
+    from pipeline import show, workflow
+
+    resolved = _load(scenario, set_)
+    folder = out or workflow.default_folder(resolved)
+    with show.Screen() as screen:
+        found = what_it_costs.study(
+            scenario, set_ or (), folder, tolerance=tolerance, budget_s=_seconds(budget), seeds=seeds, jobs=jobs,
+            progress=screen.progress, told=screen.setting,
+        )  # fmt: skip
+    show.accuracy(found, str(scenario))
+
+
+@app.command()
 def sensors() -> None:
     """Print the sensor catalogue."""
     from pipeline import show
@@ -217,6 +243,18 @@ def _load(path: Path, set_: list[str] | None) -> Scenario:
     from pipeline.scenario import load
 
     return load(path, set_ or ())
+
+
+def _seconds(text: str) -> float:
+    units = {"s": 1.0, "m": 60.0, "h": 3600.0}
+    number, unit = (text[:-1], units[text[-1]]) if text[-1:] in units else (text, 1.0)
+    try:
+        seconds = float(number) * unit
+    except ValueError:
+        seconds = -1.0
+    if not 0 < seconds < float("inf"):
+        raise InputError("--budget", repr(text), "a time above 0, for example 60s or 10m")
+    return seconds
 
 
 def _address(text: str) -> tuple[str, int]:

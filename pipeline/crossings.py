@@ -60,25 +60,19 @@ class Crossings:
         return np.repeat(np.arange(len(self.first) - 1), np.diff(self.first))
 
 
-def listed(
-    site: dict[str, Any], ends_m: NDArray[np.float64], from_m: NDArray[np.float64] | None, grid: Grid
-) -> Iterator[Crossings]:
-    """All crossings of a site's beam pieces, a few thousand pieces at a time.
-
-    ``from_m`` is how far along its beam each piece starts; None where all start at the sensor.
-    """
+def listed(site: dict[str, Any], ends_m: NDArray[np.float64], grid: Grid) -> Iterator[Crossings]:
+    """All crossings of a site's beams, a few thousand beams at a time."""
     position_m = np.array([site["x_m"], site["y_m"], site["z_m"]])
     o = grid.to_grid_m(position_m) / grid.voxel_m
     shape = np.asarray(grid.shape, dtype=np.int64)
     for start in range(0, len(ends_m), _ROWS):
         rows = slice(start, min(start + _ROWS, len(ends_m)))
         ends = ends_m[rows]
-        begin = np.zeros(len(ends)) if from_m is None else from_m[rows]
         first = np.zeros(len(ends) + 1, dtype=np.int64)
         nothing = np.empty(0, dtype=np.int64), np.empty(0), np.empty(0)
-        kernels.crossings(o, ends / grid.voxel_m, begin, shape, grid.voxel_m, first, *nothing)
+        kernels.crossings(o, ends / grid.voxel_m, shape, grid.voxel_m, first, *nothing)
         np.cumsum(first, out=first)
         total = int(first[-1])
         cells, enter, leave = np.empty(total, dtype=np.int64), np.empty(total), np.empty(total)
-        kernels.crossings(o, ends / grid.voxel_m, begin, shape, grid.voxel_m, first, cells, enter, leave)
+        kernels.crossings(o, ends / grid.voxel_m, shape, grid.voxel_m, first, cells, enter, leave)
         yield Crossings(site, grid, rows, first, ends, cells, enter, leave)

@@ -130,7 +130,10 @@ class Field:
         cap, share = (0, 1) if np.isinf(gamma) else gamma.as_integer_ratio()
         rows = zip(self._scaled, capped.tolist(), below.tolist(), strict=True)
         total = sum(entropy * (cap * unit * full + share * part) for entropy, full, part in rows if full or part)
-        return float(total / (share * unit << _SCALE))
+        try:
+            return float(total / (share * unit << _SCALE))
+        except OverflowError:  # a gamma near the largest float64, times the voxels
+            return float("inf")
 
 
 @dataclass(frozen=True)

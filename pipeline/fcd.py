@@ -6,7 +6,7 @@ Then cuts the stream into groups of whole frames.
 
 Positions are SUMO's own: the middle of the front bumper in metres, the angle in degrees clockwise from north, the slope in
 degrees. Times are whole milliseconds, SUMO's own unit. Rows without a vehicle (SUMO writes one for an empty step) are
-left out; so are persons and containers.
+left out; so are persons (unless asked for) and containers.
 """
 
 from __future__ import annotations
@@ -43,6 +43,8 @@ SCHEMA = pa.schema(
 _NEEDED = ("time", "id", "x", "y", "angle", "type")
 _OPTIONAL = {"z": 0.0, "slope": 0.0, "speed": float("nan")}
 _STRINGS = ("id", "type")
+_OTHERS = {"vehicle": ("person_", "container_"), "person": ("vehicle_", "container_", "person_slope")}
+"""Columns that belong to others, or (a person's slope) mean nothing."""
 _BLOCK_BYTES = 1 << 20
 """Arrow reads dozens of blocks ahead: with 4 MiB they take 150 MB, and reading is no faster."""
 
@@ -50,8 +52,14 @@ _BATCH_ROWS = 1 << 16
 _RIGHT = "FCD with the attributes id, x, y, angle and type (--fcd-output.attributes id,x,y,z,angle,slope,type,speed)"
 
 
-def read(path: Path) -> Iterator[pa.Table]:
+def read(path: Path, who: str = "vehicle") -> Iterator[pa.Table]:
     """The file's rows in the order of the file, as tables of :data:`SCHEMA`.
+
+    Parameters
+    ----------
+    who
+        ``"vehicle"``, or ``"person"`` for what ``--person-fcd-output`` wrote. A person's slope is left out: people stand
+        upright, and SUMO gives the lane's slope whichever way they walk.
 
     Raises
     ------
@@ -65,20 +73,20 @@ def read(path: Path) -> Iterator[pa.Table]:
     if not head:
         raise InputError(path, "is empty", _RIGHT)
     if head.startswith(b"PAR1"):
-        yield from _checked(_parquet(path), path, "row")
+        yield from _checked(_parquet(path, who), path, "row")
     elif head.startswith(b"<"):
-        yield from _checked(_xml(path), path, "vehicle element")
+        yield from _checked(_xml(path, who), path, f"{who} element")
     else:
-        yield from _checked(_csv(path), path, "row")
+        yield from _checked(_csv(path, who), path, "row")
 
 
-def _csv(path: Path) -> Iterator[pa.RecordBatch]:
+def _csv(path: Path, who: str) -> Iterator[pa.RecordBatch]:
     from pyarrow import csv
 
     with safexml.opened(path) as file:
         header = file.readline().decode("utf-8", "replace").lstrip("\ufeff").strip()
     delimiter = ";" if ";" in header else ","
-    columns = _columns([name.strip('"') for name in header.split(delimiter)], path)
+    columns = _columns([name.strip('"') for name in header.split(delimiter)], path, who)
     convert = csv.ConvertOptions(
         column_types={raw: pa.string() if name in _STRINGS else pa.float64() for name, raw in columns.items()},
         include_columns=list(columns.values()),
@@ -97,13 +105,13 @@ def _csv(path: Path) -> Iterator[pa.RecordBatch]:
         raise _damaged(path, "CSV", error) from None
 
 
-def _parquet(path: Path) -> Iterator[pa.RecordBatch]:
+def _parquet(path: Path, who: str) -> Iterator[pa.RecordBatch]:
     import pyarrow.parquet as pq
 
     with _seekable(path) as source:
         try:
             with pq.ParquetFile(source) as file:
-                columns = _columns(file.schema_arrow.names, path)
+                columns = _columns(file.schema_arrow.names, path, who)
                 for batch in file.iter_batches(_BATCH_ROWS, columns=list(columns.values())):
                     yield batch.select(list(columns.values())).rename_columns(list(columns))
         except (pa.ArrowInvalid, OSError) as error:
@@ -120,10 +128,12 @@ def _seekable(path: Path) -> Iterator[Any]:
         yield path
 
 
-def _xml(path: Path) -> Iterator[pa.RecordBatch]:
+def _xml(path: Path, who: str) -> Iterator[pa.RecordBatch]:
     rows: list[dict[str, str]] = []
     for step in safexml.children(path, "fcd-export"):
-        rows += [{"time": step.get("time", ""), **vehicle.attrib} for vehicle in step.iter("vehicle")]
+        rows += [{"time": step.get("time", ""), **one.attrib} for one in step.iter(who)]
+        if who == "person":
+            rows = [{key: value for key, value in row.items() if key != "slope"} for row in rows]
         if len(rows) >= _BATCH_ROWS:
             yield _xml_batch(rows, path)
             rows.clear()
@@ -145,12 +155,12 @@ def _xml_batch(rows: list[dict[str, str]], path: Path) -> pa.RecordBatch:
     return pa.record_batch(columns)
 
 
-def _columns(names: list[str], path: Path) -> dict[str, str]:
+def _columns(names: list[str], path: Path, who: str) -> dict[str, str]:
     """Our name -> the file's, for each column that we use (SUMO calls x ``vehicle_x`` in CSV and Parquet)."""
     ours = {
-        name.removeprefix("vehicle_").removeprefix("timestep_"): name
+        name.removeprefix(f"{who}_").removeprefix("timestep_"): name
         for name in reversed(names)
-        if not name.startswith(("person_", "container_"))
+        if not name.startswith(_OTHERS[who])
     }
     for name in _NEEDED:
         if name not in ours:
@@ -334,6 +344,16 @@ class _Cut:
                 f" {window.skip_ms / 1000:g} s ({self.seen} time steps in all)",
                 f"at most {there} frames, or a shorter warmup_s",
             )
+
+
+def together(some: Group, others: Group) -> Group:
+    """Two streams' rows of the same frames as one group."""
+    return Group(
+        some.first_frame,
+        some.frames,
+        np.concatenate([some.frame, others.frame]),
+        pa.concat_tables([some.rows, others.rows]).combine_chunks(),
+    )
 
 
 def _solid(kept: NDArray[np.int64]) -> bool:

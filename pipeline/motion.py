@@ -11,8 +11,9 @@ degrees, exact at multiples of 90. Positions are rounded to 1 micrometre, angles
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -63,13 +64,29 @@ class Boxes:
     height_m: Floats
     speed_m_s: Floats
     """NaN where unknown."""
+    types: list[str] = field(default_factory=list)
+    type_code: Ints = field(default_factory=lambda: np.empty(0, np.int64))
+    """Position in ``types``, SUMO's vehicle types."""
+    part: Ints | None = None
+    """0, or 1.. for the rear parts of an articulated vehicle; None where every vehicle is one box."""
+    apart: NDArray[np.bool_] | None = None
+    """Those who do not count as vehicles of the scenario (an effect's pedestrians and bicycles); None where all count."""
+
+    def rows(self, index: Ints) -> dict[str, Any]:
+        """The arrays that have one element a row, at ``index``."""
+        arrays = {name: value for name, value in self.__dict__.items() if isinstance(value, np.ndarray)}
+        return {name: value[index] for name, value in arrays.items()}
+
+    def only(self, kept: NDArray[np.bool_]) -> Boxes:
+        """Some of the rows."""
+        return replace(self, **self.rows(np.flatnonzero(kept)))
 
     def columns(self) -> dict[str, Any]:
         """As the artefact ``trajectories`` has them."""
         n = self.frame.size
         return {
             "frame": self.frame.astype(np.uint32),
-            "part": np.zeros(n, np.uint8),
+            "part": np.zeros(n, np.uint8) if self.part is None else self.part.astype(np.uint8),
             "vehicle": _strings(self.names, self.code),
             "kind": _strings(self.kinds, self.kind),
             **{
@@ -79,8 +96,8 @@ class Boxes:
         }
 
 
-def boxes(group: Group, sizes: Mapping[str, Size], period_s: float, place: str) -> Boxes:
-    """The boxes of a group of whole frames.
+def boxes(group: Group, sizes: Mapping[str, Size], period_s: float, place: str, apart: frozenset[str] = frozenset()) -> Boxes:
+    """The boxes of a group of whole frames. Vehicles of the types in ``apart`` do not count as the scenario's.
 
     Raises
     ------
@@ -126,6 +143,9 @@ def boxes(group: Group, sizes: Mapping[str, Size], period_s: float, place: str) 
         width,
         height,
         speed,
+        types,
+        type_code,
+        apart=np.array([name in apart for name in types], dtype=np.bool_)[type_code] if apart else None,
     )
     return found if not np.isnan(speed).any() else _with_speed(found, period_s)
 
@@ -158,6 +178,16 @@ def _tidy(values: Floats, digits: int) -> Floats:
     return np.round(values, digits) + 0.0
 
 
+def tidy_m(values: Floats) -> Floats:
+    """Metres as trajectories have them: rounded to 1 micrometre."""
+    return _tidy(values, _POSITION_DIGITS)
+
+
+def tidy_rad(values: Floats) -> Floats:
+    """Radians as trajectories have them: rounded to 1 nanoradian."""
+    return _tidy(values, _ANGLE_DIGITS)
+
+
 def _with_speed(found: Boxes, period_s: float) -> Boxes:
     """Fill speeds that the file does not give from the way to the next frame, or from the last one where there is none."""
     order = np.lexsort((found.frame, found.code))
@@ -168,7 +198,7 @@ def _with_speed(found: Boxes, period_s: float) -> Boxes:
     speed = np.empty(order.size)
     speed[order] = np.where(np.isnan(onward), back, onward)
     speed = np.where(np.isnan(found.speed_m_s), speed, found.speed_m_s)
-    return Boxes(**{**found.__dict__, "speed_m_s": speed})
+    return replace(found, speed_m_s=speed)
 
 
 def _sorted_codes(column: pa.ChunkedArray) -> tuple[list[str], Ints]:
@@ -229,6 +259,13 @@ def _share_space(found: Boxes, a: Ints, b: Ints) -> NDArray[np.bool_]:
     return together
 
 
+def _whole_pairs(found: Boxes, pairs: Ints) -> Ints:
+    """Pairs of parts -> pairs of vehicles, each once, as rows of the boxes that are left when only first parts are kept."""
+    assert found.part is not None
+    vehicle = np.cumsum(found.part == 0) - 1
+    return np.unique(vehicle[pairs], axis=0).reshape(-1, 2)
+
+
 @dataclass
 class Tally:
     """What a recording amounts to, added up group by group."""
@@ -245,22 +282,44 @@ class Tally:
     longest_standing_frames: int = 0
     stands_since: dict[str, int] = field(default_factory=dict)
     """Vehicles that stand in the last frame added, and the frame since when."""
+    apart: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """Of each kind that does not count as a vehicle: how many in a frame, and which different ones."""
+    mixed_overlaps: Counter[str] = field(default_factory=Counter)
+    """Overlapping pairs in which one at least does not count as a vehicle, by their kinds."""
 
     def __post_init__(self) -> None:
         self.vehicles = np.zeros(self.frames, dtype=np.int64)
 
     def add(self, found: Boxes) -> None:
         """Count the next group."""
-        end = found.first_frame + found.frames
+        end, pairs = found.first_frame + found.frames, overlapping(found)
+        if found.part is not None:  # the parts of one vehicle touch at their joint
+            pairs = pairs[found.code[pairs[:, 0]] != found.code[pairs[:, 1]]]
+            pairs, found = _whole_pairs(found, pairs), found.only(found.part == 0)
+        self._add_standing(found, end)
+        if found.apart is not None:
+            pairs, found = self._add_apart(found, pairs)
         self.vehicles[found.first_frame : end] = np.bincount(found.frame - found.first_frame, minlength=found.frames)
-        self.different.update(found.names)
+        self.different.update(found.names if found.apart is None else (found.names[i] for i in np.unique(found.code)))
         self.rows += found.frame.size
         self.speed_sum += float(np.nansum(found.speed_m_s))
         self.standing += int(np.count_nonzero(found.speed_m_s < STANDING_M_S))
-        pairs = overlapping(found)
         self.overlapping_pairs += len(pairs)
         self.frames_with_overlap += np.unique(found.frame[pairs[:, 0]]).size
-        self._add_standing(found, end)
+
+    def _add_apart(self, found: Boxes, pairs: Ints) -> tuple[Ints, Boxes]:
+        """Count who does not count as a vehicle; what is left: vehicles, and the pairs of them that overlap."""
+        assert found.apart is not None
+        end = found.first_frame + found.frames
+        for kind in np.unique(found.kind[found.apart]):
+            mine = found.apart & (found.kind == kind)
+            about = self.apart.setdefault(found.kinds[kind], {"frame": np.zeros(self.frames, np.int64), "different": set()})
+            about["frame"][found.first_frame : end] = np.bincount(found.frame[mine] - found.first_frame, minlength=found.frames)
+            about["different"].update(found.names[i] for i in np.unique(found.code[mine]))
+        mixed = found.apart[pairs].any(axis=1)
+        self.mixed_overlaps.update(" and ".join(sorted(found.kinds[found.kind[i]] for i in pair)) for pair in pairs[mixed])
+        counted = ~found.apart
+        return (np.cumsum(counted) - 1)[pairs[~mixed]], found.only(counted)
 
     def _add_standing(self, found: Boxes, end: int) -> None:
         """Follow each vehicle's runs of standing frames, across groups."""
@@ -294,4 +353,20 @@ class Tally:
             "longest_standing_s": round(self.longest_standing_frames * period_s, 3),
             "overlapping_pairs": self.overlapping_pairs,
             "frames_with_overlap": self.frames_with_overlap,
+            **self._apart_result(),
         }
+
+    def _apart_result(self) -> dict[str, Any]:
+        """Nothing where everybody counts as a vehicle."""
+        if not self.apart:
+            return {}
+        about = {
+            kind: {
+                "fewest": int(values["frame"].min()),
+                "most": int(values["frame"].max()),
+                "mean": round(float(values["frame"].mean()), 3),
+                "different": len(values["different"]),
+            }
+            for kind, values in sorted(self.apart.items())
+        }
+        return {"beside_vehicles": about | {"overlapping_pairs": dict(sorted(self.mixed_overlaps.items()))}}

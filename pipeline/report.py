@@ -66,7 +66,7 @@ def inputs(scenario: Scenario, out: Path) -> dict[str, Any]:
     if not scenario.scan.keep:
         from pipeline import survey
 
-        more = {"scan": survey.settings(scenario), "scan_files": survey.files(scenario, out)}
+        more = {"scan": survey.settings(scenario, out), "scan_files": survey.files(scenario, out)}
     return {
         "settings": {"shown": _shown(scenario), "keep": scenario.scan.keep, **more},
         "costs": _costs(record),

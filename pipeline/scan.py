@@ -28,7 +28,7 @@ ARTEFACTS = ("scans.parquet",)
 
 def inputs(scenario: Scenario, out: Path) -> dict[str, Any]:
     """The region of interest without its voxels, sites, sensors; the statics and the sites' files by hash."""
-    return {"settings": {"keep": scenario.scan.keep, **survey.settings(scenario)}, "files": survey.files(scenario, out)}
+    return {"settings": {"keep": scenario.scan.keep, **survey.settings(scenario, out)}, "files": survey.files(scenario, out)}
 
 
 def run(
@@ -65,7 +65,7 @@ def run(
         for site in surveyed.sites:
             if site.site in points:
                 _write_cloud(out, surveyed.scan(site), cloud)
-        return {"sites": len(known), "kept": False}
+        return {"sites": len(known), "kept": False, **_skipped(surveyed)}
     about: list[dict[str, Any]] = []
     doubtful = 0
     with tables.writer(out / ARTEFACTS[0], "scans", surveyed.columns) as file:
@@ -83,7 +83,13 @@ def run(
         "beams": sum(a["beams_in_roi"] for a in about),
         "returns": sum(a["returns"] for a in about),
         "settled_in_float64": doubtful,
+        **_skipped(surveyed),
     }
+
+
+def _skipped(surveyed: Survey) -> dict[str, Any]:
+    """What to say of effects that are named but provably change nothing; nothing when there is none."""
+    return {"skipped": [f"{name}: {why}" for name, why in surveyed.skipped.items()]} if surveyed.skipped else {}
 
 
 def _columns(done: SiteScan) -> dict[str, Any]:
@@ -97,7 +103,7 @@ def _columns(done: SiteScan) -> dict[str, Any]:
         "dz_m": ends[:, 2],
         "returned": done.scan.returned,
     }
-    return columns | {"from_m": done.scan.from_m, "weight": done.scan.weight}
+    return columns | {"weight": done.scan.weight}
 
 
 def _write_cloud(out: Path, done: SiteScan, suffix: str) -> None:

@@ -261,6 +261,7 @@ class ScoreModel(_Model):
     keep_visibility: tuple[str, ...] | Literal["all"] = Field(
         (), description="Sites whose hits in every voxel are written to visibility.parquet"
     )
+    standard_error: bool = Field(True, description="Say how far each score may be off because the traffic was short")
 
 
 class Scenario(_Model):

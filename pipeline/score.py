@@ -4,8 +4,9 @@ r"""Which site sees most of what is uncertain?
 
 (arXiv 2504.06772, Eq. 4): ``hits`` are the beams of the site's empty scan that cross voxel v, p comes from the TPOG.
 
-Steps: read ``tpog.parquet``; read ``scans.parquet`` site by site (with ``scan.keep = false``: cast instead); march every beam through
-the grid and count; sum; rank. Another gamma, voxel size or TPOG needs this stage alone.
+Steps: read ``tpog.parquet``; read ``scans.parquet`` site by site (with ``scan.keep = false``: cast instead); march every beam
+through the grid and count; sum; rank; say how far each score may be off because the traffic was short. Another gamma, voxel size or
+TPOG needs this stage alone.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import survey, tables, visibility
+from pipeline import survey, tables, uncertainty, visibility
 from pipeline.entropy import Field, Score
 from pipeline.kernels import march
 from pipeline.ordered import in_order
@@ -40,15 +41,17 @@ class _Scored:
     score: Score
     audit: tuple[float, float, int, int] | None
     visible: dict[str, Any] | None
+    left_out: NDArray[np.float64] | None
 
 
 def inputs(scenario: Scenario, out: Path) -> dict[str, Any]:
     """Gamma and what to keep; TPOG and scans by hash (without kept scans: what a scan depends on)."""
-    own = {"name": scenario.name, "score": scenario.score.model_dump(mode="json"), **_effects(scenario)}
-    hashes = {"tpog.parquet": tables.sha256_of(out / "tpog.parquet")}
+    named, also_read = _effects(scenario, out)
+    own = {"name": scenario.name, "score": scenario.score.model_dump(mode="json"), **named}
+    hashes = {name: tables.sha256_of(out / name) for name in ("tpog.parquet", *also_read)}
     if scenario.scan.keep:
         return {"settings": own, "files": hashes | {"scans.parquet": tables.sha256_of(out / "scans.parquet")}}
-    return {"settings": own | {"scan": survey.settings(scenario)}, "files": hashes | survey.files(scenario, out)}
+    return {"settings": own | {"scan": survey.settings(scenario, out)}, "files": hashes | survey.files(scenario, out)}
 
 
 def run(
@@ -70,7 +73,8 @@ def run(
     field = Field.of(tpog.counts, tpog.frames, tpog.grid)
     gamma = scenario.score.gamma
     visible_from = Visibility(scenario, out, tpog.grid)
-    scorer = _Scorer(visible_from, field, scenario, audit)
+    leave_out = uncertainty.LeaveOut.of(out / "tpog.parquet") if scenario.score.standard_error else None
+    scorer = _Scorer(visible_from, field, scenario, audit, leave_out)
     done: list[_Scored] = []
     visible: list[dict[str, Any]] = []
     for scored in in_order(scorer.score, visible_from.beams(), threads(jobs)):
@@ -82,10 +86,17 @@ def run(
     read = inputs(scenario, out)
     about = metadata(scenario, read, gamma=gamma, grid=tpog.grid.to_json(), frames=tpog.frames, sites=[d.about for d in done])
     _write_visibility(out / ARTEFACTS[1], visible, about)
-    columns = _columns(done, limit)
-    tables.write(out / ARTEFACTS[0], "scores", columns, about)
+    estimate = _estimate(done, leave_out)
+    columns = _columns(done, limit) | _error_columns(estimate)
+    with tables.writer(out / ARTEFACTS[0], "scores", tuple(_error_columns(estimate))) as file:
+        file.write(columns)
+        file.describe(about)
     best = [d.about["site"] for d, rank in zip(done, columns["rank"], strict=True) if rank == 1]
     summary: dict[str, Any] = {"sites": len(done), "best": best, "egvs_limit": limit}
+    if visible_from.skipped:
+        summary["skipped"] = [f"{name}: {reason}" for name, reason in visible_from.skipped.items()]
+    if estimate is not None:
+        summary |= uncertainty.in_words(estimate, tpog.frames)
     if audit:
         summary["audit"] = _worst([d.audit for d in done if d.audit is not None])
     return summary
@@ -94,8 +105,10 @@ def run(
 class _Scorer:
     """Scores one site after another, on any thread."""
 
-    def __init__(self, visible: Visibility, field: Field, scenario: Scenario, audit: bool) -> None:
-        self._visibility, self._field, self._audit = visible, field, audit
+    def __init__(
+        self, visible: Visibility, field: Field, scenario: Scenario, audit: bool, leave_out: uncertainty.LeaveOut | None
+    ) -> None:
+        self._visibility, self._field, self._audit, self._leave_out = visible, field, audit, leave_out
         self._gamma, self._keep = scenario.score.gamma, scenario.score.keep_visibility
 
     def score(self, beams: Beams) -> _Scored:
@@ -103,7 +116,8 @@ class _Scorer:
         hits = self._visibility.hits(beams)
         visible = self._visible(name, hits, unit) if self._keep == "all" or name in self._keep else None
         found = audit(beams, self._field.grid) if self._audit else None
-        return _Scored(beams.site, self._field.score(hits, self._gamma, unit), found, visible)
+        left_out = self._leave_out.scores(hits, self._gamma, unit) if self._leave_out is not None else None
+        return _Scored(beams.site, self._field.score(hits, self._gamma, unit), found, visible, left_out)
 
     def _visible(self, site: str, hits: Hits, unit: int) -> dict[str, Any]:
         flat = np.flatnonzero(hits)
@@ -131,15 +145,29 @@ def _columns(done: list[_Scored], limit: float) -> dict[str, Any]:
     }
 
 
-def _effects(scenario: Scenario) -> dict[str, Any]:
-    """The effects that act in this stage, and the sensors that they ask; nothing when the scenario names none."""
-    if not scenario.effects:
+def _estimate(done: list[_Scored], leave_out: uncertainty.LeaveOut | None) -> uncertainty.Estimate | None:
+    """What leaving blocks out says of all sites; None when it is not asked for, or there is one block only."""
+    if leave_out is None:
+        return None
+    return uncertainty.Estimate.of(np.array([d.left_out for d in done]).reshape(len(done), -1), leave_out.frames)
+
+
+def _error_columns(estimate: uncertainty.Estimate | None) -> dict[str, Any]:
+    """The columns of ``scores.parquet`` that say how far a score may be off."""
+    if estimate is None:
         return {}
+    return {"egvs_se": estimate.se, "egvs_bias": estimate.bias, "beats_next": uncertainty.beats_next(estimate)}
+
+
+def _effects(scenario: Scenario, out: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Settings of the effects that act in this stage, with the sensors that they ask; the artefacts that only they read."""
+    live, _ = visibility.acting(scenario, out)
+    if not live:
+        return {}, ()
     from pipeline import effects
 
-    named = effects.settings(effects.of(scenario, NAME))
     sensors = {name: model.model_dump(mode="json") for name, model in scenario.sensors.items()}
-    return {"effects": named, "sensors": sensors} if named else {}
+    return {"effects": effects.settings(live), "sensors": sensors}, tuple(name for effect in live for name in effect.reads)
 
 
 def ranks(scores: NDArray[np.float64]) -> NDArray[np.uint32]:

@@ -18,7 +18,12 @@ from rich.table import Table
 from pipeline.sensors import Sensor
 
 if TYPE_CHECKING:
+    from pipeline.accuracy import Row, Seeds, Study
     from pipeline.callings import Call, Change
+
+
+SEPARABLE = 0.9
+"""Neighbours in rank are told apart when the chance that the better is better reaches this."""
 
 
 class Screen:
@@ -61,6 +66,12 @@ class Screen:
             self._bar.update(self._task, visible=False)
         took = "unchanged" if state == "skipped" else f"{record['cost']['seconds']:.2f} s"
         self._err.print(f"{stage:<8} {took:>10}   {_in_words(record['said'])}", markup=False)
+
+    def setting(self, name: str, state: str, said: dict[str, Any]) -> None:
+        """A :data:`pipeline.accuracy.Told`."""
+        self._stage = "accuracy"
+        took = f"{said['seconds']:.2f} s" if "seconds" in said else state
+        self._err.print(f"{took:>10}   {name}{' (kept)' if state == 'kept' else ''} {said.get('why', '')}", markup=False)
 
     def result(self, folder: Path, record: dict[str, Any]) -> None:
         """The ranking, the artefacts, and what each stage cost."""
@@ -106,17 +117,29 @@ class Screen:
 
 def ranking(rows: list[dict[str, Any]]) -> Table:
     """Sites by rank, as a table."""
-    table = Table(box=None, pad_edge=False)
-    for name in ("rank", "site", "x m", "y m", "z m", "sensor", "EGVS bit", "of best", "entropy seen", "beams in ROI"):
+    table = Table(box=None, pad_edge=False, caption_justify="left")
+    columns = ["rank", "site", "x m", "y m", "z m", "sensor", "EGVS bit", "of best", "entropy seen", "beams in ROI"]
+    unsure = "egvs_se" in rows[0] if rows else False
+    if unsure:
+        columns[7:7] = ["std error", "beats next"]
+        if any(row["beats_next"] < SEPARABLE for row in rows):
+            table.caption = f"~ not separable from the next site: the chance that it truly scores higher is below {SEPARABLE:.0%}"
+    for name in columns:
         table.add_column(name, justify="left" if name in ("site", "sensor") else "right")
     best = max((row["egvs"] for row in rows), default=0.0)
     for row in sorted(rows, key=lambda row: row["rank"]):
         share = f"{row['egvs'] / best:.1%}" if best > 0 else "-"
         table.add_row(
             str(row["rank"]), row["site"], f"{row['x_m']:.2f}", f"{row['y_m']:.2f}", f"{row['z_m']:.2f}", row["sensor"],
-            f"{row['egvs']:.1f}", share, f"{row['entropy_seen']:.1%}", str(row["beams_in_roi"]),
+            f"{row['egvs']:.1f}", *(_doubt(row) if unsure else ()), share, f"{row['entropy_seen']:.1%}", str(row["beams_in_roi"]),
         )  # fmt: skip
     return table
+
+
+def _doubt(row: dict[str, Any]) -> tuple[str, str]:
+    """How far a score may be off, and whether the site is told from the next."""
+    mark = "~ " if row["beats_next"] < SEPARABLE else ""
+    return f"{row['egvs_se'] / row['egvs']:.1%}" if row["egvs"] > 0 else "-", f"{mark}{row['beats_next']:.0%}"
 
 
 def catalogue(sensors: Iterable[Sensor]) -> None:
@@ -165,6 +188,68 @@ def summary(folder: Path, found: dict[str, Any]) -> None:
     for key, value in found.items():
         console.print(f"{key}: {_in_words(value) if isinstance(value, dict) else _plain(value)}", markup=False)
     console.print(f"next: egvs run {folder}", markup=False)
+
+
+def accuracy(study: Study, scenario: str) -> None:
+    """What the study found: two tables, what was left out, the recommendation."""
+    console = Console(width=None if sys.stdout.isatty() else 160, highlight=False, soft_wrap=True)
+    same = [row for row in study.rows if row.kind != "measures"]
+    other = [row for row in study.rows if row.kind in ("measures", "scenario")]
+    long = f"traffic {study.times} times as long" if study.times > 1 else "the scenario itself: nothing longer is to be had"
+    console.print(_settings("settings that approximate the same number, against the reference", same, True))
+    console.print(f"reference: {long}. * on the front of time and error, = recommended\n", markup=False)
+    if len(other) > 1:
+        console.print(_settings("settings that measure something else, against the scenario on the same traffic", other, False))
+    for name, why in study.skipped.items():
+        console.print(f"skipped: {name}: {why}", markup=False)
+    if study.seeds is not None:
+        _seeds(console, study.seeds)
+    for better, worse, chance, frames in study.neighbours[:3]:
+        console.print(f"{better} above {worse}: chance {chance:.0%}; about {frames:,.0f} frames tell them apart", markup=False)
+    console.print(_recommendation(study, scenario), markup=False)
+    for path in study.files:
+        console.print(str(path), markup=False)
+
+
+def _settings(title: str, rows: Sequence[Row], errors: bool) -> Table:
+    table = Table(box=None, pad_edge=False, title=title, title_justify="left")
+    names = ["", "setting", "knob", "seconds", "+-", "n", "traffic", "tpog", "scan", "score", "peak MB", "MB"]
+    names += ["error", "std error", "own change"] if errors else []
+    for name in (*names, "tau", "rho", "best", "three", "regret"):
+        left = name in ("", "setting", "knob")
+        table.add_column(name, justify="left" if left else "right", no_wrap=True)
+    for r in rows:
+        parts = [f"{r.error:.2%}", f"{r.error_se:.2%}", f"{r.own_change:.2%}"] if errors else []
+        table.add_row(
+            "*" * r.front + "=" * r.recommended, r.setting, r.knob, f"{r.seconds:.2f}", f"{r.seconds_spread:.2f}", str(r.repeats),
+            f"{r.traffic_s:.2f}", f"{r.tpog_s:.2f}", f"{r.scan_s:.2f}", f"{r.score_s:.2f}", f"{r.peak_mb:.0f}",
+            f"{r.bytes / 1e6:.1f}", *parts, f"{r.tau:.3f}", f"{r.rho:.3f}",
+            "kept" if r.best_kept else "other", "kept" if r.best_three_kept else "other", f"{r.regret:.2%}",
+        )  # fmt: skip
+    return table
+
+
+def _seeds(console: Console, seeds: Seeds) -> None:
+    table = Table(
+        box=None, pad_edge=False, title=f"{seeds.seeds} independent runs of {seeds.frames} frames, bit", title_justify="left"
+    )
+    for name in ("site", "between runs", "standard error", "bias", "expected bias"):
+        table.add_column(name, justify="left" if name == "site" else "right")
+    for row in zip(seeds.sites, seeds.between, seeds.within, seeds.bias, seeds.expected_bias, strict=True):
+        table.add_row(row[0], *(f"{value:.0f}" for value in row[1:]))
+    console.print(table)
+    console.print(f"90 % intervals hold the score of all runs together in {seeds.covered:.1%} of cases")
+
+
+def _recommendation(study: Study, scenario: str) -> str:
+    if study.best is None:
+        least = min((row for row in study.rows if row.kind in ("approximates", "scenario")), key=lambda row: row.judged)
+        return f"no setting is within {study.tolerance:.2%}; the nearest is {least.setting!r}, with {least.judged:.2%}"
+    best = study.best
+    return (
+        f"the cheapest setting within {study.tolerance:.2%}: {best.setting}, {best.seconds:.2f} s, error {best.error:.2%}, "
+        f"standard error {best.error_se:.2%}\n  egvs run {scenario} {best.overrides}".rstrip()
+    )
 
 
 def _in_words(said: dict[str, Any]) -> str:

@@ -1,7 +1,8 @@
 """How does a scenario become a run of SUMO?
 
 Steps: lay out a folder that opens in sumo-gui (``run.sumocfg``, demand, vTypes, a copy of the network); run ``sumo`` there as a
-subprocess, which writes its floating car data to a file; or record the same from a SUMO that is already running.
+subprocess, which writes its floating car data to a file; or record the same from a SUMO that is already running. Where an effect
+brings people on foot and on bicycles, they are a further route file of the same simulation.
 
 World frame and units as in SUMO; times are whole milliseconds, SUMO's own unit, so that step, period and warm-up are
 compared exactly.
@@ -15,7 +16,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -27,8 +28,12 @@ from pipeline.motion import Size
 from pipeline.scenario import Scenario, TrafficModel
 from pipeline.stage import Progress
 
+if TYPE_CHECKING:
+    from pipeline.effects.pedestrians_bicycles import PedestriansBicycles
+
 CONFIG, NETWORK, TRIPS, VTYPES = "run.sumocfg", "network.net.xml", "trips.rou.xml", "vtypes.add.xml"
 FCD, COLLISIONS, STOPS, LOG = "fcd.csv", "collisions.xml", "stops.xml", "sumo.log"
+OTHERS, PERSONS = "others.rou.xml", "persons.csv"
 _SYNONYMS = {
     "n": "net-file",
     "net": "net-file",
@@ -210,6 +215,8 @@ class Prepared:
     cycle_s: float
     drawn: bool
     notes: tuple[str, ...]
+    crowd: bool = False
+    """Whether people on foot and on bicycles are there too."""
 
     @property
     def config(self) -> list[str]:
@@ -229,28 +236,37 @@ class Prepared:
             "precision": str(_PRECISION),
             "collision-output": COLLISIONS,
         }
+        if self.crowd:
+            wanted |= {"person-fcd-output": PERSONS}
         return wanted if self.drawn else wanted | {"stop-output": STOPS, "stop-output.write-unfinished": "true"}
 
 
-def prepare(scenario: Scenario, folder: Path) -> Prepared:
-    """Lay out the folder."""
+def prepare(scenario: Scenario, folder: Path, crowd: PedestriansBicycles | None = None) -> Prepared:
+    """Lay out the folder. ``crowd`` brings people on foot and on bicycles."""
     traffic, where = scenario.traffic, place(scenario)
     given = sources(scenario)
     when = timing(traffic, given.begin_s, where)
     folder.mkdir(parents=True, exist_ok=True)
     files = _copies(given, folder)
     roads = network.read(folder / files["net-file"], given.files["net-file"][0])
-    demand_seed, sumo_seed = np.random.SeedSequence(scenario.seed).spawn(2)
+    demand_seed, sumo_seed, crowd_seed = np.random.SeedSequence(scenario.seed).spawn(3)
     drawn, notes = traffic.sumocfg is None and not traffic.routes, []
     if drawn:
         notes = _draw(scenario, roads, when, np.random.default_rng(demand_seed), folder)
         files |= {"additional-files": VTYPES, "route-files": TRIPS}
-    options = given.options | files | _settings(traffic, when, int(sumo_seed.generate_state(1)[0]) & 0x7FFFFFFF)
+    vehicles = traffic.vehicles
+    if crowd is not None:
+        path, times = folder / files["net-file"], (when.begin_ms / 1000.0, when.end_ms / 1000.0)
+        plan = crowd.plan(scenario, path, roads, *times, np.random.default_rng(crowd_seed))
+        tables.write_text(folder / OTHERS, plan.xml)
+        files["route-files"] = ",".join(name for name in (files.get("route-files"), OTHERS) if name)
+        vehicles, notes = vehicles + plan.slots, [*notes, *plan.notes]
+    options = given.options | files | _settings(traffic, when, int(sumo_seed.generate_state(1)[0]) & 0x7FFFFFFF, vehicles)
     tables.write_text(folder / CONFIG, _config_xml(options))
-    return Prepared(folder, options, when, roads.has_heights, roads.cycle_s, drawn, tuple(notes))
+    return Prepared(folder, options, when, roads.has_heights, roads.cycle_s, drawn, tuple(notes), crowd is not None)
 
 
-def _settings(traffic: TrafficModel, when: Timing, seed: int) -> dict[str, str]:
+def _settings(traffic: TrafficModel, when: Timing, seed: int, vehicles: int) -> dict[str, str]:
     """What the scenario decides, whatever a user's configuration says; see the traps of SUMO behind each."""
     return {
         "seed": str(seed),
@@ -259,7 +275,7 @@ def _settings(traffic: TrafficModel, when: Timing, seed: int) -> dict[str, str]:
         "step-length": _text(when.step_ms),
         "threads": "1",
         "lateral-resolution": f"{traffic.lateral_resolution_m:g}",
-        "max-num-vehicles": str(traffic.vehicles),
+        "max-num-vehicles": str(vehicles),
         "max-depart-delay": f"{traffic.max_depart_delay_s:g}",
         "time-to-teleport": "-1",
         "collision.action": "warn",
@@ -290,28 +306,23 @@ def _draw(scenario: Scenario, roads: network.Network, when: Timing, rng: np.rand
 
 def _copies(given: Sources, folder: Path) -> dict[str, str]:
     """Copy every file into the folder, so that it can be moved and opened elsewhere."""
-    taken, values = {CONFIG, TRIPS, VTYPES, FCD, COLLISIONS, STOPS, LOG}, {}
+    taken, values = {CONFIG, TRIPS, VTYPES, FCD, COLLISIONS, STOPS, LOG, OTHERS, PERSONS}, {}
     for option, paths in given.files.items():
         names = []
         for path in paths:
             name = path.name.replace(",", "_")
             if option == "net-file":
-                name = NETWORK + (".gz" if safexml.is_gzip(path) and not is_osm(path) else "")
+                name = NETWORK + (".gz" if safexml.is_gzip(path) and not network.is_osm(path) else "")
             while name in taken:
                 name = f"_{name}"
             taken.add(name)
-            if option == "net-file" and is_osm(path):
+            if option == "net-file" and network.is_osm(path):
                 convert_osm(path, folder / name)
             else:
                 shutil.copyfile(path, folder / name)
             names.append(name)
         values[option] = ",".join(names)
     return values
-
-
-def is_osm(path: Path) -> bool:
-    """Whether a network is still a map of OpenStreetMap."""
-    return path.name.removesuffix(".gz").endswith((".osm", ".osm.xml"))
 
 
 def convert_osm(path: Path, network_path: Path) -> None:
@@ -414,6 +425,8 @@ class Seen:
     sizes: Polled = field(default_factory=Polled)
     collided: set[tuple[str, str]] = field(default_factory=set)
     on_purpose: set[str] = field(default_factory=set)
+    persons: bool = False
+    """Whether persons are wanted too."""
 
 
 def poll(connection: Any, when: Timing, seen: Seen, address: str) -> Iterator[pa.Table]:
@@ -422,7 +435,7 @@ def poll(connection: Any, when: Timing, seen: Seen, address: str) -> Iterator[pa
     After a step, TraCI's clock is one step ahead of the state that it shows: what SUMO's FCD calls time t is seen at t + step.
     """
     _check_clock(connection, when, address)
-    watch = _Watch(connection)
+    watch = _Watch(connection, seen.persons)
     while (shown_ms := round(connection.simulation.getTime() * 1000)) < when.end_ms:
         connection.simulationStep()
         watch.follow()
@@ -431,7 +444,7 @@ def poll(connection: Any, when: Timing, seen: Seen, address: str) -> Iterator[pa
         seen.collided |= {(c.collider, c.victim) for c in connection.simulation.getCollisions()}
         if (shown_ms - when.first_ms) % when.period_ms == 0 and (rows := watch.rows(seen.sizes)):
             if shown_ms + when.step_ms >= when.end_ms:
-                seen.on_purpose |= {name for name, _, _ in rows if connection.vehicle.isStopped(name)}
+                seen.on_purpose |= {name for name in watch.vehicles() if connection.vehicle.isStopped(name)}
             yield _as_table(shown_ms, rows)
 
 
@@ -455,9 +468,9 @@ def _check_clock(connection: Any, when: Timing, address: str) -> None:
 
 
 class _Watch:
-    """Subscriptions to every vehicle on the road."""
+    """Subscriptions to every vehicle on the road, and to every person where these are wanted."""
 
-    def __init__(self, connection: Any) -> None:
+    def __init__(self, connection: Any, persons: bool) -> None:
         tc = sumo.constants()
         self._connection = connection
         self._wanted = (tc.VAR_POSITION3D, tc.VAR_ANGLE, tc.VAR_SLOPE, tc.VAR_SPEED, tc.VAR_TYPE)
@@ -466,17 +479,35 @@ class _Watch:
             connection.vehicle.subscribe(name, self._wanted)
         connection.simulation.subscribe((tc.VAR_DEPARTED_VEHICLES_IDS,))
         self._departed = tc.VAR_DEPARTED_VEHICLES_IDS
+        self._persons: set[str] | None = set() if persons else None
 
     def follow(self) -> None:
-        """Subscribe to the vehicles that departed in this step."""
+        """Subscribe to the vehicles that departed in this step, and to persons who are new."""
         for name in self._connection.simulation.getSubscriptionResults()[self._departed]:
             self._connection.vehicle.subscribe(name, self._wanted)
+        if self._persons is not None:
+            there = set(self._connection.person.getIDList())
+            for name in sorted(there - self._persons):
+                self._connection.person.subscribe(name, self._wanted)
+            self._persons = there
+
+    def vehicles(self) -> list[str]:
+        """The names of all vehicles on the road."""
+        position = self._wanted[0]
+        results = self._connection.vehicle.getAllSubscriptionResults()
+        return [name for name, values in results.items() if values[position][0] != self._invalid]
 
     def rows(self, sizes: Polled) -> list[tuple[str, str, list[float]]]:
-        """(id, type, [x, y, z, angle, slope, speed]) of every vehicle, rounded as SUMO rounds in its files."""
+        """(id, type, [x, y, z, angle, slope, speed]) of everybody, rounded as SUMO rounds in its files."""
+        found = self._rows(self._connection.vehicle, sizes)
+        if self._persons is not None:  # people stand upright, see fcd.read
+            found += [(name, vtype, [*n[:4], 0.0, n[5]]) for name, vtype, n in self._rows(self._connection.person, sizes)]
+        return found
+
+    def _rows(self, domain: Any, sizes: Polled) -> list[tuple[str, str, list[float]]]:
         position, angle, slope, speed, vtype = self._wanted
         found = []
-        for name, values in self._connection.vehicle.getAllSubscriptionResults().items():
+        for name, values in domain.getAllSubscriptionResults().items():
             if values[position][0] == self._invalid:
                 continue  # between two places of a teleport
             sizes.learn(self._connection, values[vtype])

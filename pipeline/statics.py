@@ -5,7 +5,8 @@ count what was mended; extrude footprints between ``base_m`` and ``height_m``; l
 one triangle mesh, ``statics.ply``, in the world frame in metres.
 
 ``height_m`` is the z of the top, ``base_m`` (default 0) the z of the underside. Points are discs of ``radius_m``, lines are
-strips of that half width.
+strips of that half width. Where the network has relief, the ground follows its roads (:mod:`pipeline.effects.slope`), and both
+heights count from the ground below the footprint's centre; what stands on the ground reaches down to the lowest of it.
 """
 
 from __future__ import annotations
@@ -14,14 +15,14 @@ import json
 import math
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import safexml, tables
+from pipeline import network, safexml, tables
 from pipeline.errors import InputError
 from pipeline.scenario import MeshModel, Scenario
 from pipeline.stage import Progress, metadata, silent
@@ -30,6 +31,8 @@ from pipeline.world import World, write_ply
 if TYPE_CHECKING:
     from shapely import Polygon
     from shapely.geometry.base import BaseGeometry
+
+    from pipeline.effects.slope import Surface
 
 NAME = "statics"
 ARTEFACTS = ("statics.ply",)
@@ -72,9 +75,10 @@ def inputs(scenario: Scenario, out: Path) -> dict[str, Any]:
     named = [*(("footprints", f) for f in model.footprints), *(("polygons", f) for f in model.polygons),
              *(("meshes", m.file) for m in model.meshes)]  # fmt: skip
     box = scenario.roi.box
+    hilly = {"surface": tables.sha256_of(path)} if (path := _hilly(scenario)) is not None else {}
     return {
         "settings": {"name": scenario.name, "statics": model.model_dump(mode="json"), "roi": [box.origin_m, box.size_m]},
-        "files": {name: tables.sha256_of(scenario.find(name, f"statics.{key}")) for key, name in named},
+        "files": {name: tables.sha256_of(scenario.find(name, f"statics.{key}")) for key, name in named} | hilly,
     }
 
 
@@ -91,12 +95,14 @@ def run(scenario: Scenario, out: Path, *, jobs: int | None = None, progress: Pro
     tally = Tally.empty()
     world = build(scenario, tally, progress)
     write_ply(out / ARTEFACTS[0], world, metadata(scenario, read))
+    notes = {"notes": ["slope: on, the ground follows the network's roads"]} if "surface" in read["files"] else {}
     return {
         "triangles": len(world.faces),
         "solids": len(world.solids),
         "built": dict(sorted(tally.built.items())),
         "mended": dict(sorted(tally.mended.items())),
         "left_out": dict(sorted(tally.left_out.items())),
+        **notes,
     }
 
 
@@ -109,6 +115,8 @@ def build(scenario: Scenario, tally: Tally, progress: Progress = silent) -> Worl
     for name in model.polygons:
         footprints += _poly_xml(scenario.find(name, "statics.polygons"), model.polygon_height_m, tally)
     builder = _Builder()
+    if (surface := _surface(scenario, footprints)) is not None:
+        footprints = [_on(surface, footprint) for footprint in footprints]
     for done, footprint in enumerate(footprints):
         builder.add(*_extrude(footprint), footprint.name, footprint.kind)
         tally.built[footprint.kind] += 1
@@ -116,7 +124,8 @@ def build(scenario: Scenario, tally: Tally, progress: Progress = silent) -> Worl
     for mesh in model.meshes:
         _add_mesh(builder, scenario.find(mesh.file, "statics.meshes"), mesh, tally)
     if model.ground:
-        builder.add(*_ground(builder, scenario), "ground", "ground")
+        laid = _ground(builder, scenario) if surface is None else (surface.vertices_m, surface.faces)
+        builder.add(*laid, "ground", "ground")
         tally.built["ground"] += 1
     return builder.world()
 
@@ -183,7 +192,8 @@ def _polygons(geometry: Any, properties: dict[str, Any], place: str, tally: Tall
     import shapely
 
     try:
-        shape: BaseGeometry = shapely.geometry.shape(geometry)
+        with np.errstate(invalid="ignore"):  # what is no number is refused below
+            shape: BaseGeometry = shapely.geometry.shape(geometry)
         coordinates = shapely.get_coordinates(shape)
     except (shapely.errors.ShapelyError, TypeError, ValueError, KeyError, AttributeError, IndexError) as error:
         raise InputError(f"{place}: geometry", f"cannot be understood ({error})", "a GeoJSON geometry") from None
@@ -248,7 +258,7 @@ def _extrude(footprint: Footprint) -> tuple[NDArray[np.float64], NDArray[np.int6
     import trimesh
 
     mesh = trimesh.creation.extrude_polygon(footprint.polygon, footprint.height_m - footprint.base_m, engine="earcut")
-    return np.asarray(mesh.vertices) + [0.0, 0.0, footprint.base_m], np.asarray(mesh.faces)
+    return np.asarray(mesh.vertices) + np.array([0.0, 0.0, footprint.base_m]), np.asarray(mesh.faces)
 
 
 def _add_mesh(builder: _Builder, path: Path, model: MeshModel, tally: Tally) -> None:
@@ -267,6 +277,8 @@ def _add_mesh(builder: _Builder, path: Path, model: MeshModel, tally: Tally) -> 
     faces = len(mesh.faces)
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
+    if len(mesh.faces) == 0:
+        raise InputError(path, f"none of its {faces} triangles has an area", "a triangle mesh")
     if dropped := faces - len(mesh.faces):
         tally.mended["degenerate or doubled triangles dropped"] += dropped
     pieces = trimesh.graph.connected_components(mesh.face_adjacency, nodes=np.arange(len(mesh.faces)), min_len=1)
@@ -292,3 +304,35 @@ def _ground(builder: _Builder, scenario: Scenario) -> tuple[NDArray[np.float64],
     (x0, y0), (x1, y1) = points.min(axis=0)[:2] - GROUND_MARGIN_M, points.max(axis=0)[:2] + GROUND_MARGIN_M
     vertices = np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
     return vertices, np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def _hilly(scenario: Scenario) -> Path | None:
+    """The network that the ground follows; None where it is flat, which imports no effect."""
+    path = network.path_of(scenario)
+    if path is None or not network.may_have_heights(path):
+        return None
+    from pipeline.effects import slope
+
+    return path if slope.decide(scenario)[0] else None
+
+
+def _surface(scenario: Scenario, footprints: list[Footprint]) -> Surface | None:
+    """The ground over the region of interest and everything that stands, and well beyond, where the network has relief."""
+    if (path := _hilly(scenario)) is None:
+        return None
+    from pipeline.effects import slope
+
+    box = scenario.roi.box
+    corners = [np.array([box.origin_m, np.add(box.origin_m, box.size_m)])[:, :2]]
+    points = np.concatenate([*corners, *(np.reshape(f.polygon.bounds, (2, 2)) for f in footprints)])
+    return slope.ground(path, points.min(axis=0) - GROUND_MARGIN_M, points.max(axis=0) + GROUND_MARGIN_M)
+
+
+def _on(surface: Surface, footprint: Footprint) -> Footprint:
+    """A footprint whose heights count from the ground."""
+    centre = np.array([[footprint.polygon.centroid.x, footprint.polygon.centroid.y]])
+    ground = float(surface.height_m(centre[:, 0], centre[:, 1])[0])
+    base = ground + footprint.base_m
+    if footprint.base_m <= 0:
+        base = min(base, surface.lowest_m(np.asarray(footprint.polygon.exterior.coords)))
+    return replace(footprint, base_m=base, height_m=ground + footprint.height_m)

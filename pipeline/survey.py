@@ -9,7 +9,7 @@ A measured scan holds returns only: it cannot tell which beams met nothing, so t
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,11 +23,12 @@ from pipeline.raycast import Caster, EmptyScan, standing_on
 from pipeline.scenario import Scenario
 from pipeline.sensors import Sensor
 from pipeline.sites import Site
-from pipeline.world import World
-
+from pipeline.world import World, read_ply
 
 if TYPE_CHECKING:
     from pipeline.effects import Expand, TransmitScan
+
+_BEAMS = 4096  # beams expanded at once: bounds the memory
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,8 @@ class Survey:
     ----------
     sites
         In the order of the sites file.
+    skipped
+        Effects that are named but provably change nothing here, and why.
     """
 
     def __init__(self, scenario: Scenario, world: World) -> None:
@@ -54,17 +57,22 @@ class Survey:
         self._sensors = {s.site: sensors.resolve(s.sensor, scenario.sensors, f"site {s.site}") for s in self.sites}
         for site in self.sites:
             self._check(site)
-        self._expand, self._transmit = _effects(scenario, world, self.sites)
-        for effect in self._transmit:
-            world = effect.opaque(world)
-        self._caster = Caster(world, self._roi)
+        found = acting(scenario, world, self.sites)
+        self.skipped, self._expand = found.skipped, found.expand
+        opaque = world
+        for effect in found.transmit:
+            opaque = effect.opaque(opaque)
+        self._cuts = [effect.cutter(world, self._roi) for effect in found.transmit]
+        cast = [site for site in self.sites if site.points is None]
+        reach = max((self._sensors[site.site].range_m for site in cast), default=0.0)
+        self._caster = Caster(opaque, self._roi, np.array([site.position_m for site in cast]), reach)
         self._tables: dict[tuple[str, float, float, float], NDArray[np.float64]] = {}
         self._lock = threading.Lock()
 
     @property
     def columns(self) -> tuple[str, ...]:
         """The optional columns that these scans have."""
-        return (("from_m",) if self._transmit else ()) + (("weight",) if self._transmit or self._expand else ())
+        return ("weight",) if self._cuts or self._expand else ()
 
     def scan(self, site: Site) -> SiteScan:
         """The empty scan of one site, simulated or measured."""
@@ -79,18 +87,25 @@ class Survey:
         return SiteScan(site, scan, site.to_json() | counts)
 
     def _simulated(self, site: Site, sensor: Sensor) -> EmptyScan:
-        """Cast all beams; where effects say so, as weighted sub-beams, cut into pieces."""
-        directions, beam, weight = self._directions(site), None, None
-        for effect in self._expand:
-            directions, parent, share = effect.expand(directions, sensor)
-            beam = parent if beam is None else beam[parent]
-            weight = share if weight is None else weight[parent] * share
-        scan = self._caster.scan(site.position_m, directions, sensor.range_m)
-        if beam is not None and weight is not None:
-            scan = replace(scan, beam=beam[scan.beam].astype(np.uint32), weight=weight[scan.beam])
-        for cut in self._transmit:
-            scan = cut.pieces(scan, site, self._world)
+        """Cast all beams; where effects say so, as weighted sub-beams, and those cut into parts."""
+        directions = self._directions(site)
+        if self._expand:
+            starts = range(0, len(directions), _BEAMS)
+            scan = _joined([self._expanded(site, sensor, start, directions[start : start + _BEAMS]) for start in starts])
+        else:
+            scan = self._caster.scan(site.position_m, directions, sensor.range_m)
+        for cut in self._cuts:
+            scan = cut(scan, site)
         return scan
+
+    def _expanded(self, site: Site, sensor: Sensor, start: int, directions: NDArray[np.float64]) -> EmptyScan:
+        """Cast the sub-beams of some beams, of which the first is number ``start``."""
+        beam, weight = np.arange(start, start + len(directions)), np.ones(len(directions))
+        for effect in self._expand:
+            directions, parent, share = effect.expand(directions, sensor, site)
+            beam, weight = beam[parent], weight[parent] * share
+        scan = self._caster.scan(site.position_m, directions, sensor.range_m)
+        return replace(scan, beam=beam[scan.beam].astype(np.uint32), weight=weight[scan.beam])
 
     def _directions(self, site: Site) -> NDArray[np.float64]:
         """Beams in the world's axes; sites with one sensor and pose share them."""
@@ -114,12 +129,16 @@ class Survey:
         o = np.asarray(site.position_m) - np.asarray(self._roi.origin_m)
         rays.can_meet(o, ends / away * self._sensors[site.site].range_m, np.asarray(self._roi.size_m), reaches)
         beam = np.flatnonzero(reaches)
-        return EmptyScan(beam.astype(np.uint32), ends[beam], np.ones(len(beam), dtype=np.bool_)), len(points)
+        weight = np.ones(len(beam)) if self.columns else None
+        return EmptyScan(beam.astype(np.uint32), ends[beam], np.ones(len(beam), dtype=np.bool_), weight=weight), len(points)
 
     def _check(self, site: Site) -> None:
         place, sensor, box = f"site {site.site}", self._sensors[site.site], self._roi
-        if self._scenario.statics.ground and not site.z_m > rays.EDGE_M:
-            raise InputError(place, f"z_m = {site.z_m:g} is not above the ground (z = 0)", "a height above 0 m")
+        ground = self._ground_m(site) if self._scenario.statics.ground else -np.inf
+        if not site.z_m > ground + rays.EDGE_M:
+            raise InputError(
+                place, f"z_m = {site.z_m:g} is not above the ground (z = {ground:.4g})", f"a height above {ground:.4g} m"
+            )
         gap = np.maximum(np.subtract(box.origin_m, site.position_m), np.subtract(site.position_m, np.add(box.origin_m, box.size_m)))
         far = float(np.sqrt((np.maximum(gap, 0.0) ** 2).sum()))
         if far > sensor.range_m:
@@ -130,6 +149,19 @@ class Survey:
         if inside is not None:
             name, kind = self._world.solids[inside]
             raise InputError(place, f"({site.x_m:g}, {site.y_m:g}, {site.z_m:g}) stands inside {name} ({kind})", "a free place")
+
+    def _ground_m(self, site: Site) -> float:
+        """The ground's z below a site: 0, or on the surface that a network with relief has."""
+        world, at = self._world, np.array([site.x_m, site.y_m])
+        low, high = world.bounds_xy_m
+        over = np.flatnonzero(np.all((low - rays.EDGE_M <= at) & (at <= high + rays.EDGE_M), axis=1))
+        for a, b, c in world.triangles_m[[i for i in over if world.solids[world.solid_of_face[i]] == ("ground", "ground")]]:
+            u, v, to = (b - a)[:2], (c - a)[:2], at - a[:2]
+            area = u[0] * v[1] - u[1] * v[0]
+            s, t = (to[0] * v[1] - to[1] * v[0]) / area, (u[0] * to[1] - u[1] * to[0]) / area
+            if min(s, t, 1.0 - s - t) >= -rays.EDGE_M:
+                return float(a[2] + s * (b[2] - a[2]) + t * (c[2] - a[2]))
+        return 0.0
 
     def _solid_round(self, site: Site) -> int | None:
         """The first solid that the site stands in, by its winding number; not one whose surface it stands on."""
@@ -157,8 +189,37 @@ def _effects(scenario: Scenario, world: World, where: tuple[Site, ...]) -> tuple
     return expand, tuple(effect for effect in named if isinstance(effect, effects.TransmitScan))
 
 
-def settings(scenario: Scenario) -> dict[str, Any]:
-    """The settings that an empty scan depends on."""
+def _joined(scans: list[EmptyScan]) -> EmptyScan:
+    """Scans of consecutive beams of one site as one."""
+    fields = {name: np.concatenate([getattr(scan, name) for scan in scans]) for name in ("beam", "ends_m", "returned", "weight")}
+    return EmptyScan(**fields, doubtful=sum(scan.doubtful for scan in scans))
+
+
+@dataclass(frozen=True)
+class Acting:
+    """The effects of this stage: those that act, in the order in which they do, and why each other one cannot."""
+
+    expand: tuple[Expand, ...] = ()
+    transmit: tuple[TransmitScan, ...] = ()
+    skipped: dict[str, str] = field(default_factory=dict)
+
+
+def acting(scenario: Scenario, world: World, standing: tuple[Site, ...]) -> Acting:
+    """Which of the effects that the scenario names change what is scanned; none is imported when it names none."""
+    if not scenario.effects:
+        return Acting()
+    from pipeline import effects
+
+    live, skipped = effects.acting(scenario, "scan", world, standing)
+    return Acting(
+        tuple(effect for effect in live if isinstance(effect, effects.Expand)),
+        tuple(effect for effect in live if isinstance(effect, effects.TransmitScan)),
+        skipped,
+    )
+
+
+def settings(scenario: Scenario, out: Path) -> dict[str, Any]:
+    """The settings that an empty scan depends on; ``out`` holds ``statics.ply``, which tells what an effect can act on."""
     box = scenario.roi.box
     return {
         "name": scenario.name,
@@ -166,17 +227,21 @@ def settings(scenario: Scenario) -> dict[str, Any]:
         "ground": scenario.statics.ground,
         "sites": scenario.sites.model_dump(mode="json"),
         "sensors": {name: model.model_dump(mode="json") for name, model in scenario.sensors.items()},
-        **_effect_settings(scenario),
+        **_effect_settings(scenario, out),
     }
 
 
-def _effect_settings(scenario: Scenario) -> dict[str, Any]:
+def _effect_settings(scenario: Scenario, out: Path) -> dict[str, Any]:
+    """The effects that act. One that cannot change the result is left out, as if it were not named."""
     if not scenario.effects:
         return {}
     from pipeline import effects
 
-    named = effects.settings(effects.of(scenario, "scan"))
-    return {"effects": named} if named else {}
+    if not effects.of(scenario, "scan"):
+        return {}
+    found = acting(scenario, read_ply(out / "statics.ply")[0], sites.of(scenario))
+    live = (*found.expand, *found.transmit)
+    return {"effects": effects.settings(live)} if live else {}
 
 
 def files(scenario: Scenario, out: Path) -> dict[str, str]:

@@ -2,7 +2,8 @@
 
 Steps: get rows of floating car data (FCD) - from SUMO as a subprocess, from a SUMO that is already running, or from a
 finished file; cut them into groups of whole frames; turn front bumpers into boxes; write a group as a row group of
-``trajectories.parquet``; check what the scenario promises: N vehicles in each frame, and nobody standing for good.
+``trajectories.parquet``; check what the scenario promises: N vehicles in each frame, and nobody standing for good. Effects that the
+scenario names, and a network with relief, bring people on foot and on bicycles, rear parts, and boxes that stand on slopes.
 
 World frame (x east, y north, z up), metres, radians, seconds. The folder ``sumo`` beside the artefact opens in sumo-gui.
 
@@ -16,15 +17,21 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import pyarrow as pa
 
 from pipeline import fcd, motion, network, simulation, sumo, tables
 from pipeline.errors import InputError, RunError
-from pipeline.motion import Size, Tally
+from pipeline.motion import Boxes, Size, Tally
 from pipeline.scenario import Scenario, TrafficModel, sumo_home
 from pipeline.stage import Progress, metadata, silent
+
+if TYPE_CHECKING:
+    from pipeline.effects import Effect
+    from pipeline.effects.articulated import Articulated, Follower
+    from pipeline.effects.pedestrians_bicycles import PedestriansBicycles
+    from pipeline.effects.slope import Surface
 
 NAME = "traffic"
 ARTEFACTS = ("trajectories.parquet",)
@@ -46,6 +53,90 @@ class Recording:
     result: dict[str, Any] = field(default_factory=dict)
     patience_s: float | None = None
     on_purpose: set[str] = field(default_factory=set)
+    persons: Iterable[pa.Table] | None = None
+
+
+@dataclass
+class Acting:
+    """What goes beyond plain vehicles on flat ground; each None where it does not act."""
+
+    crowd: PedestriansBicycles | None = None
+    articulated: Articulated | None = None
+    surface: Surface | None = None
+    notes: list[str] = field(default_factory=list)
+    follower: Follower | None = None
+
+    @property
+    def named(self) -> tuple[Effect, ...]:
+        """Those whose parameters count."""
+        return tuple(effect for effect in (self.articulated, self.crowd) if effect is not None)
+
+    @property
+    def apart(self) -> frozenset[str]:
+        """SUMO's types of those who do not count as vehicles."""
+        if self.crowd is None:
+            return frozenset()
+        from pipeline.effects.pedestrians_bicycles import TYPES
+
+        return TYPES
+
+    def prepare(self, scenario: Scenario, sizes: Mapping[str, Size]) -> None:
+        """Once sizes are known; further calls do nothing."""
+        if self.articulated is not None and self.follower is None:
+            from pipeline.effects import articulated
+
+            own = {name: size for name, size in sizes.items() if name not in self.apart}
+            self.follower = articulated.Follower(self.articulated.geometries(own, articulated.place_of(scenario)))
+
+    def result(self, recorded: dict[str, Any]) -> dict[str, Any]:
+        """What the stage reports, with what the effects have to say; unchanged where they have nothing."""
+        about = dict(recorded)
+        if self.notes:
+            about["notes"] = [*recorded.get("notes", []), *self.notes]
+        return about if self.follower is None else about | {"articulated": self.follower.result()}
+
+    def change(self, found: Boxes) -> Boxes:
+        """Boxes with rear parts, and on the ground."""
+        if self.follower is not None:
+            found = self.follower.parts(found)
+        return found if self.surface is None else self.surface.seat(found)
+
+
+def acting(scenario: Scenario) -> Acting:
+    """The named effects that change the trajectories; none is imported where none is named."""
+    found = Acting()
+    if not scenario.effects:
+        return found
+    from pipeline import effects
+
+    for effect in effects.of(scenario, NAME):
+        if effect.NAME == effects.SELF_ACTING:
+            continue  # see _stand
+        reason = cast("Articulated | PedestriansBicycles", effect).changes_nothing(scenario)
+        if reason is not None:
+            found.notes.append(f"{effect.NAME}: named, but {reason}: skipped, the result is the same")
+        elif effect.NAME == "articulated":
+            found.articulated = cast("Articulated", effect)
+        else:
+            found.crowd = cast("PedestriansBicycles", effect)
+    return found
+
+
+def _stand(scenario: Scenario, found: Acting) -> None:
+    """Lay the ground where the network has relief; a flat one imports no effect for that."""
+    path = network.path_of(scenario)
+    hilly = path is not None and network.may_have_heights(path)
+    if not hilly and "slope" not in scenario.effects:
+        return
+    from pipeline.effects import slope
+
+    on, reason = slope.decide(scenario)
+    if on and path is not None:
+        found.surface = slope.ground(path)
+        found.notes.append(f"slope: on, {reason}")
+    else:
+        named = "named, but " if "slope" in scenario.effects else "off, "
+        found.notes.append(f"slope: {named}{reason}" + (": skipped, the result is the same" if named.startswith("named") else ""))
 
 
 def inputs(scenario: Scenario, out: Path) -> dict[str, Any]:
@@ -59,10 +150,24 @@ def inputs(scenario: Scenario, out: Path) -> dict[str, Any]:
         if traffic.sumocfg is not None:
             files.insert(0, scenario.find(traffic.sumocfg, "traffic.sumocfg"))
     return {
-        "settings": {"seed": scenario.seed, "name": scenario.name, "traffic": traffic.model_dump(mode="json")},
+        "settings": {
+            "seed": scenario.seed,
+            "name": scenario.name,
+            "traffic": traffic.model_dump(mode="json"),
+            **_effect_settings(scenario),
+        },
         "files": {_label(path, scenario): tables.sha256_of(path) for path in files},
         "sumo": None if traffic.fcd is not None else sumo.version(),
     }
+
+
+def _effect_settings(scenario: Scenario) -> dict[str, Any]:
+    """The effects that act. One that cannot change the result is left out, as if it were not named."""
+    if not scenario.effects or not (named := acting(scenario).named):
+        return {}
+    from pipeline import effects
+
+    return {"effects": effects.settings(named)}
 
 
 def _label(path: Path, scenario: Scenario) -> str:
@@ -97,30 +202,45 @@ def run(
     del jobs  # SUMO runs on one thread, so that its bytes do not depend on how many there are
     about = inputs(scenario, out)
     frames = scenario.traffic.frames
-    tally = Tally(frames)
-    with _recording(scenario, out, progress, traci) as recording, tables.writer(out / ARTEFACTS[0], "trajectories") as file:
+    tally, effects = Tally(frames), acting(scenario)
+    _stand(scenario, effects)
+    source = _recording(scenario, out, progress, traci, effects.crowd)
+    with source as recording, tables.writer(out / ARTEFACTS[0], "trajectories") as file:
         period_s = recording.window.period_ms / 1000.0
-        for group in fcd.groups(recording.rows, recording.window, GROUP_FRAMES, recording.place):
-            boxes = motion.boxes(group, recording.sizes, period_s, recording.place)
+        for group in _groups(recording):
+            effects.prepare(scenario, recording.sizes)
+            boxes = effects.change(motion.boxes(group, recording.sizes, period_s, recording.place, effects.apart))
             if boxes.frame.size:
                 file.write(boxes.columns())
             tally.add(boxes)
             progress("frames written", group.first_frame + group.frames, frames)
         _check(scenario.traffic, tally, recording)
         file.describe(metadata(scenario, about, frames=frames, frame_period_s=period_s, sumo=about["sumo"]))
-    return tally.result(period_s) | recording.result
+    return tally.result(period_s) | effects.result(recording.result)
+
+
+def _groups(recording: Recording) -> Iterator[fcd.Group]:
+    """Groups of whole frames, persons among the vehicles where they are recorded beside."""
+    groups = fcd.groups(recording.rows, recording.window, GROUP_FRAMES, recording.place)
+    if recording.persons is None:
+        return groups
+    persons = fcd.groups(recording.persons, recording.window, GROUP_FRAMES, recording.place)
+    return (fcd.together(some, others) for some, others in zip(groups, persons, strict=True))
 
 
 def _recording(
-    scenario: Scenario, out: Path, progress: Progress, traci: tuple[str, int] | None
+    scenario: Scenario, out: Path, progress: Progress, traci: tuple[str, int] | None, crowd: PedestriansBicycles | None
 ) -> AbstractContextManager[Recording]:
     if scenario.traffic.fcd is not None and traci is not None:
         raise InputError("--traci", "the scenario names a finished FCD file", "network or sumocfg in [traffic]")
+    if scenario.traffic.fcd is not None and crowd is not None:
+        place = f"{scenario.file}: effects.{crowd.NAME}"
+        raise InputError(place, "the scenario names a finished FCD file, so nobody can be added", "network or sumocfg in [traffic]")
     if scenario.traffic.fcd is not None:
         return _finished(scenario)
     if traci is not None:
-        return _running(scenario, *traci)
-    return _simulated(scenario, out / "sumo", progress)
+        return _running(scenario, *traci, crowd)
+    return _simulated(scenario, out / "sumo", progress, crowd)
 
 
 @contextmanager
@@ -138,15 +258,17 @@ def _finished(scenario: Scenario) -> Iterator[Recording]:
 
 
 @contextmanager
-def _simulated(scenario: Scenario, folder: Path, progress: Progress) -> Iterator[Recording]:
+def _simulated(scenario: Scenario, folder: Path, progress: Progress, crowd: PedestriansBicycles | None) -> Iterator[Recording]:
     """From SUMO as a subprocess; its FCD file is removed once it is read."""
-    prepared = simulation.prepare(scenario, folder)
+    prepared = simulation.prepare(scenario, folder, crowd)
     sizes = _kind_sizes(scenario) if prepared.drawn else simulation.type_sizes(prepared)
-    path = folder / simulation.FCD
+    if crowd is not None:
+        sizes |= crowd.sizes()
+    path, persons = folder / simulation.FCD, folder / simulation.PERSONS
     try:
         seconds = simulation.simulate(prepared, progress)
         yield Recording(
-            fcd.read(path) if path.stat().st_size > 1 else (),  # where no vehicle drove, SUMO writes no header, only a line's end
+            fcd.read(path) if _has_rows(path) else (),
             prepared.timing.window(),
             sizes,
             simulation.place(scenario),
@@ -159,19 +281,26 @@ def _simulated(scenario: Scenario, folder: Path, progress: Progress) -> Iterator
             },
             patience_s(prepared.cycle_s),
             simulation.stopped_on_purpose(prepared),
+            None if crowd is None else (fcd.read(persons, "person") if _has_rows(persons) else ()),
         )
     finally:
         path.unlink(missing_ok=True)
+        persons.unlink(missing_ok=True)
+
+
+def _has_rows(path: Path) -> bool:
+    """Where nobody moved, SUMO writes no header, only a line's end."""
+    return path.stat().st_size > 1
 
 
 @contextmanager
-def _running(scenario: Scenario, host: str, port: int) -> Iterator[Recording]:
+def _running(scenario: Scenario, host: str, port: int, crowd: PedestriansBicycles | None) -> Iterator[Recording]:
     """From a SUMO that somebody else started."""
     given = simulation.sources(scenario)
     when = simulation.timing(scenario.traffic, given.begin_s, simulation.place(scenario))
     roads = given.files["net-file"][0]
-    cycle_s = 0.0 if simulation.is_osm(roads) else network.read(roads).cycle_s
-    seen = simulation.Seen()
+    cycle_s = 0.0 if network.is_osm(roads) else network.read(roads).cycle_s
+    seen = simulation.Seen(persons=crowd is not None)
     with sumo.connected(host, port) as connection:
         recording = Recording(
             simulation.poll(connection, when, seen, f"{host}:{port}"),

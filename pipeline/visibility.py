@@ -42,13 +42,12 @@ class Beams:
         What the scan's metadata says of the site.
     ends_m
         Where each piece ends, seen from the sensor along the world's axes, (n, 3) float64.
-    from_m, weight
-        How far along the beam the piece starts, and its weight, (n,) float64; None where beams are whole.
+    weight
+        The share of its beam that each row is, (n,) float64; None where every row is a whole beam.
     """
 
     site: dict[str, Any]
     ends_m: NDArray[np.float64]
-    from_m: NDArray[np.float64] | None = None
     weight: NDArray[np.float64] | None = None
 
 
@@ -59,12 +58,15 @@ class Visibility:
     ----------
     unit
         What a whole beam adds to a voxel: 1 (counters are uint32), or ``UNIT`` where effects weight beams (int64).
+    skipped
+        Named effects of the score stage that cannot change a score, and why.
     """
 
     def __init__(self, scenario: Scenario, out: Path, grid: Grid) -> None:
         self._scenario, self._out, self._grid = scenario, out, grid
-        self._effects = _score_effects(scenario, out)
-        self.unit = UNIT if _weighted(scenario) else 1
+        live, self.skipped = acting(scenario, out)
+        self._effects = tuple(_prepared(effect, scenario, out) for effect in live)
+        self.unit = UNIT if live or _weighted_scans(scenario, out) else 1
         self._local = threading.local()
 
     def beams(self, only: Collection[str] | None = None) -> Iterator[Beams]:
@@ -98,7 +100,7 @@ class Visibility:
         from pipeline.effects import Detect, TransmitScore
 
         sensor = sensors.resolve(beams.site["sensor"], self._scenario.sensors, f"site {beams.site['site']}")
-        for found in crossings.listed(beams.site, beams.ends_m, beams.from_m, self._grid):
+        for found in crossings.listed(beams.site, beams.ends_m, self._grid):
             share = np.ones(len(found.cells)) if beams.weight is None else beams.weight[found.rows][found.piece]
             for effect in self._effects:
                 if isinstance(effect, Detect):
@@ -127,39 +129,47 @@ def in_voxels(beams: Beams, grid: Grid) -> tuple[NDArray[np.float64], NDArray[np
     return o, d, np.asarray(grid.shape, dtype=np.int64)
 
 
-def _weighted(scenario: Scenario) -> bool:
-    """Whether effects make hits a sum of weights."""
+def _prepared(effect: Effect, scenario: Scenario, out: Path) -> Effect:
+    from pipeline.effects import TransmitScore
+
+    return effect.prepare(scenario, out) if isinstance(effect, TransmitScore) else effect
+
+
+def acting(scenario: Scenario, out: Path) -> tuple[tuple[Effect, ...], dict[str, str]]:
+    """The effects of the score stage that can change a score, and why each other one that is named cannot.
+
+    Nothing is imported when the scenario names none. ``out`` holds ``statics.ply``, which tells what an effect can act on.
+    """
+    if not scenario.effects:
+        return (), {}
+    from pipeline import effects, sites
+
+    return effects.acting(scenario, "score", read_ply(out / "statics.ply")[0], sites.of(scenario))
+
+
+def _weighted_scans(scenario: Scenario, out: Path) -> bool:
+    """Whether rows of the scans are shares of beams."""
     if not scenario.effects:
         return False
-    from pipeline import effects
+    if scenario.scan.keep:
+        with tables.reader(out / "scans.parquet", "scans") as (file, _):
+            return "weight" in file.schema_arrow.names
+    from pipeline import survey
 
-    return any(effects.KINDS[name][0] in ("scan", "score") for name in scenario.effects)
-
-
-def _score_effects(scenario: Scenario, out: Path) -> tuple[Effect, ...]:
-    """The effects that act here, prepared; nothing is imported when the scenario names none."""
-    if not scenario.effects:
-        return ()
-    from pipeline import effects
-
-    found = effects.of(scenario, "score")
-    for effect in found:
-        if isinstance(effect, effects.TransmitScore):
-            effect.prepare(scenario, out)
-    return found
+    return "effects" in survey.settings(scenario, out)
 
 
 def _kept(path: Path, only: Collection[str] | None) -> Iterator[Beams]:
     with tables.reader(path, "scans") as (file, about):
         if file.num_row_groups != len(about["sites"]):
             raise InputError(path, f"{file.num_row_groups} row groups for {len(about['sites'])} sites", "one a site")
-        wanted = [c for c in ("dx_m", "dy_m", "dz_m", "from_m", "weight") if c in file.schema_arrow.names]
+        wanted = [c for c in ("dx_m", "dy_m", "dz_m", "weight") if c in file.schema_arrow.names]
         for group, site in enumerate(about["sites"]):
             if only is None or site["site"] in only:
                 table = tables.read_group(file, group, path, wanted)
                 columns = {name: table.column(name).to_numpy() for name in wanted}
                 ends = np.column_stack([columns[name] for name in ("dx_m", "dy_m", "dz_m")])
-                yield Beams(site, ends, columns.get("from_m"), columns.get("weight"))
+                yield Beams(site, ends, columns.get("weight"))
 
 
 def _cast(scenario: Scenario, out: Path, only: Collection[str] | None) -> Iterator[Beams]:
@@ -170,4 +180,4 @@ def _cast(scenario: Scenario, out: Path, only: Collection[str] | None) -> Iterat
     for site in surveyed.sites:
         if only is None or site.site in only:
             done = surveyed.scan(site)
-            yield Beams(done.about, done.scan.ends_m, done.scan.from_m, done.scan.weight)
+            yield Beams(done.about, done.scan.ends_m, done.scan.weight)

@@ -91,7 +91,6 @@ def mini(tmp_path: Path) -> Path:
     return folder
 
 
-
 @pytest.fixture
 def egvs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     """Call the command line in this process: ``code, out, err = egvs("run", folder)``."""

@@ -77,14 +77,20 @@ BAD: dict[str, tuple[Change, str]] = {
     "NaN voxel": (edit("voxel_m = 0.5", "voxel_m = nan"), r"roi.voxel_m: nan"),
     "infinite ROI": (edit("size_m = [40, 20, 5]", "size_m = [inf, 20, 5]"), r"roi.size_m.0: inf"),
     "two numbers for a size": (edit("size_m = [40, 20, 5]", "size_m = [40, 20]"), r"roi.size_m"),
-    "ROI no multiple": (edit("[40, 20, 5]", "[40.3, 20, 5]"), r"roi.size_m: 40.3 m along x .* nearest sizes that fit are 40 or 40.5 m"),
+    "ROI no multiple": (
+        edit("[40, 20, 5]", "[40.3, 20, 5]"),
+        r"roi.size_m: 40.3 m along x .* nearest sizes that fit are 40 or 40.5 m",
+    ),
     "too many voxels": (edit("voxel_m = 0.5", "voxel_m = 0.001"), r"roi.voxel_m: 0.001 m gives .* voxels"),
     "blocks do not divide": (edit("blocks = 4", "blocks = 7"), r"tpog.blocks = 7 does not divide traffic.frames = 40"),
     "gamma below 0": (edit("gamma = 4", "gamma = -1"), r"score.gamma: -1"),
     "gamma NaN": (edit("gamma = 4", "gamma = nan"), r"score.gamma: nan"),
     "two traffic sources": (traffic('fcd = "fcd.csv"\nnetwork = "n.xml"'), r"exactly one of network, sumocfg and fcd"),
     "key that acts on nothing": (edit("frames = 40", "frames = 40\nvehicles = 3"), r"vehicles would act on nothing beside fcd"),
-    "two kinds of one name": (add('\n[[traffic.kinds]]\nname = "car"\nlength_m = 4\nwidth_m = 2\nheight_m = 1\n'), r"same name: car"),
+    "two kinds of one name": (
+        add('\n[[traffic.kinds]]\nname = "car"\nlength_m = 4\nwidth_m = 2\nheight_m = 1\n'),
+        r"same name: car",
+    ),
     "size of a kind 0": (edit("length_m = 4.5", "length_m = 0"), r"traffic.kinds.0.length_m: 0"),
     # traffic
     "FCD missing": (remove("fcd.csv"), r"traffic.fcd = 'fcd.csv': no such file"),
@@ -92,7 +98,10 @@ BAD: dict[str, tuple[Change, str]] = {
     "FCD without angle": (put("fcd.csv", fcd().replace("vehicle_angle", "vehicle_odd")), r"fcd.csv: .*angle"),
     "FCD with an unknown type": (put("fcd.csv", fcd().replace(";car;", ";bus;")), r"bus"),
     "FCD with NaN": (put("fcd.csv", fcd().replace("-2.0;90.0", "nan;90.0", 1)), r"fcd.csv.*nan"),
-    "FCD truncated gzip": (put("fcd.csv", gzip.compress(fcd().encode(), mtime=0)[:-40]), r"fcd.csv: .*(damaged gzip|Truncated compressed)"),
+    "FCD truncated gzip": (
+        put("fcd.csv", gzip.compress(fcd().encode(), mtime=0)[:-40]),
+        r"fcd.csv: .*(damaged gzip|Truncated compressed)",
+    ),
     "FCD malformed XML": (put("fcd.csv", "<fcd-export><timestep time='0'>"), r"fcd.csv: is not well-formed XML"),
     "FCD with entities": (
         put("fcd.csv", "<!DOCTYPE a [<!ENTITY b 'c'>]><fcd-export>&b;</fcd-export>"),
@@ -117,7 +126,10 @@ BAD: dict[str, tuple[Change, str]] = {
     "statics without height": (statics(feature({"type": "Point", "coordinates": [1, 1]}, radius_m=1)), r"height_m is missing"),
     "statics upside down": (statics(polygon(BUILDING[0], base_m=7)), r"height_m = 5 with base_m = 7"),
     "statics NaN height": (statics(polygon(BUILDING[0], height_m=math.nan)), r"height_m: nan"),
-    "statics point without radius": (statics(feature({"type": "Point", "coordinates": [1, 1]}, height_m=3)), r"radius_m is missing"),
+    "statics point without radius": (
+        statics(feature({"type": "Point", "coordinates": [1, 1]}, height_m=3)),
+        r"radius_m is missing",
+    ),
     "statics self-crossing polygon": (
         statics(polygon([[0, 0], [4, 4], [4, 0], [0, 4], [0, 0]], name="bow")),
         r"feature 0 \(bow\): geometry: is not a sound polygon \(Self-intersection",
@@ -132,7 +144,10 @@ BAD: dict[str, tuple[Change, str]] = {
         put("statics.geojson", collection(polygon(BUILDING[0])).replace("14", "1e999", 1)),
         r"coordinate that is no number",
     ),
-    "mesh that is none": (put("m.stl", "solid nothing", add('\n[[statics.meshes]]\nfile = "m.stl"\n')), r"m.stl: (cannot be|holds no)"),
+    "mesh that is none": (
+        put("m.stl", "solid nothing", add('\n[[statics.meshes]]\nfile = "m.stl"\n')),
+        r"m.stl: (cannot be|holds no)",
+    ),
     # sites and sensors
     "sites missing": (remove("sites.csv"), r"sites.file = 'sites.csv': no such file"),
     "sites empty": (put("sites.csv", "site,x_m,y_m,z_m\n"), r"sites.csv: holds no site"),
@@ -147,9 +162,15 @@ BAD: dict[str, tuple[Change, str]] = {
     "site too far": (sites("a,1,500,3"), r"site a: stands 490.0 m from the region of interest"),
     "unknown sensor": (edit('sensor = "small"', 'sensor = "VLP32C"'), r"unknown sensor 'VLP32C'; did you mean VLP-32C\?"),
     "pitch beyond 90": (sites("a,1,12,3,100", head="site,x_m,y_m,z_m,pitch_deg"), r"row a: pitch_deg: 100"),
-    "azimuth step does not divide": (edit("azimuth_step_deg = 1.0", "azimuth_step_deg = 0.7"), r"azimuth_step_deg = 0.7 does not divide 360"),
+    "azimuth step does not divide": (
+        edit("azimuth_step_deg = 1.0", "azimuth_step_deg = 0.7"),
+        r"azimuth_step_deg = 0.7 does not divide 360",
+    ),
     "elevations and channels disagree": (edit("[-15, 5]", "[-15, 0, 5]"), r"channels = 8 needs elevations_deg"),
-    "unknown site to keep": (add('keep_visibility = ["pole_z"]\n'), r"score.keep_visibility: no site 'pole_z'; one of pole_a, pole_b"),
+    "unknown site to keep": (
+        add('keep_visibility = ["pole_z"]\n'),
+        r"score.keep_visibility: no site 'pole_z'; one of pole_a, pole_b",
+    ),
     # measured scans
     "points missing": (put("sites.csv", "site,x_m,y_m,z_m\na,10,12,3\n", POINTS), r"points = 'cloud.csv': no such file"),
     "points for two sites": (put("cloud.csv", "x_m,y_m,z_m\n1,1,0\n", POINTS), r"one measured scan for 2 sites"),

@@ -23,8 +23,7 @@ quick = settings(deadline=None, max_examples=60, suppress_health_check=[HealthCh
 POINTS = np.array([[1 / 3, -2.5, 1e6 / 7], [4.0, 5.0, 6.0]])
 ASCII_PCD = "FIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nWIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA ascii\n1 2 3\n4 5 6\n"
 ASCII_PLY = (
-    "ply\nformat ascii 1.0\nelement vertex 2\nproperty double x\nproperty double y\nproperty double z\n"
-    "end_header\n1 2 3\n4 5 6\n"
+    "ply\nformat ascii 1.0\nelement vertex 2\nproperty double x\nproperty double y\nproperty double z\nend_header\n1 2 3\n4 5 6\n"
 )
 
 

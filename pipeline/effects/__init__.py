@@ -1,14 +1,14 @@
 r"""Which effects exist, and what may one do?
 
 The plain scene has straight beams, opaque static geometry and no weather. Everything beyond it is an *effect*: a table
-``[effects.<name>]`` in the scenario, and one module of that name in this folder, imported only when it is named. An effect acts in one
-stage, in one of four ways:
+``[effects.<name>]`` in the scenario, and one module of that name in this folder, imported only when it is named. An effect acts
+in one stage, in one of four ways:
 
 ========== ======== ===========================================================================================
 kind       stage    what it does
 ========== ======== ===========================================================================================
 expand     scan     turns a beam into weighted sub-beams; the weights of a beam add up to 1
-transmit   scan     cuts a cast beam into pieces, each with the share of the beam that gets there
+transmit   scan     cuts a cast beam into parts, each a share of the beam that ends elsewhere
 transmit   score    gives the share of a beam that gets as far as each voxel that it crosses
 detect     score    gives the chance that a target at a range sends a return that is noticed
 traffic    traffic  changes who moves, and how boxes are made of it
@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import difflib
 import importlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from pipeline.crossings import Crossings
+    from pipeline.grid import Roi
     from pipeline.raycast import EmptyScan
     from pipeline.scenario import Scenario
     from pipeline.sensors import Sensor
@@ -87,6 +88,11 @@ class Effect:
     SOURCE: ClassVar[str]
     Model: ClassVar[type[Parameters]]
 
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """Artefacts that the effect reads beyond those that its stage reads anyway."""
+        return ()
+
     def idle(self, scene: Scene) -> str | None:
         """Why the effect provably cannot change the result in this scene; None when it can."""
         del scene
@@ -114,10 +120,11 @@ class Expand(Effect):
     """One beam into weighted sub-beams."""
 
     def expand(
-        self, directions: NDArray[np.float64], sensor: Sensor
+        self, directions: NDArray[np.float64], sensor: Sensor, site: Site
     ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
-        """Sub-beams (m, 3) along the world's axes, the row of ``directions`` (n, 3) that each comes from (m,), ascending, and
-        its weight (m,); the weights of one beam add up to 1."""
+        """Sub-beams (m, 3), unit vectors along the world's axes, of some beams ``directions`` (n, 3) of ``sensor`` as it is
+        mounted at ``site``; the row of ``directions`` that each comes from (m,), ascending, and its weight (m,); the weights
+        of one beam add up to 1."""
         raise NotImplementedError
 
 
@@ -128,20 +135,23 @@ class TransmitScan(Effect):
         """The world without what this effect lets beams through."""
         raise NotImplementedError
 
-    def pieces(self, scan: EmptyScan, site: Site, world: World) -> EmptyScan:
-        """Cut beams that were cast at :meth:`opaque` into pieces, with ``from_m`` and ``weight``."""
+    def cutter(self, world: World, roi: Roi) -> Callable[[EmptyScan, Site], EmptyScan]:
+        """What cuts the scan of a site that was cast at :meth:`opaque` into weighted parts; prepared once, threads may share it.
+
+        Each part is a beam from the sensor that ends where that share of the beam ends, so that the weights of a beam still add
+        up to what they were, and a voxel's hits are the share that gets as far."""
         raise NotImplementedError
 
 
 class TransmitScore(Effect):
     """What gets as far as a voxel."""
 
-    def prepare(self, scenario: Scenario, out: Path) -> None:
-        """Read what :meth:`share` needs, once, before any site is scored."""
+    def prepare(self, scenario: Scenario, out: Path) -> TransmitScore:
+        """Read what :meth:`share` needs, once, before any site is scored; returns the effect that holds it."""
         raise NotImplementedError
 
     def share(self, crossings: Crossings) -> NDArray[np.float64]:
-        """Share (k,), 0 to 1, of its beam that gets as far as each crossing of ``crossings``."""
+        """Share (k,), 0 to 1, of its beam that gets as far as each crossing of ``crossings``; called from several threads."""
         raise NotImplementedError
 
 
@@ -183,6 +193,14 @@ def of(scenario: Scenario, stage: str) -> tuple[Effect, ...]:
     place = f"{scenario.file}: effects"
     named = [name for name, (where, _) in KINDS.items() if where == stage and name in scenario.effects]
     return tuple(make(name, dict(scenario.effects[name]), place) for name in named)
+
+
+def acting(scenario: Scenario, stage: str, world: World, standing: tuple[Site, ...]) -> tuple[tuple[Effect, ...], dict[str, str]]:
+    """The named effects of a stage that can change its result, in order; and why each other one cannot."""
+    found, scene = of(scenario, stage), Scene(scenario, world, standing)
+    reasons = {effect.NAME: effect.idle(scene) for effect in found}
+    live = tuple(effect for effect in found if reasons[effect.NAME] is None)
+    return live, {name: reason for name, reason in reasons.items() if reason is not None}
 
 
 def settings(effects: Iterable[Effect]) -> dict[str, Any]:

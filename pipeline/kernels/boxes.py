@@ -10,6 +10,10 @@ and the last bit of a sine decides nothing.
 - A pitched box is tested voxel by voxel with separating axes (Gottschalk, Lin, Manocha 1996, "OBBTree"): three axes of
   the grid, three of the box, nine cross products. A column of voxels meets a convex box in one interval of layers.
 
+How deep a box overlaps a voxel is the largest length by which its six faces can be moved inwards with volume still shared. Both
+ways decide as for a box whose corners are moved by rounding alone: right wherever the depth differs from ``SHRINK_M`` by more than
+2^-48 of the largest coordinate or size, which is 4e-13 m for 100 m and under 1e-9 m up to 100 km.
+
 Two boxes in a voxel in a frame count once. Counting works on intervals of layers: a column notes the last frame in which it
 was occupied and the layers that were; the counts are differences along z, summed up by :func:`sum_layers` at the end.
 """
@@ -23,6 +27,9 @@ import numpy as np
 
 SHRINK_M = 1e-4
 """An overlap up to this depth is no contact."""
+
+TINY = 1e-100
+"""A cross product shorter than this is 0 but for products that vanish; any longer one, however rough, is a sound axis."""
 
 _kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -59,8 +66,8 @@ def _cells(low, high, voxel_m, count):  # type: ignore[no-untyped-def]
 def _axis_parts(nx, ny, nz, c, axes, half, low, voxel_m):  # type: ignore[no-untyped-def]
     """True when the axis n parts the box from the voxel whose low corner is ``low``. Soundness needs no exact axis."""
     size = abs(nx) + abs(ny) + abs(nz)
-    if size < 1e-12:
-        return False
+    if size < TINY:
+        return False  # parallel edges: no axis
     h = 0.5 * voxel_m
     gap = abs((low[0] + h - c[0]) * nx + (low[1] + h - c[1]) * ny + (low[2] + h - c[2]) * nz)
     reach = h * size
@@ -108,7 +115,7 @@ def axes_of(yaw_rad, pitch_rad, axes):  # type: ignore[no-untyped-def]
 @_kernel
 def _is_fresh(row, j_low, j_high, frame):  # type: ignore[no-untyped-def]
     """True when no cell of the row was occupied in this frame before."""
-    for iy in range(j_low, j_high):
+    for iy in range(j_low, j_high):  # noqa: SIM110 - Numba has no generators
         if row[iy] == frame:
             return False
     return True

@@ -8,45 +8,36 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from pipeline.kernels.march import CHORD_M, walk
+from pipeline.kernels.march import _scratch, _walk
 
 _kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @_kernel
-def crossings(o, d, begin_m, shape, voxel_m, first, cells, enter_m, leave_m):  # type: ignore[no-untyped-def]
+def crossings(o, d, shape, voxel_m, first, cells, enter_m, leave_m):  # type: ignore[no-untyped-def]
     """List crossings, or count them when ``cells`` is empty.
 
     Parameters
     ----------
     o, d, shape, voxel_m
         Sensor (3,), beam ends seen from it (n, 3), both in voxel units; the grid, as in :func:`pipeline.kernels.march.count_hits`.
-    begin_m
-        Range at which each piece starts, (n,) float64; a voxel counts by the chord beyond it.
     first
         (n + 1,) int64. Counting: ``first[i + 1]`` is set to the crossings of piece i. Listing: where each piece's begin.
     cells, enter_m, leave_m
         Filled: flat index, range of entry and of exit of each crossing.
     """
     longest = shape[0] + shape[1] + shape[2] + 3
-    scratch, t_cells = np.empty(longest, np.int64), np.empty((longest, 2), np.float64)
+    scratch, t_cells, times = np.empty(longest, np.int64), np.empty((longest, 2), np.float64), _scratch(shape)
     unused = np.empty(0, np.uint32)
     for n in range(d.shape[0]):
-        count, _, _ = walk(o, d[n], shape, voxel_m, unused, scratch, t_cells)
-        size = np.sqrt(d[n, 0] ** 2 + d[n, 1] ** 2 + d[n, 2] ** 2) * voxel_m
-        kept = 0
-        for i in range(count):
-            enter, leave = t_cells[i, 0] * size, t_cells[i, 1] * size
-            if begin_m[n] > enter:
-                enter = begin_m[n]
-                if leave - enter <= CHORD_M:
-                    continue
-            if cells.shape[0] > 0:
-                at = first[n] + kept
-                cells[at], enter_m[at], leave_m[at] = scratch[i], enter, leave
-            kept += 1
+        count, _, _ = _walk(o, d[n], shape, voxel_m, unused, scratch, t_cells, times)
         if cells.shape[0] == 0:
-            first[n + 1] = kept
+            first[n + 1] = count
+            continue
+        size = np.sqrt(d[n, 0] ** 2 + d[n, 1] ** 2 + d[n, 2] ** 2) * voxel_m
+        for i in range(count):
+            at = first[n] + i
+            cells[at], enter_m[at], leave_m[at] = scratch[i], t_cells[i, 0] * size, t_cells[i, 1] * size
 
 
 @_kernel

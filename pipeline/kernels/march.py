@@ -39,11 +39,11 @@ _inlined = numba.njit(cache=True, nogil=True, error_model="numpy", inline="alway
 
 
 @_inlined
-def _clip(o, d, n, t_first, t_last):  # type: ignore[no-untyped-def]
-    """Cut [t_first, t_last] to the slab 0 <= o + t * d < n of one axis; empty when nothing is left."""
+def _clip(o, d, low, high, t_first, t_last):  # type: ignore[no-untyped-def]
+    """Cut [t_first, t_last] to the slab low <= o + t * d < high of one axis; empty when nothing is left."""
     if d == 0.0:
-        return (t_first, t_last) if 0.0 <= o < n else (1.0, 0.0)
-    a, b = (0.0 - o) / d, (n - o) / d
+        return (t_first, t_last) if low <= o < high else (1.0, 0.0)
+    a, b = (low - o) / d, (high - o) / d
     return max(t_first, min(a, b)), min(t_last, max(a, b))
 
 
@@ -125,9 +125,9 @@ def _walk(o, d, shape, voxel_m, hits, cells, t_cells, times):  # type: ignore[no
     ox, oy, oz = o[0], o[1], o[2]
     dx, dy, dz = d[0], d[1], d[2]
     nx, ny, nz = float(shape[0]), float(shape[1]), float(shape[2])
-    t, t_last = _clip(ox, dx, nx, 0.0, 1.0)
-    t, t_last = _clip(oy, dy, ny, t, t_last)
-    t, t_last = _clip(oz, dz, nz, t, t_last)
+    t, t_last = _clip(ox, dx, 0.0, nx, 0.0, 1.0)
+    t, t_last = _clip(oy, dy, 0.0, ny, t, t_last)
+    t, t_last = _clip(oz, dz, 0.0, nz, t, t_last)
     if not t < t_last:
         return 0, 0.0, 0.0
     times_x, times_y, times_z, counting = times[0], times[1], times[2], times[3]
@@ -260,9 +260,10 @@ def audit(o, d, shape, voxel_m, last_beam):  # type: ignore[no-untyped-def]
     Returns
     -------
     worst_sum, longest_gap_m, misplaced, doubled
-        Largest difference between the clipped segment and its chords and gaps, as a share of the segment; longest piece
-        that belongs to no voxel (chords up to 1 micrometre, at most three in a row); chords whose middle lies outside
-        their voxel by more than 1e-9 of the grid; voxels visited twice by a beam.
+        Largest difference between the clipped segment and the sum of the chords of its voxels, computed from each voxel by
+        itself, and of the gaps between them, as a share of the segment; longest piece that belongs to no voxel (chords up
+        to 1 micrometre, at most three in a row); chords whose middle lies outside their voxel by more than 1e-9 of the grid;
+        voxels visited twice by a beam.
     """
     longest = shape[0] + shape[1] + shape[2] + 3
     cells, t_cells, times = np.empty(longest, np.int64), np.empty((longest, 2), np.float64), _scratch(shape)
@@ -281,13 +282,15 @@ def audit(o, d, shape, voxel_m, last_beam):  # type: ignore[no-untyped-def]
             if i == count:
                 break
             end = t_cells[i, 1]
-            total += end - start
             middle, cell = 0.5 * (start + end), cells[i]
-            x, y, z = o[0] + middle * d[beam, 0], o[1] + middle * d[beam, 1], o[2] + middle * d[beam, 2]
-            cx, cy, cz = cell // (shape[1] * shape[2]), cell // shape[2] % shape[1], cell % shape[2]
-            away = max(abs(x - cx - 0.5), abs(y - cy - 0.5), abs(z - cz - 0.5))
+            low, high, away = t_first, t_last, 0.0
+            for a in range(3):
+                k = float(cell // (shape[1] * shape[2]) if a == 0 else cell // shape[2] % shape[1] if a == 1 else cell % shape[2])
+                low, high = _clip(o[a], d[beam, a], k, k + 1.0, low, high)
+                away = max(away, abs(o[a] + middle * d[beam, a] - k - 0.5))
+            total += max(high - low, 0.0)
             misplaced += away > 0.5 + slack
             doubled += last_beam[cell] == beam + 1
             last_beam[cell] = beam + 1
-        worst_sum = max(worst_sum, abs(total - (t_last - t_first)) / (t_last - t_first))
+        worst_sum = max(worst_sum, abs(total - (t_last - t_first)))
     return worst_sum, longest_gap, misplaced, doubled

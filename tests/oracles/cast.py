@@ -1,9 +1,9 @@
 """What does a ray meet first, and which voxels does a segment cross - slowly, obviously, in float64?
 
 Shares no code with the pipeline. Rays: each is held against every triangle (Moeller and Trumbore 1997, "Fast, Minimum
-Storage Ray/Triangle Intersection"), then against the rules that the pipeline documents: a plane that is seen at a sine below 1e-9
-is not met, and a point up to 1 micrometre outside a triangle is on it. Segments: all crossings with the planes of the grid are
-collected and sorted; the middle of each piece tells the voxel.
+Storage Ray/Triangle Intersection"), then against the rules that the pipeline documents: a plane seen at a sine below 1e-9 or
+within 1 micrometre of the start is not met, and a point up to 1 micrometre outside a triangle is on it. Segments: all crossings
+with the planes of the grid are collected and sorted; the middle of each piece tells the voxel.
 """
 
 import numba
@@ -15,17 +15,13 @@ CHORD_M = 1e-6
 
 
 @numba.njit(cache=True, nogil=True)
-def _off(p, a, b):
-    """Distance of a point from the segment a-b."""
+def _distance(p, a, b):
+    """Of a point from the segment a-b."""
     along, length = 0.0, 0.0
     for k in range(3):
         along += (p[k] - a[k]) * (b[k] - a[k])
         length += (b[k] - a[k]) ** 2
-    s = along / length
-    if s < 0.0:
-        s = 0.0
-    if s > 1.0:
-        s = 1.0
+    s = min(max(along / length, 0.0), 1.0)
     away = 0.0
     for k in range(3):
         away += (p[k] - a[k] - s * (b[k] - a[k])) ** 2
@@ -33,19 +29,21 @@ def _off(p, a, b):
 
 
 @numba.njit(cache=True, nogil=True)
-def _brute(o, d, corners, heights, edge_m, graze, ranges, which):
+def _brute(o, d, corners, heights, area2, edge_m, graze, ranges, which):
     p = np.empty(3)
     for r in range(d.shape[0]):
         best, best_of = np.inf, -1
-        dx, dy, dz = d[r, 0], d[r, 1], d[r, 2]
+        ox, oy, oz = o[r]
+        dx, dy, dz = d[r]
         for m in range(corners.shape[0]):
-            e1x, e1y, e1z = corners[m, 1, 0] - corners[m, 0, 0], corners[m, 1, 1] - corners[m, 0, 1], corners[m, 1, 2] - corners[m, 0, 2]
-            e2x, e2y, e2z = corners[m, 2, 0] - corners[m, 0, 0], corners[m, 2, 1] - corners[m, 0, 1], corners[m, 2, 2] - corners[m, 0, 2]
+            ax, ay, az = corners[m, 0]
+            e1x, e1y, e1z = corners[m, 1, 0] - ax, corners[m, 1, 1] - ay, corners[m, 1, 2] - az
+            e2x, e2y, e2z = corners[m, 2, 0] - ax, corners[m, 2, 1] - ay, corners[m, 2, 2] - az
             px, py, pz = dy * e2z - dz * e2y, dz * e2x - dx * e2z, dx * e2y - dy * e2x
             det = e1x * px + e1y * py + e1z * pz
             if det == 0.0:
                 continue
-            sx, sy, sz = o[r, 0] - corners[m, 0, 0], o[r, 1] - corners[m, 0, 1], o[r, 2] - corners[m, 0, 2]
+            sx, sy, sz = ox - ax, oy - ay, oz - az
             u = (sx * px + sy * py + sz * pz) / det
             if u * heights[m, 1] < -2.0 * edge_m:
                 continue
@@ -54,30 +52,86 @@ def _brute(o, d, corners, heights, edge_m, graze, ranges, which):
             if v * heights[m, 2] < -2.0 * edge_m or (1.0 - u - v) * heights[m, 0] < -2.0 * edge_m:
                 continue
             t = (e2x * qx + e2y * qy + e2z * qz) / det
-            if not 0.0 < t < best or abs(det) < graze * heights[m, 3]:
+            sine = abs(det) / area2[m]
+            if not 0.0 < t < best or sine < graze or t * sine <= edge_m:
                 continue
             if u < 0.0 or v < 0.0 or u + v > 1.0:
-                p[0], p[1], p[2] = o[r, 0] + t * dx, o[r, 1] + t * dy, o[r, 2] + t * dz
+                p[0], p[1], p[2] = ox + t * dx, oy + t * dy, oz + t * dz
                 a, b, c = corners[m, 0], corners[m, 1], corners[m, 2]
-                if min(_off(p, a, b), _off(p, b, c), _off(p, c, a)) > edge_m:
+                if min(_distance(p, a, b), _distance(p, b, c), _distance(p, c, a)) > edge_m:
                     continue
             best, best_of = t, m
         ranges[r], which[r] = best, best_of
 
 
 def first_hits(o, d, corners, edge_m=EDGE_M, graze=GRAZE):
-    """Range of each ray's first hit (infinity for none) and the triangle (-1).
+    """Range of each ray's first hit (infinity for none), and its triangle (-1).
 
-    ``o`` (3,) or (n, 3); unit ``d`` (n, 3); ``corners`` (m, 3, 3). Triangles without area are not met.
+    ``o`` (3,) or (n, 3), unit ``d`` (n, 3), ``corners`` (m, 3, 3). Triangles without area are not met.
     """
     d = np.ascontiguousarray(d, dtype=np.float64)
     o = np.ascontiguousarray(np.broadcast_to(np.asarray(o, dtype=np.float64), d.shape))
-    corners = np.ascontiguousarray(corners, dtype=np.float64)
-    double_area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    kept = np.flatnonzero(double_area > 0)
-    corners, double_area = corners[kept], double_area[kept]
+    corners = np.asarray(corners, dtype=np.float64)
+    area2 = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    kept = np.flatnonzero(area2 > 0)
+    corners, area2 = np.ascontiguousarray(corners[kept]), area2[kept]
     opposite = np.linalg.norm(np.roll(corners, -1, axis=1) - np.roll(corners, -2, axis=1), axis=2)
-    heights = np.column_stack([double_area[:, None] / opposite, double_area])
     ranges, which = np.empty(len(d)), np.empty(len(d), dtype=np.int64)
-    _brute(o, d, corners, heights, edge_m, graze, ranges, which)
-    return ranges, np.where(which >= 0, kept[which] if len(kept) else -1, -1)
+    _brute(o, d, corners, area2[:, None] / opposite, area2, edge_m, graze, ranges, which)
+    return ranges, np.where(which >= 0, np.append(kept, -1)[which], -1)
+
+
+def differ(found, true, tolerance_m=1e-9):
+    """Which outcomes differ: met against not met, or ranges further apart than the tolerance (relative to 1 m + range)."""
+    with np.errstate(invalid="ignore"):
+        close = np.abs(found - true) <= tolerance_m * (1.0 + np.abs(true))
+    return ~((found == true) | close)
+
+
+def crossed(start, way, origin, voxel, shape):
+    """The voxels, (k, 3), that share a chord longer than CHORD_M with the segment from ``start`` to ``start + way``."""
+    start, way = np.asarray(start, dtype=np.float64) - origin, np.asarray(way, dtype=np.float64)
+    length = np.linalg.norm(way)
+    cuts = [np.array([0.0, 1.0])]
+    for axis in range(3):
+        if way[axis] != 0.0:
+            at = (np.arange(shape[axis] + 1) * voxel - start[axis]) / way[axis]
+            cuts.append(at[(at > 0.0) & (at < 1.0)])
+    cuts = np.sort(np.concatenate(cuts))
+    middle = start + way * (0.5 * (cuts[1:] + cuts[:-1]))[:, None]
+    index = np.floor(middle / voxel).astype(np.int64)
+    return index[(np.diff(cuts) * length > CHORD_M) & ((index >= 0) & (index < shape)).all(axis=1)]
+
+
+@numba.njit(cache=True, nogil=True)
+def _count(start, ways, voxel, shape, hits):
+    cuts = np.empty(2 + shape.sum() + 3)
+    for beam in range(ways.shape[0]):
+        way = ways[beam]
+        n = 0
+        for axis in range(3):
+            if way[axis] != 0.0:
+                for plane in range(shape[axis] + 1):
+                    at = (plane * voxel - start[axis]) / way[axis]
+                    if 0.0 < at < 1.0:
+                        cuts[n] = at
+                        n += 1
+        cuts[n], cuts[n + 1] = 0.0, 1.0
+        found = np.sort(cuts[: n + 2])
+        length = np.sqrt(way[0] ** 2 + way[1] ** 2 + way[2] ** 2)
+        for piece in range(n + 1):
+            if (found[piece + 1] - found[piece]) * length > CHORD_M:
+                middle = 0.5 * (found[piece] + found[piece + 1])
+                i = np.floor((start[0] + way[0] * middle) / voxel)
+                j = np.floor((start[1] + way[1] * middle) / voxel)
+                k = np.floor((start[2] + way[2] * middle) / voxel)
+                if 0 <= i < shape[0] and 0 <= j < shape[1] and 0 <= k < shape[2]:
+                    hits[int(i), int(j), int(k)] += 1
+
+
+def count_hits(position, ways, origin, voxel, shape):
+    """Beams that cross each voxel, int64 of the grid's shape: :func:`crossed` for each of ``ways`` (n, 3), added up."""
+    hits = np.zeros(shape, dtype=np.int64)
+    start = np.asarray(position, dtype=np.float64) - np.asarray(origin)
+    _count(start, np.ascontiguousarray(ways, dtype=np.float64), float(voxel), np.asarray(shape, dtype=np.int64), hits)
+    return hits

@@ -1,0 +1,64 @@
+"""Are there any mismatches?
+
+``python -m benchmarks.numerics`` hunts at full length (``--scale 1e-3`` is a smoke test), prints one table, and ends with 1 when a
+decision came out other than exact arithmetic has it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from benchmarks.numerics import boxes, cast, entropy, march
+from benchmarks.numerics.row import Row
+
+MODULES = (march, boxes, cast, entropy)
+HEADINGS = ("case", "rule", "tested against", "cases", "excluded", "mismatches", "worst figure")
+
+
+def cells(row: Row) -> tuple[str, ...]:
+    """A row as text."""
+    return row.case, row.rule, row.tested, f"{row.cases:,}", f"{row.excluded:,}", f"{row.mismatches:,}", row.worst
+
+
+def markdown(found: list[Row]) -> str:
+    """The rows as a Markdown table."""
+    lines = [HEADINGS, ("---",) * 3 + ("---:",) * 3 + ("---",), *(cells(row) for row in found)]
+    return "".join("| " + " | ".join(text.replace("|", "\\|") for text in line) + " |\n" for line in lines)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run all hunts; the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.numerics", description=__doc__)
+    parser.add_argument("--scale", type=float, default=1.0, help="share of the full length (default 1)")
+    parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the table there too")
+    chosen = parser.parse_args(arguments)
+    if not 0 < chosen.scale <= 100:
+        parser.error(f"--scale {chosen.scale:g}: a number above 0, at most 100")
+    console, start = Console(highlight=False), time.perf_counter()
+    found: dict[str, list[Row]] = {}
+    with Progress(console=console, transient=True) as progress:
+        for module in progress.track(MODULES, description="hunting"):
+            found[module.__name__.rpartition(".")[2]] = module.rows(chosen.scale)
+    rows = [row for part in found.values() for row in part]
+    table = Table(*HEADINGS, box=None, title=f"Decisions against exact arithmetic, scale {chosen.scale:g}")
+    for row in rows:
+        table.add_row(*cells(row), style="red" if row.mismatches else None)
+    console.print(table)
+    if chosen.markdown is not None:
+        chosen.markdown.write_text(markdown(rows), encoding="utf-8")
+    for name, part in found.items():
+        console.print(f"{name}: {sum(row.mismatches for row in part)} mismatches in {sum(row.cases for row in part):,} cases")
+    wrong = sum(row.mismatches for row in rows)
+    console.print(f"all: {wrong} mismatches, {time.perf_counter() - start:.0f} s")
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,352 @@
+"""Does the march cross other voxels than exact arithmetic does, on millions of segments?
+
+Most segments are settled by sorted cuts in float64, a scheme that shares nothing with the march but the formula of a crossing:
+all crossings of all planes, sorted; between two of them the middle decides which voxel it is. Wherever a piece is within 2e-8 m of
+the 1 micrometre bound, or its middle closer to a plane than rounding could move it, the segment goes to the rational oracle
+instead. So every answer is certain, and only the doubtful ones are slow.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from fractions import Fraction
+from pathlib import Path
+
+import numba
+import numpy as np
+
+import pipeline
+from benchmarks.numerics.row import Row
+from pipeline import statics, survey
+from pipeline.kernels import march
+from pipeline.world import read_ply
+from tests.oracles import march as oracle
+
+ROOT = Path(__file__).resolve().parents[2]
+SCENES = ("nishishinjuku", "ingolstadt")
+RULE = "chord > 1e-6 m"
+FAR_M = 1e7
+
+_kernel = numba.njit(nogil=True, error_model="numpy", cache=True)
+
+
+@_kernel
+def cuts(o, d, shape, voxel_m, times, cells):
+    """Cells of one segment by sorted cuts, ascending along it; -1 when float64 cannot be certain."""
+    size = 0.0
+    for a in range(3):
+        size = max(size, abs(d[a]))
+    if size == 0.0 or size > 1e150 or size < 1e-150:
+        return -1
+    length = size * np.sqrt((d[0] / size) ** 2 + (d[1] / size) ** 2 + (d[2] / size) ** 2) * voxel_m
+    n = 2
+    times[0], times[1] = 0.0, 1.0
+    for a in range(3):
+        if d[a] == 0.0:
+            continue
+        for k in range(shape[a] + 1):
+            t = (k - o[a]) / d[a]
+            if 0.0 < t < 1.0:
+                times[n] = t
+                n += 1
+    pieces = np.sort(times[:n])
+    count = 0
+    unsure_m = 2e-8
+    for i in range(n - 1):
+        chord = (pieces[i + 1] - pieces[i]) * length
+        if chord < 1e-6 - unsure_m:
+            continue
+        middle, outside, cell = 0.5 * (pieces[i] + pieces[i + 1]), False, 0
+        for a in range(3):
+            x = o[a] + middle * d[a]
+            k = np.floor(x)
+            if d[a] != 0.0:
+                error = 1e-15 * (abs(o[a]) + abs(middle * d[a]))
+                if min(x - k, k + 1.0 - x) <= error:
+                    if -1.0 <= k <= shape[a]:
+                        return -1
+                    outside = True
+            if not 0.0 <= x < shape[a]:
+                outside = True
+            else:
+                cell = cell * shape[a] + np.int64(k)
+        if outside:
+            continue
+        if chord < 1e-6 + unsure_m:
+            return -1
+        # Two pieces of one voxel: what lies between them was a cut that rounding put into it.
+        if count > 0 and cells[count - 1] == cell:
+            return -1
+        cells[count] = cell
+        count += 1
+    return count
+
+
+@_kernel
+def compare(o, d, shape, voxel_m, verdict):
+    """For each segment: 0 the march agrees, 1 it does not, 2 the oracle must say. Returns the voxels crossed."""
+    longest = shape.sum() + 8
+    times, mine, cells, t_cells = (
+        np.empty(longest),
+        np.empty(longest, np.int64),
+        np.empty(longest, np.int64),
+        np.empty((longest, 2)),
+    )
+    hits, crossed = np.zeros(1, np.uint32), 0
+    for i in range(o.shape[0]):
+        n = cuts(o[i], d[i], shape, voxel_m, times, mine)
+        count, _, _ = march.walk(o[i], d[i], shape, voxel_m, hits, cells, t_cells)
+        crossed += count
+        verdict[i] = 2 if n < 0 else 0 if n == count and np.all(mine[:n] == cells[:count]) else 1
+    return crossed
+
+
+def settle(o, d, shape, voxel_m):
+    """The voxels by sorted cuts, None when float64 cannot be certain."""
+    n = np.asarray(shape, np.int64)
+    cells = np.empty(n.sum() + 8, np.int64)
+    count = cuts(np.asarray(o, float), np.asarray(d, float), n, voxel_m, np.empty(n.sum() + 8), cells)
+    if count < 0:
+        return None
+    return {tuple(int(i) for i in np.unravel_index(c, tuple(n))) for c in cells[:count]}
+
+
+def walk(o, d, shape, voxel_m):
+    """The voxels that the march lists."""
+    n = np.asarray(shape, np.int64)
+    cells, t_cells = np.empty(n.sum() + 8, np.int64), np.empty((n.sum() + 8, 2))
+    count, _, _ = march.walk(o, d, n, voxel_m, np.zeros(1, np.uint32), cells, t_cells)
+    return {tuple(int(i) for i in np.unravel_index(c, tuple(n))) for c in cells[:count]}
+
+
+def check(o, d, shape, voxel_m):
+    """(excluded, mismatches, asked): segments with a chord within 1e-8 m of the bound; wrong ones; settled by rationals."""
+    verdict = np.empty(len(o), np.int64)
+    compare(o, d, np.asarray(shape, np.int64), voxel_m, verdict)
+    excluded = mismatches = 0
+    for i in np.flatnonzero(verdict):
+        wrong = walk(o[i], d[i], shape, voxel_m) ^ oracle.crossed(o[i], d[i], shape, voxel_m)
+        doubtful = oracle.doubtful(o[i], d[i], shape, voxel_m)
+        excluded += bool(doubtful)
+        mismatches += not wrong <= doubtful
+    return excluded, mismatches, int((verdict > 0).sum())
+
+
+def hostile(rng, n, shape, voxel_m):
+    """Starts and extents (n, 3) made of what hurts: lattice points, last bits, 1e-12 to 1e-4 beside, zeros, subnormals, far."""
+    span = np.asarray(shape, float)
+
+    def points(size):
+        base = np.rint(rng.uniform(-2, 1, (size, 3)) + rng.uniform(0, 1, (size, 3)) * (span + 2))
+        kind = rng.integers(0, 8, (size, 3))
+        eps = rng.choice([-1.0, 1.0], (size, 3)) * 10.0 ** rng.uniform(-12, -4, (size, 3))
+        tiny = rng.choice([5e-324, -5e-324, 1e-310, -1e-310, 0.0, -0.0], (size, 3))
+        out = np.where(kind == 1, base + 0.5, base)
+        out = np.where(kind == 2, np.nextafter(base, rng.choice([-9.0, 99.0], (size, 3))), out)
+        out = np.where(kind == 3, base + eps, out)
+        out = np.where(kind == 4, rng.uniform(-2, 2, (size, 3)) + rng.uniform(0, 1, (size, 3)) * span, out)
+        return np.where(kind == 5, tiny, out)
+
+    start, end = points(n), points(n)
+    kind = rng.integers(0, 12, n)
+    same = rng.random((n, 3)) < 0.25
+    end = np.where(same, start, end)  # along axes and in planes
+    d = end - start
+    diagonal = rng.integers(-12, 13, (n, 1)) * rng.choice([-1.0, 0.0, -0.0, 1.0], (n, 3))
+    d = np.where((kind == 1)[:, None], diagonal, d)
+    d = np.where((kind == 2)[:, None] & same, rng.choice([5e-324, -5e-324, 1e-310, -1e-310, 1e-300], (n, 3)), d)
+    away = rng.uniform(-1, 1, (n, 3)) * FAR_M / voxel_m
+    far = (kind == 3)[:, None]
+    start, d = np.where(far, end + away, start), np.where(far, -away * rng.choice([1.0, 2.0], (n, 1)), d)
+    d = np.where((kind == 4)[:, None], away, d)
+    back = rng.random(n) < 0.5
+    turned = start + d
+    return np.where(back[:, None], turned, start), np.where(back[:, None], -d, d)
+
+
+def uniform(rng, n, shape, voxel_m):
+    """Random segments in and round the grid."""
+    del voxel_m
+    span = np.asarray(shape, float)
+    start, end = rng.uniform(-0.3, 1.3, (2, n, 3)) * span
+    return start, end - start
+
+
+def near_the_bound(rng, n, shape, voxel_m):
+    """Segments that cut a corner by 0.5 to 2 micrometres."""
+    span = np.asarray(shape, float)
+    corner = np.rint(rng.uniform(0.6, 0.99, (n, 3)) * (span - 1))
+    corner[:, 2] += 0.5
+    u = np.column_stack([rng.uniform(0.05, 1, n), rng.uniform(0.05, 1, n), rng.uniform(-0.3, 0.3, n)])
+    chord = rng.uniform(0.5, 2, n) * 1e-6 / voxel_m
+    # Between the planes x = corner and y = corner the segment needs the offset / u of each: shift x by chord * u_x.
+    size = np.sqrt((u**2).sum(axis=1))
+    corner[:, 0] += chord * u[:, 0] / size
+    return corner - u * 4, u * rng.uniform(4.5, 9, (n, 1))
+
+
+def hunt(case, make, seed, n, shape, voxel_m, built=False):
+    """One row: ``n`` segments, some tens of thousands at a time."""
+    rng = np.random.default_rng(seed)
+    done = excluded = mismatches = asked = 0
+    while done < n:
+        size = min(n - done, 50_000)
+        o, d = make(rng, size, shape, voxel_m)
+        found = check(np.ascontiguousarray(o), np.ascontiguousarray(d), shape, voxel_m)
+        excluded, mismatches, asked, done = excluded + found[0], mismatches + found[1], asked + found[2], done + size
+    told = f"sorted cuts with a margin; {asked} by fractions"
+    return Row(case, RULE, told, done, excluded, mismatches, "-" if built else f"{excluded} within 1e-8 m of the bound")
+
+
+@_kernel
+def fragile(o, d, shape, voxel_m, moved_m):
+    """Whether moving an end by ``moved_m`` could change a voxel: see the oracle's ``fragile``; in float64."""
+    longest = shape.sum() + 8
+    times = np.empty(longest)
+    n = 2
+    times[0], times[1] = 0.0, 1.0
+    length = np.sqrt(d[0] ** 2 + d[1] ** 2 + d[2] ** 2) * voxel_m
+    grow = moved_m / voxel_m
+    for a in range(3):
+        if d[a] == 0.0:
+            continue
+        for k in range(shape[a] + 1):
+            t = (k - o[a]) / d[a]
+            if 0.0 < t < 1.0:
+                times[n] = t
+                n += 1
+    pieces = np.sort(times[:n])
+    first, last = np.empty((3, 2), np.int64), np.empty(3, np.int64)
+    for i in range(n - 1):
+        # Every voxel that the segment touches when made a little larger, seen from the two ends and the middle of a piece.
+        for a in range(3):
+            x, y = o[a] + pieces[i] * d[a], o[a] + pieces[i + 1] * d[a]
+            first[a, 0] = np.int64(max(np.floor(min(x, y) - 2 * grow), 0.0))
+            first[a, 1] = np.int64(min(np.floor(max(x, y) + 2 * grow), shape[a] - 1.0))
+        for last[0] in range(first[0, 0], first[0, 1] + 1):
+            for last[1] in range(first[1, 0], first[1, 1] + 1):
+                for last[2] in range(first[2, 0], first[2, 1] + 1):
+                    if _may_turn(o, d, last, grow, length, moved_m):
+                        return True
+    return False
+
+
+@_kernel
+def _may_turn(o, d, cell, grow, length, moved_m):
+    """Whether the chords of a smaller and of a larger voxel lie on either side of the bound."""
+    low_in, high_in, low_out, high_out = 0.0, 1.0, 0.0, 1.0
+    for a in range(3):
+        k = float(cell[a])
+        if d[a] == 0.0:
+            if not k - grow <= o[a] < k + 1.0 + grow:
+                return False
+            if not k + grow <= o[a] < k + 1.0 - grow:
+                high_in = -1.0
+            continue
+        p, q = (k - grow - o[a]) / d[a], (k + 1.0 + grow - o[a]) / d[a]
+        low_out, high_out = max(low_out, min(p, q)), min(high_out, max(p, q))
+        p, q = (k + grow - o[a]) / d[a], (k + 1.0 - grow - o[a]) / d[a]
+        low_in, high_in = max(low_in, min(p, q)), min(high_in, max(p, q))
+    outer, inner = (high_out - low_out) * length, max(high_in - low_in, 0.0) * length
+    return outer > 1e-6 - 2 * moved_m and outer > 0.0 and inner <= 1e-6 + 2 * moved_m
+
+
+@_kernel
+def count_fragile(o, d, shape, voxel_m, moved_m):
+    """Beams that a move could turn: (in a plane because a component is 0, others)."""
+    in_plane, others = 0, 0
+    for i in range(d.shape[0]):
+        if fragile(o, d[i], shape, voxel_m, moved_m):
+            exact = False
+            for a in range(3):
+                exact |= d[i, a] == 0.0 and abs(o[a] - np.rint(o[a])) * voxel_m <= moved_m
+            if exact:
+                in_plane += 1
+            else:
+                others += 1
+    return in_plane, others
+
+
+def beams_of(name, folder):
+    """(grid, [(site, o, d)]) of a shipped scene."""
+    scenario = pipeline.load(ROOT / "scenarios" / name)
+    statics.run(scenario, folder)
+    world, _ = read_ply(folder / "statics.ply")
+    surveyed, grid = survey.Survey(scenario, world), scenario.roi.grid
+    found = []
+    for site in surveyed.sites:
+        o = grid.to_grid_m(np.asarray(site.position_m)) / grid.voxel_m
+        found.append((site.site, o, np.ascontiguousarray(surveyed.scan(site).scan.ends_m / grid.voxel_m)))
+    return grid, found
+
+
+def shipped(name, scale):
+    """Rows of a shipped scene: its beams against sorted cuts, the audit, and how many a nanometre could turn."""
+    with tempfile.TemporaryDirectory() as temporary:
+        grid, sites = beams_of(name, Path(temporary))
+    shape = np.asarray(grid.shape, np.int64)
+    step = max(1, round(1 / max(scale, 1e-9) ** 0.5))
+    total = excluded = mismatches = asked = in_plane = others = 0
+    worst_sum = longest_gap = 0.0
+    broken = 0
+    for _, o, ends in sites[::step]:
+        d = ends[::step].copy()
+        total += len(d)
+        found = check(np.broadcast_to(o, d.shape), d, grid.shape, grid.voxel_m)
+        excluded, mismatches, asked = excluded + found[0], mismatches + found[1], asked + found[2]
+        found = count_fragile(o, d, shape, grid.voxel_m, 1e-9)
+        in_plane, others = in_plane + found[0], others + found[1]
+        found = march.audit(o, d, shape, grid.voxel_m, np.zeros(int(shape.prod()), np.uint32))
+        worst_sum, longest_gap, broken = max(worst_sum, found[0]), max(longest_gap, found[1]), broken + found[2] + found[3]
+    return [
+        Row(f"beams of {name}", RULE, f"sorted cuts with a margin; {asked} by fractions", total, excluded, mismatches, "-"),
+        Row(f"beams of {name}, chords add up", "to 1e-12 of the segment, no voxel twice", "march.audit", total, 0,
+            broken + (worst_sum > 1e-12), f"{worst_sum:.1e} of the segment; longest gap {longest_gap:.1e} m"),
+        Row(f"beams of {name}, ends moved by 1e-9 m", "no voxel may turn", "chords in voxels 1e-9 m larger and smaller", total,
+            in_plane + others, 0, f"{in_plane} beams exactly in a plane, {others} others"),
+    ]  # fmt: skip
+
+
+def far_chords(scale):
+    """How exact are chords of beams that start 1e7 m away? Against fractions."""
+    rng, n = np.random.default_rng(16), max(10, round(2000 * scale))
+    shape, voxel_m, worst = np.array((12, 8, 5), np.int64), 0.25, Fraction(0)
+    cells, t_cells = np.empty(40, np.int64), np.empty((40, 2))
+    for _ in range(n):
+        target = rng.uniform(0, 1, 3) * shape
+        away = rng.normal(size=3)
+        o = target - away / np.sqrt((away**2).sum()) * FAR_M / voxel_m
+        d = 2 * (target - o)
+        exact = oracle.shares(o, d, shape)
+        count, _, _ = march.walk(o, d, shape, voxel_m, np.zeros(1, np.uint32), cells, t_cells)
+        for c in range(count):
+            voxel = tuple(int(i) for i in np.unravel_index(cells[c], tuple(shape)))
+            worst = max(worst, abs(Fraction(t_cells[c, 1]) - Fraction(t_cells[c, 0]) - exact[voxel]) * Fraction(2 * FAR_M))
+    return Row(
+        "chords of beams from 1e7 m away",
+        "to 4 u R = 4.5e-9 m",
+        "fractions",
+        n,
+        0,
+        int(worst > Fraction(45, 10**10)),
+        f"{float(worst):.1e} m",
+    )
+
+
+def rows(scale: float) -> list[Row]:
+    """All hunts of the march; scale 1 is the long run."""
+
+    def some(n):
+        return max(50, round(n * scale))
+
+    found = [
+        hunt("hostile segments, 0.25 m", hostile, 11, some(500_000), (7, 5, 4), 0.25),
+        hunt("hostile segments, 0.1 m, a larger grid", hostile, 12, some(250_000), (40, 24, 10), 0.1),
+        hunt("hostile segments, 16 m", hostile, 13, some(250_000), (12, 9, 6), 16.0),
+        hunt("random segments", uniform, 14, some(10_000_000), (40, 20, 10), 0.25),
+        hunt("corners cut by 0.5 to 2 micrometres", near_the_bound, 15, some(20_000), (20, 20, 6), 0.25),
+        far_chords(scale),
+    ]
+    for name in SCENES:
+        found += shipped(name, scale)
+    return found

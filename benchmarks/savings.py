@@ -1,0 +1,81 @@
+"""What does leaving out what no beam can meet save?
+
+The static world of the shipped junction, and a city of nine of them, held whole and held only as far as a beam can meet it; and no
+static geometry at all. All ways are timed in turn, and the bytes of their scans are compared.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import pipeline
+from pipeline import statics, survey
+from pipeline.raycast import Caster
+from pipeline.world import World
+
+SCENARIO = Path(__file__).resolve().parent.parent / "scenarios" / "nishishinjuku"
+REPEATS = 7
+
+
+def in_turn(*works: Callable[[], Any]) -> list[float]:
+    """Median seconds of each, one after the other in each round; each was called once before."""
+    times: list[list[float]] = [[] for _ in works]
+    for work in works:
+        work()
+    for _ in range(REPEATS):
+        for taken, work in zip(times, works, strict=True):
+            start = time.perf_counter()
+            work()
+            taken.append(time.perf_counter() - start)
+    return [statistics.median(taken) for taken in times]
+
+
+def city(world: World, spacing_m: float = 700.0) -> World:
+    """The world nine times, side by side; the first stays where it is."""
+    steps = sorted(((x, y, 0) for x in (-1, 0, 1) for y in (-1, 0, 1)), key=np.linalg.norm)
+    vertices = np.concatenate([world.vertices_m + spacing_m * np.array(step) for step in steps])
+    faces = np.concatenate([world.faces + i * len(world.vertices_m) for i in range(9)]).astype(np.int32)
+    return World(vertices, faces, np.tile(world.solid_of_face, 9), world.solids)
+
+
+def rows() -> list[tuple[str, str, str, bool]]:
+    """What was saved, the ratio, what is wanted, and whether it is so."""
+    return [*_pair("junction", lambda world: world), *_pair("city of nine", city)]
+
+
+def _pair(name: str, grown: Callable[[World], World]) -> list[tuple[str, str, str, bool]]:
+    scenario = pipeline.load(SCENARIO)
+    plain = statics.build(scenario, statics.Tally.empty())
+    roi, surveyed, world = scenario.roi.box, survey.Survey(scenario, plain), grown(plain)
+    sites = np.array([site.position_m for site in surveyed.sites])
+    nothing = World(np.empty((0, 3)), np.empty((0, 3), np.int32), np.empty(0, np.int32), ())
+    sensor = surveyed._sensors[surveyed.sites[0].site]
+    directions, range_m = sensor.directions(), sensor.range_m
+    held, whole, empty = Caster(world, roi, sites, range_m), Caster(world, roi), Caster(nothing, roi)
+
+    def cast(caster: Caster) -> list[bytes]:
+        scans = (caster.scan(site.position_m, directions, range_m) for site in surveyed.sites)
+        return [scan.ends_m.tobytes() + scan.returned.tobytes() for scan in scans]
+
+    same = cast(held) == cast(whole)
+    build = in_turn(lambda: Caster(world, roi, sites, range_m), lambda: Caster(world, roi), lambda: Caster(nothing, roi))
+    casting = in_turn(lambda: cast(held), lambda: cast(whole), lambda: cast(empty))
+    part = len(held._triangles) / len(whole._triangles)
+    return [
+        (f"{name}: triangles that a beam can meet", f"{part:.0%} of {len(whole._triangles)}", "same bytes", same),
+        ("  building, with / without leaving out", f"{build[0] / build[1]:.2f}", "1.1", build[0] <= 1.1 * build[1]),
+        ("  casting 13 sites, with / without leaving out", f"{casting[0] / casting[1]:.2f}", "1.1", casting[0] <= 1.1 * casting[1]),
+        ("  no geometry, building / with geometry", f"{build[2] / build[1]:.3f}", "0.1", build[2] <= 0.1 * build[1]),
+        ("  no geometry, casting / with geometry", f"{casting[2] / casting[1]:.2f}", "0.6", casting[2] <= 0.6 * casting[1]),
+    ]
+
+
+if __name__ == "__main__":
+    for row in rows():
+        print(*row, sep=" | ")

@@ -1,0 +1,187 @@
+"""What do stable decisions cost?
+
+Time of our kernels over the time of the textbook's, and how many voxels the textbook gets wrong, on the shipped junction:
+
+- march against Amanatides and Woo (1987): t accumulated, every visited voxel counted. Wrong are voxels whose hits exact arithmetic
+  has otherwise, summed over the sites;
+- occupancy by boxes shrunk by 0.1 mm against boxes that may touch, on the shipped traffic. Wrong are voxels whose count changes
+  when every box moves by 1e-9 m.
+
+Repeats are interleaved; medians are compared. Machines differ, ratios less so.
+"""
+
+from __future__ import annotations
+
+import re
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numba
+import numpy as np
+
+import pipeline
+from benchmarks.numerics.march import beams_of, check
+from pipeline import tpog, traffic
+from pipeline.kernels import boxes, march
+
+ROOT = Path(__file__).resolve().parents[1]
+SCENE = "nishishinjuku"
+REPEATS = 9
+
+_kernel = numba.njit(nogil=True, error_model="numpy", cache=True)
+
+
+@_kernel
+def _start(o, d, n, t):
+    """Voxel at the start, step, first crossing and time between crossings of one axis, as the paper has them."""
+    i = min(max(np.int64(np.floor(o + t * d)), 0), n - 1)
+    if d > 0.0:
+        return i, 1, (i + 1 - o) / d, 1.0 / d
+    if d < 0.0:
+        return i, -1, (i - o) / d, -1.0 / d
+    return i, 0, np.inf, np.inf
+
+
+@_kernel
+def textbook(o, d, shape, hits):
+    """Amanatides and Woo (1987), "A Fast Voxel Traversal Algorithm for Ray Tracing": add each beam to the voxels it visits."""
+    nx, ny, nz = shape[0], shape[1], shape[2]
+    for beam in range(d.shape[0]):
+        t, t_last = 0.0, 1.0
+        for a in range(3):
+            if d[beam, a] == 0.0:
+                if not 0.0 <= o[a] < shape[a]:
+                    t_last = -1.0
+            else:
+                p, q = -o[a] / d[beam, a], (shape[a] - o[a]) / d[beam, a]
+                t, t_last = max(t, min(p, q)), min(t_last, max(p, q))
+        if not t < t_last:
+            continue
+        ix, sx, tx, dtx = _start(o[0], d[beam, 0], nx, t)
+        iy, sy, ty, dty = _start(o[1], d[beam, 1], ny, t)
+        iz, sz, tz, dtz = _start(o[2], d[beam, 2], nz, t)
+        cell = (ix * ny + iy) * nz + iz
+        step_x, step_y = sx * ny * nz, sy * nz
+        while True:
+            hits[cell] += np.uint32(1)
+            if tx < ty and tx < tz:
+                ix += sx
+                if tx >= t_last or ix < 0 or ix >= nx:
+                    break
+                cell += step_x
+                tx += dtx
+            elif ty < tz:
+                iy += sy
+                if ty >= t_last or iy < 0 or iy >= ny:
+                    break
+                cell += step_y
+                ty += dty
+            else:
+                iz += sz
+                if tz >= t_last or iz < 0 or iz >= nz:
+                    break
+                cell += sz
+                tz += dtz
+
+
+def touching() -> Any:
+    """The box kernels with boxes that are not shrunk, compiled anew."""
+    source = Path(boxes.__file__).read_text(encoding="utf-8")
+    for old, new in ((r"^SHRINK_M = .*$", "SHRINK_M = 0.0"), (r"cache=True, ", "")):
+        source, found = re.subn(old, new, source, flags=re.MULTILINE)
+        assert found
+    namespace: dict[str, Any] = {"__name__": "touching"}
+    exec(compile(source, "touching boxes", "exec"), namespace)
+    return SimpleNamespace(**namespace)
+
+
+def medians(works: list[Callable[[], object]]) -> list[float]:
+    """Seconds of each, measured in turns after one call that is not counted."""
+    times: list[list[float]] = [[] for _ in works]
+    for turn in range(REPEATS + 1):
+        for work, taken in zip(works, times, strict=True):
+            begin = time.perf_counter()
+            work()
+            if turn:
+                taken.append(time.perf_counter() - begin)
+    return [statistics.median(taken) for taken in times]
+
+
+def march_rows() -> list[tuple[str, float, float, int]]:
+    """Ours and the textbook's on the beams of all sites, a round of the sites at a time."""
+    with tempfile.TemporaryDirectory() as temporary:
+        grid, sites = beams_of(SCENE, Path(temporary))
+    shape = np.asarray(grid.shape, np.int64)
+    hits = np.zeros(int(shape.prod()), np.uint32)
+
+    def ours() -> None:
+        for _, o, d in sites:
+            march.count_hits(o, d, shape, grid.voxel_m, hits)
+
+    def theirs() -> None:
+        for _, o, d in sites:
+            textbook(o, d, shape, hits)
+
+    wrong_ours = wrong_theirs = 0
+    for _, o, d in sites:
+        found, other = np.zeros_like(hits), np.zeros_like(hits)
+        march.count_hits(o, d, shape, grid.voxel_m, found)
+        textbook(o, d, shape, other)
+        # Every beam of ours is right by exact arithmetic, or counted here; so what differs from ours is wrong.
+        wrong_ours += check(np.broadcast_to(o, d.shape), d, grid.shape, grid.voxel_m)[1]
+        wrong_theirs += int((found != other).sum())
+    mine, textbooks = medians([ours, theirs])
+    return [
+        (f"march, {len(sites)} sites: textbook", textbooks, 1.0, wrong_theirs),
+        (f"march, {len(sites)} sites: ours", mine, mine / textbooks, wrong_ours),
+    ]
+
+
+def box_rows() -> list[tuple[str, float, float, int]]:
+    """Ours and touching boxes on the shipped traffic, 1000 frames."""
+    frames = 1000
+    scenario = pipeline.load(ROOT / "scenarios" / SCENE, [f"traffic.frames={frames}"])
+    grid = scenario.roi.grid
+    with tempfile.TemporaryDirectory() as temporary:
+        traffic.run(scenario, Path(temporary))
+        batches = list(tpog._read(Path(temporary) / "trajectories.parquet", grid))
+    frame, values = np.concatenate([b.frame for b in batches]), np.concatenate([b.values for b in batches])
+    near = tpog._in_reach(values, grid)
+    frame, values = frame[near], values[near]
+    shape, (nx, ny, nz) = np.asarray(grid.shape, np.int64), grid.shape
+    steps, seen = np.zeros((nz + 1, nx, ny), np.int32), np.full((3, nx, ny), -1, np.int64)
+
+    def count(kernels: Any, moved: Any) -> Any:
+        steps[:], seen[:] = 0, -1
+        kernels.count_boxes(frame, moved, shape, grid.voxel_m, steps, seen)
+        kernels.sum_layers(steps)
+        return steps[:-1]
+
+    plain = touching()
+    wrong = []
+    for kernels in (plain, boxes):
+        before, turned = count(kernels, values).copy(), np.zeros((nz, nx, ny), bool)
+        for axis in range(3):
+            for nudge in (-1e-9, 1e-9):
+                turned |= count(kernels, values + nudge * np.eye(8)[axis]) != before
+        wrong.append(int(turned.sum()))
+    textbooks, mine = medians([lambda: count(plain, values), lambda: count(boxes, values)])
+    return [
+        (f"boxes, {frames} frames: touching", textbooks, 1.0, wrong[0]),
+        (f"boxes, {frames} frames: ours", mine, mine / textbooks, wrong[1]),
+    ]
+
+
+def rows() -> list[tuple[str, float, float, int]]:
+    """(what, seconds, ratio to the textbook, wrong voxels)."""
+    return march_rows() + box_rows()
+
+
+if __name__ == "__main__":
+    for row in rows():
+        print(*row)

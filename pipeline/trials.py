@@ -1,0 +1,264 @@
+"""What does one setting score, and what does each of its stages cost?
+
+Stages run in the order of the program, in a folder of their own; what a stage wrote is kept under the hash of its inputs, so that
+settings that share traffic, static world or scans share the work. A stage can be run again, to time it once more: it must then
+write the same bytes.
+
+    out/accuracy/<hash of the setting>.json     its scores, so that a study goes on where it was interrupted
+    out/accuracy/stages/<stage>-<hash>/         artefacts of a stage, and cost.json: seconds of each repeat, peak memory
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import math
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from pipeline import __version__, sites, tables
+from pipeline.cost import measured
+from pipeline.entropy import Field
+from pipeline.errors import RunError
+from pipeline.knobs import Setting
+from pipeline.results import read_tpog
+from pipeline.scenario import Scenario, load
+from pipeline.stage import Progress
+from pipeline.uncertainty import Estimate, LeaveOut, order
+from pipeline.visibility import Hits, Visibility
+
+STAGES = ("statics", "scan", "traffic", "tpog", "score")
+"""What a ranking takes; the report is left out."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One setting's scores.
+
+    Attributes
+    ----------
+    sites
+        Names, in the order of the sites.
+    shares
+        Scores as shares of ``egvs_limit`` (of the TPOG's entropy where gamma is infinite), (n,) float64.
+    share_ses
+        Their standard errors, (n,); not a number where the TPOG has one block.
+    frames
+        T.
+    scores, ses, biases
+        In bits, (n,); the last two not a number where the TPOG has one block.
+    quantile
+        How many standard errors an interval reaches to each side.
+    neighbours
+        For each site but the last, best first: its name, the next one's, the chance that it truly scores higher, and the frames
+        that would tell the two apart.
+    stages
+        Stage -> hash of its inputs.
+    """
+
+    sites: list[str]
+    shares: list[float]
+    share_ses: list[float]
+    frames: int
+    scores: list[float]
+    ses: list[float]
+    biases: list[float]
+    quantile: float
+    neighbours: list[tuple[str, str, float, float]]
+    stages: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Spent:
+    """What one stage cost: seconds of each repeat, peak memory of the process, bytes of its artefacts."""
+
+    seconds: tuple[float, ...]
+    peak_mb: float
+    bytes: int
+
+
+class Bench:
+    """Runs settings of one scenario, each stage once for equal inputs."""
+
+    def __init__(self, path: Path, sets: Sequence[str], out: Path, jobs: int | None, progress: Progress) -> None:
+        self._path, self._sets, self._jobs, self._progress = path, tuple(sets), jobs, progress
+        self._kept = out / "accuracy"
+        self._kept.mkdir(parents=True, exist_ok=True)
+
+    def scenario(self, setting: Setting) -> Scenario:
+        """The scenario as this setting has it."""
+        scenario = load(self._path, [*self._sets, *setting.overrides])
+        if setting.without is None:
+            return scenario
+        return scenario.with_effects({name: p for name, p in scenario.effects.items() if name != setting.without})
+
+    def known(self, setting: Setting) -> Trial | None:
+        """A kept result; None where there is none, or where a stage's artefacts were removed."""
+        path = self._result(setting)
+        if not path.is_file():
+            return None
+        trial = Trial(**json.loads(path.read_text(encoding="utf-8"))["trial"])
+        return trial if all((self._folder(s, k) / "cost.json").is_file() for s, k in trial.stages.items()) else None
+
+    def run(self, setting: Setting) -> Trial:
+        """Run every stage that is not known yet, and score."""
+        if (known := self.known(setting)) is not None:
+            return known
+        scenario = self.scenario(setting)
+        with self._workshop() as work:
+            keys = {}
+            for name in STAGES:
+                stage = _module(name)
+                keys[name] = tables.hash_of({"egvs": __version__, **stage.inputs(scenario, work)})
+                if not (self._folder(name, keys[name]) / "cost.json").is_file():
+                    self._measure(name, keys[name], scenario, work)
+                _link(self._folder(name, keys[name]), work)
+            trial = _trial(scenario, work, keys)
+        kept = {"setting": setting.name, "overrides": setting.overrides, "trial": trial.__dict__}
+        tables.write_text(self._result(setting), json.dumps(kept, indent=1) + "\n")
+        return trial
+
+    def again(self, name: str, setting: Setting, trial: Trial) -> None:
+        """Run one stage of a known setting once more, for its time; RunError when it writes other bytes."""
+        with self._workshop() as work:
+            for before in STAGES[: STAGES.index(name)]:
+                _link(self._folder(before, trial.stages[before]), work)
+            self._measure(name, trial.stages[name], self.scenario(setting), work)
+
+    def warm_up(self, setting: Setting) -> None:
+        """Run all stages once, and forget it: what is compiled or loaded first is compiled and loaded then."""
+        scenario = self.scenario(setting)
+        with self._workshop() as work:
+            for name in STAGES:
+                _module(name).run(scenario, work, jobs=self._jobs)
+
+    def spent(self, name: str, key: str) -> Spent:
+        """What one stage cost so far."""
+        folder = self._folder(name, key)
+        cost = json.loads((folder / "cost.json").read_text(encoding="utf-8"))
+        size = sum(path.stat().st_size for path in folder.iterdir() if path.name != "cost.json")
+        return Spent(tuple(cost["seconds"]), cost["peak_mb"], size)
+
+    def artefact(self, trial: Trial, stage: str, name: str) -> Path:
+        """Where one of a trial's artefacts is kept."""
+        return self._folder(stage, trial.stages[stage]) / name
+
+    def hits(self, setting: Setting, trial: Trial) -> Iterator[tuple[Hits, int]]:
+        """Hits of each site and their unit, as :meth:`Visibility.hits` gives them."""
+        with self._workshop() as work:
+            for name in STAGES:
+                _link(self._folder(name, trial.stages[name]), work)
+            visibility = Visibility(self.scenario(setting), work, read_tpog(work / "tpog.parquet").grid)
+            for beams in visibility.beams():
+                yield visibility.hits(beams), visibility.unit
+
+    def note(self, name: str) -> dict[str, Any]:
+        """Something else that the study keeps."""
+        path = self._kept / f"{name}.json"
+        found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+        return found
+
+    def keep_note(self, name: str, value: dict[str, Any]) -> None:
+        """Keep it."""
+        tables.write_text(self._kept / f"{name}.json", json.dumps(value, indent=1) + "\n")
+
+    def _measure(self, name: str, key: str, scenario: Scenario, work: Path) -> None:
+        with measured() as cost:
+            _module(name).run(scenario, work, jobs=self._jobs, progress=self._progress)
+        written = [work / artefact for artefact in _module(name).ARTEFACTS if (work / artefact).exists()]
+        digests = {path.name: tables.sha256_of(path) for path in written}
+        folder = self._folder(name, key)
+        folder.mkdir(parents=True, exist_ok=True)
+        file = folder / "cost.json"
+        before: dict[str, Any] = {"seconds": [], "peak_mb": 0.0, "sha256": digests}
+        if file.is_file():
+            before = json.loads(file.read_text(encoding="utf-8"))
+        if before["sha256"] != digests:
+            raise RunError(f"{name}: a repeat wrote other bytes than the first run; kept in {folder}")
+        for path in written:
+            if not (folder / path.name).exists():
+                _same(path, folder / path.name)
+        seconds = [*before["seconds"], round(cost.seconds, 4)]
+        peak = max(before["peak_mb"], round(cost.peak_mb, 1))
+        tables.write_text(file, json.dumps({"seconds": seconds, "peak_mb": peak, "sha256": digests}) + "\n")
+
+    def _result(self, setting: Setting) -> Path:
+        scenario = self.scenario(setting)
+        where = [scenario.find(scenario.sites.file, "sites.file")] if scenario.sites.file is not None else []
+        where += [scenario.find(s.points, f"site {s.site}: points") for s in sites.of(scenario) if s.points is not None]
+        read = {
+            "egvs": __version__,
+            "scenario": scenario.model_dump(mode="json"),
+            "statics": _module("statics").inputs(scenario, self._kept),
+            "traffic": _module("traffic").inputs(scenario, self._kept),
+            "sites": [tables.sha256_of(path) for path in where],
+        }
+        return self._kept / f"{tables.hash_of(read)[:16]}.json"
+
+    def _folder(self, name: str, key: str) -> Path:
+        return self._kept / "stages" / f"{name}-{key[:16]}"
+
+    @contextmanager
+    def _workshop(self) -> Iterator[Path]:
+        with tempfile.TemporaryDirectory(prefix=".work-", dir=self._kept) as folder:
+            yield Path(folder)
+
+
+def _module(name: str) -> ModuleType:
+    return importlib.import_module(f"pipeline.{name}")
+
+
+def _link(folder: Path, work: Path) -> None:
+    """Lay a stage's kept artefacts into a folder."""
+    for path in folder.iterdir():
+        if path.name != "cost.json":
+            (work / path.name).unlink(missing_ok=True)
+            _same(path, work / path.name)
+
+
+def _same(path: Path, other: Path) -> None:
+    """One file under two names (artefacts are never written into, only replaced); a copy where links are not to be had."""
+    try:
+        os.link(path, other)
+    except OSError:
+        shutil.copyfile(path, other)
+
+
+def _trial(scenario: Scenario, work: Path, keys: dict[str, str]) -> Trial:
+    table = tables.read(work / "scores.parquet", "scores")[0].to_pydict()
+    tpog, gamma = read_tpog(work / "tpog.parquet"), scenario.score.gamma
+    names, scores = table["site"], np.array(table["egvs"])
+    most = Field.of(tpog.counts, tpog.frames, tpog.grid).limit(1.0 if math.isinf(gamma) else gamma)
+    shares = scores / most if most > 0 else np.zeros(len(scores))
+    leave_out = LeaveOut.of(work / "tpog.parquet")
+    if leave_out is None:
+        unknown = [math.nan] * len(names)
+        return Trial(names, shares.tolist(), unknown, tpog.frames, scores.tolist(), unknown, unknown, math.nan, [], keys)
+    visibility = Visibility(scenario, work, tpog.grid)
+    left = np.array([leave_out.scores(visibility.hits(beams), gamma, visibility.unit) for beams in visibility.beams()])
+    limits = leave_out.limits(1.0 if math.isinf(gamma) else gamma)
+    raw = Estimate.of(left, leave_out.frames)
+    normal = Estimate.of(left / np.where(limits > 0, limits, 1.0), leave_out.frames)
+    return Trial(
+        names, shares.tolist(), normal.se.tolist(), tpog.frames, scores.tolist(), raw.se.tolist(), raw.bias.tolist(),
+        raw.quantile(), _neighbours(raw, names, tpog.frames), keys,
+    )  # fmt: skip
+
+
+def _neighbours(estimate: Estimate, names: list[str], frames: int) -> list[tuple[str, str, float, float]]:
+    ranked = order(estimate.scores)
+    chances = estimate.beats(ranked[:-1], ranked[1:])
+    found = []
+    for (a, b), chance in zip(pairwise(ranked.tolist()), chances.tolist(), strict=True):
+        found.append((names[a], names[b], chance, frames * estimate.times_needed(a, b)))
+    return found

@@ -1,0 +1,289 @@
+"""Does the accuracy study tell the truth about its settings, and does what it recommends hold?
+
+Evidence: settings that are run again by themselves, from the ``--set`` line that the study prints; plain twins of what is compared
+(tau from pairs, hits weighted up by hand); a study that is repeated, resumed and cut short. Seconds are never asserted.
+"""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pipeline
+from pipeline import accuracy, knobs, tables, trials
+from pipeline.accuracy import Study
+from pipeline.errors import RunError
+from pipeline.trials import Bench
+from pipeline.visibility import Visibility
+
+ROOT = Path(__file__).resolve().parent.parent
+MEASURED = {"seconds", "seconds_spread", "repeats", "statics_s", "scan_s", "traffic_s", "tpog_s", "score_s", "peak_mb"}
+RESTED = MEASURED | {"front", "recommended"}
+"""Columns that the clock has a say in."""
+
+
+@pytest.fixture
+def few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A study of a few settings."""
+    monkeypatch.setattr(knobs, "VOXELS_M", (1.0,))
+    monkeypatch.setattr(knobs, "GAMMAS", (2.0,))
+    monkeypatch.setattr(knobs, "PERIODS_S", (1.0,))
+    monkeypatch.setattr(accuracy, "REPEATS", 2)
+
+
+@pytest.fixture
+def junction(tmp_path: Path) -> Path:
+    """The shipped junction, shortened: SUMO runs in it."""
+    folder = tmp_path / "junction"
+    shutil.copytree(ROOT / "scenarios" / "nishishinjuku", folder)
+    text = (folder / "scenario.toml").read_text()
+    for long, short in (
+        ("frames = 5000", "frames = 200"),
+        ("warmup_s = 300", "warmup_s = 50"),
+        ("vehicles = 50", "vehicles = 20"),
+        ("voxel_m = 0.25", "voxel_m = 0.5"),
+    ):
+        assert long in text
+        text = text.replace(long, short)
+    (folder / "scenario.toml").write_text(text)
+    return folder
+
+
+def words(row: accuracy.Row) -> list[str]:
+    """The values after each ``--set``."""
+    return shlex.split(row.overrides)[1::2]
+
+
+def shares(path: Path, sets: list[str], out: Path, weight: float = 1.0) -> np.ndarray:
+    """Scores as shares of their limit, from an ordinary run."""
+    pipeline.run(pipeline.load(path, sets), out)
+    table = pipeline.read_scores(out / "scores.parquet")
+    return table["egvs"].to_numpy() / table["egvs_limit"].to_numpy()
+
+
+def test_study_of_a_finished_file(mini: Path, tmp_path: Path, few: None) -> None:
+    study = accuracy.study(mini, [], tmp_path / "out", budget_s=300)
+    names = [row.setting for row in study.rows]
+    assert names[0] == "scenario"
+    assert {"every 2nd azimuth", "every 4th azimuth", "every 2nd channel", "gamma 2", "voxel 1 m", "voxel 1 m, gamma 16"} <= set(
+        names
+    )
+    assert len(set(names)) == len(names)
+    assert not study.skipped
+    table, about = tables.read(tmp_path / "out" / "accuracy.parquet", "accuracy")
+    assert table["setting"].to_pylist() == names
+    assert about["reference_times"] == 1
+    assert (tmp_path / "out" / "accuracy.png").read_bytes()[:4] == b"\x89PNG"
+    assert all(row.repeats == 2 for row in study.rows)
+    own = study.rows[0]
+    assert (own.error, own.tau, own.regret, own.best_kept, own.best_three_kept) == (0.0, 1.0, 0.0, True, True)
+    recommended = [row for row in study.rows if row.recommended]
+    assert recommended == [study.best]
+    again = shares(mini, words(recommended[0]), tmp_path / "again")
+    against = shares(mini, [], tmp_path / "plain")
+    assert np.abs(again / against - 1).max() == pytest.approx(recommended[0].error, abs=1e-12)
+    assert recommended[0].error <= 0.02
+
+
+def test_recommended_setting_holds_where_sumo_runs(
+    junction: Path, tmp_path: Path, few: None, monkeypatch: pytest.MonkeyPatch, egvs
+) -> None:
+    monkeypatch.setattr(knobs, "FRAMES", (100,))
+    monkeypatch.setattr(knobs, "LONGER", (2, 4))
+    monkeypatch.setattr(knobs, "STEPS_S", (0.5,))
+    monkeypatch.setattr(knobs, "GRID_LONGER", (4,))
+    monkeypatch.setattr(knobs, "GRID_WATCHED_S", ((None, 1.0), (0.5, 1.0)))
+    monkeypatch.setattr(accuracy, "LONGEST", 8)
+    monkeypatch.setattr(accuracy, "REPEATS", 1)
+    code, printed, said = egvs("accuracy", junction, "--out", tmp_path / "out", "--budget", "10m", "--tolerance", 0.4, "--seeds", 2)
+    assert code == 0, said
+    rows = tables.read(tmp_path / "out" / "accuracy.parquet", "accuracy")[0].to_pylist()
+    longest, best = rows[1], next(row for row in rows if row["recommended"])
+    assert (longest["setting"], longest["overrides"]) == ("reference", "--set traffic.frames=1600")
+    assert f"{junction} {best['overrides']}".strip() in printed
+    assert "independent runs" in printed
+    assert "tell them apart" in printed
+    again = shares(junction, shlex.split(best["overrides"])[1::2], tmp_path / "again")
+    against = shares(junction, ["traffic.frames=1600"], tmp_path / "against")
+    assert np.abs(again / against - 1).max() == pytest.approx(best["error"], abs=1e-12)
+    assert max(best["error"], best["error_se"]) <= 0.4
+    longer, short = (next(r for r in rows if r["setting"] == name) for name in ("800 frames", "100 frames"))
+    assert longer["error_se"] < short["error_se"]
+
+
+def compared(study: Study) -> list[tuple[object, ...]]:
+    names = [f for f in accuracy.Row.__dataclass_fields__ if f not in RESTED]
+    return sorted(tuple(getattr(row, name) for name in names) for row in study.rows)
+
+
+def test_errors_are_deterministic_and_a_study_is_resumed(
+    mini: Path, tmp_path: Path, few: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = accuracy.study(mini, [], tmp_path / "one", jobs=1)
+    other = accuracy.study(mini, [], tmp_path / "other", jobs=2)
+    assert compared(one) == compared(other)
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("a stage ran again")
+
+    monkeypatch.setattr(Bench, "_measure", refuse)
+    monkeypatch.setattr(Bench, "warm_up", refuse)
+    assert accuracy.study(mini, [], tmp_path / "one").rows == one.rows
+
+
+def test_an_interrupted_study_goes_on(mini: Path, tmp_path: Path, few: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = accuracy.study(mini, [], tmp_path / "whole")
+    run, done = Bench.run, []
+
+    def tired(bench: Bench, setting: knobs.Setting) -> trials.Trial:
+        if len(done) == 3:
+            raise KeyboardInterrupt
+        done.append(setting.name)
+        return run(bench, setting)
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(Bench, "run", tired)
+        accuracy.study(mini, [], tmp_path / "out")
+    told: list[tuple[str, str]] = []
+    rest = accuracy.study(mini, [], tmp_path / "out", told=lambda name, state, _: told.append((name, state)))
+    assert [name for name, state in told if state == "kept"] == done
+    assert compared(rest) == compared(whole)
+    assert not list((tmp_path / "out" / "accuracy").glob(".work-*"))
+
+
+def test_a_budget_leaves_settings_out_and_names_them(mini: Path, tmp_path: Path, egvs) -> None:
+    code, printed, said = egvs("accuracy", mini, "--out", tmp_path / "out", "--budget", "0.001s")
+    assert code == 0, said
+    assert "skipped: voxel 1 m" in printed
+    rows = tables.read(tmp_path / "out" / "accuracy.parquet", "accuracy")[0].to_pylist()
+    assert [row["setting"] for row in rows] == ["scenario"]
+
+
+def test_a_setting_that_fails_is_named_and_the_rest_goes_on(
+    mini: Path, tmp_path: Path, few: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(knobs, "LONGER", (2,))
+    own = knobs._watched
+    monkeypatch.setattr(
+        knobs, "_watched", lambda s: [knobs.Setting("80 frames", "approximates", "frames", ("traffic.frames=80",)), *own(s)]
+    )
+    study = accuracy.study(mini, [], tmp_path / "out")
+    assert "80" in study.skipped["80 frames"]
+    assert len(study.rows) > 5
+
+
+def test_a_repeat_that_writes_other_bytes_is_an_error(mini: Path, tmp_path: Path) -> None:
+    bench = Bench(mini, [], tmp_path, 1, lambda *_: None)
+    own = knobs.Setting("scenario", "scenario", "")
+    trial = bench.run(own)
+    cost = tmp_path / "accuracy" / "stages" / f"tpog-{trial.stages['tpog'][:16]}" / "cost.json"
+    cost.write_text(cost.read_text().replace('"tpog.parquet": "', '"tpog.parquet": "0'))
+    with pytest.raises(RunError, match="other bytes"):
+        bench.again("tpog", own, trial)
+
+
+def test_thinned_beams_score_as_if_each_counted_twice(mini: Path, tmp_path: Path) -> None:
+    thin = next(s for s in knobs.settings(pipeline.load(mini)) if s.name == "every 2nd azimuth")
+    scenario = pipeline.load(mini, thin.overrides)
+    found = shares(mini, list(thin.overrides), tmp_path / "out")
+    tpog = pipeline.read_tpog(tmp_path / "out" / "tpog.parquet")
+    p = tpog.p.ravel()
+    with np.errstate(divide="ignore", invalid="ignore"):
+        entropy = np.nan_to_num(-(p * np.log2(p) + (1 - p) * np.log2(1 - p)))
+    visibility = Visibility(scenario, tmp_path / "out", tpog.grid)
+    for share, beams in zip(found, visibility.beams(), strict=True):
+        twice = np.minimum(4.0, 2.0 * visibility.hits(beams))
+        assert share == pytest.approx((entropy * twice).sum() / (4.0 * entropy.sum()), rel=1e-12)
+
+
+@pytest.mark.parametrize("sensor", ["VLP-32C", "OS1-64"])
+def test_a_thinned_catalogue_sensor_has_the_beams_of_the_whole_one(mini: Path, sensor: str) -> None:
+    from pipeline.sensors import CATALOGUE, resolve
+
+    whole = CATALOGUE[sensor]
+    for setting in knobs.settings(pipeline.load(mini, [f"sites.sensor={sensor}"])):
+        if setting.knob not in ("azimuth", "channels"):
+            continue
+        thin = resolve(sensor, pipeline.load(mini, [f"sites.sensor={sensor}", *setting.overrides]).sensors, "")
+        assert thin.beams * setting.weight == whole.beams
+        every = {tuple(ray) for ray in whole.directions(30.0).tolist()}
+        assert {tuple(ray) for ray in thin.directions(30.0).tolist()} <= every
+
+
+def test_effects_have_lines_of_their_own(mini: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    from pipeline.effects.rain import Rain
+
+    monkeypatch.setattr(Rain, "QUALITY", {"rate_mm_h": (1.0, 5.0, 20.0)}, raising=False)
+    sets = ["effects.rain.rate_mm_h=5.0"]
+    found = {s.name: s for s in knobs.settings(pipeline.load(mini, sets))}
+    assert found["without rain"].kind == knobs.MEASURES
+    assert found["rain rate_mm_h 20.0"].beside == knobs.SCENARIO
+    assert found["rain rate_mm_h 1.0"].beside == "rain rate_mm_h 20.0"
+    assert "rain rate_mm_h 5.0" not in found
+    bench = Bench(mini, sets, tmp_path / "out", 1, lambda *_: None)
+    bare = bench.run(found["without rain"])
+    assert bare.shares == pytest.approx(shares(mini, [], tmp_path / "plain"))
+
+
+def test_a_site_with_a_measured_scan_is_not_thinned(mini: Path) -> None:
+    (mini / "points.csv").write_text("x_m,y_m,z_m\n12,5,0.5\n")
+    (mini / "sites.csv").write_text("site,x_m,y_m,z_m,points\npole_a,10,12,3,points.csv\npole_b,30.5,-12,3,\n")
+    assert not {"azimuth", "channels"} & {s.knob for s in knobs.settings(pipeline.load(mini))}
+
+
+@pytest.mark.parametrize("name", ["nishishinjuku", "ingolstadt"])
+def test_settings_are_sound_scenarios(name: str) -> None:
+    folder = ROOT / "scenarios" / name
+    found = knobs.settings(pipeline.load(folder))
+    assert len({s.name for s in found}) == len(found)
+    for setting in found:
+        assert pipeline.load(folder, setting.overrides)
+        assert setting.beside in {s.name for s in found}
+
+
+def test_comparisons_with_ties() -> None:
+    a, b = np.array([3.0, 3.0, 1.0, 2.0]), np.array([4.0, 3.0, 1.0, 2.0])
+    pairs = [(i, j) for i in range(4) for j in range(i)]
+    signs = [(np.sign(a[i] - a[j]), np.sign(b[i] - b[j])) for i, j in pairs]
+    agree = sum(x * y for x, y in signs) / np.sqrt(sum(x != 0 for x, _ in signs) * sum(y != 0 for _, y in signs))
+    assert accuracy.agreement(a, b, "tau") == pytest.approx(agree)
+    assert accuracy.agreement(np.ones(3), np.ones(3), "rho") == 1.0
+    assert accuracy.agreement(np.ones(4), b, "tau") == 0.0
+    assert accuracy.best(a, 1) == {0, 1}
+    assert accuracy.best(b, 3) == {0, 1, 3}
+    assert accuracy.regret(a, b) == pytest.approx(0.25)  # of two that tie, the worse
+    assert accuracy.regret(b, a) == 0.0
+    assert accuracy.relative(np.array([0.0, 1.0]), np.array([0.0, 0.0])).tolist() == [0.0, np.inf]
+
+
+def test_front_holds_no_setting_that_another_beats(mini: Path, tmp_path: Path, few: None) -> None:
+    rows = [row for row in accuracy.study(mini, [], tmp_path / "out").rows if row.kind in ("approximates", "scenario")]
+    for row in rows:
+        beaten = any(
+            other.seconds <= row.seconds
+            and other.judged <= row.judged
+            and (other.seconds, other.judged) != (row.seconds, row.judged)
+            for other in rows
+        )
+        assert row.front != beaten
+
+
+BAD = {
+    ("--tolerance", "0"): "--tolerance: 0",
+    ("--budget", "soon"): "--budget: 'soon'",
+    ("--budget", "-3s"): "--budget: '-3s'",
+    ("--budget", ""): "--budget: ''",
+    ("--set", "roi.voxel_m=0.3"): "voxel",
+}
+
+
+@pytest.mark.parametrize(("words", "message"), BAD.items(), ids=[" ".join(words) for words in BAD])
+def test_wrong_input_is_answered_in_words(mini: Path, tmp_path: Path, egvs, words: tuple[str, str], message: str) -> None:
+    code, printed, said = egvs("accuracy", mini, "--out", tmp_path / "out", *words)
+    assert code == 2
+    assert message in said
+    assert "Traceback" not in said + printed
