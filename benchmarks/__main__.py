@@ -1,7 +1,7 @@
 """How fast is it, measured against what it must reach?
 
-``make bench`` runs everything here on the shipped junction and prints ratios from this one run: machines differ and are noisy, ratios
-less so. Kernels are compiled before anything is timed; repeats of what is compared are interleaved; medians are shown.
+``make bench`` runs everything here on the shipped junction and prints ratios from this one run: machines differ and are noisy,
+ratios less so. Kernels are compiled before anything is timed; repeats of what is compared are interleaved; medians are shown.
 """
 
 from __future__ import annotations

@@ -1,18 +1,43 @@
 """Where do the pictures in README and docs come from?
 
-From the report of the shipped junction: ``make pictures`` runs the scenario and takes the figures out of the page.
+``make pictures`` runs the shipped scenarios and draws: the map of the README, taken from the report, and for each effect what the
+score (or, where an effect changes traffic, the occupancy) looks like from above before and after, on one colour scale.
 """
 
 from __future__ import annotations
 
 import re
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 import pipeline
-from pipeline import figures
+from pipeline import effects, figures, workflow
+from pipeline.entropy import Field
+from pipeline.results import read_scores, read_tpog
+from pipeline.scenario import Scenario
+from pipeline.visibility import hits_of
+from pipeline.world import read_ply
 
 ROOT = Path(__file__).resolve().parent.parent
+IMAGES = ROOT / "docs" / "images"
+
+# effect -> scenario, parameters, site: strong enough to see
+SHOWN: dict[str, tuple[str, dict[str, Any], str]] = {
+    "range_limit": ("nishishinjuku", {"reflectivity": 0.02}, "c08"),
+    "rain": ("nishishinjuku", {"rate_mm_h": 60}, "c08"),
+    "fog": ("nishishinjuku", {"visibility_m": 150}, "c08"),
+    "dropout": ("nishishinjuku", {"share": 0.5}, "c08"),
+    "moving_occlusion": ("nishishinjuku", {}, "c08"),
+    "divergence": ("nishishinjuku", {"sub_beams": 7, "divergence_mrad": [12.0, 12.0]}, "c08"),
+    "mount_sway": ("nishishinjuku", {"tilt_deg": 1.0}, "c08"),
+    "foliage": ("nishishinjuku", {"leaf_area_density": 0.5}, "c12"),
+    "articulated": ("hill", {}, ""),
+    "pedestrians_bicycles": ("hill", {}, ""),
+}
 
 
 def figure(page: str, label: str) -> str:
@@ -21,12 +46,54 @@ def figure(page: str, label: str) -> str:
     return figures.standalone(found)
 
 
+def seen(scenario: Scenario, out: Path, site: str) -> tuple[np.ndarray, np.ndarray]:
+    """Score of each column of voxels, bits (nx, ny), or its mean occupied voxels where no site is named; voxels that beams cross."""
+    tpog = read_tpog(out / "tpog.parquet")
+    if not site:
+        return tpog.p.sum(axis=2), np.ones(tpog.grid.shape, dtype=np.bool_)
+    field = Field.of(tpog.counts, tpog.frames, tpog.grid)
+    _, hits = next(hits_of(scenario, out, tpog.grid, [site]))
+    worth = field.per_cell_bit * np.minimum(hits.ravel()[field.cells], scenario.score.gamma)
+    nx, ny, nz = tpog.grid.shape
+    return np.bincount(field.cells // nz, weights=worth, minlength=nx * ny).reshape(nx, ny), hits > 0
+
+
+def before_and_after(name: str, folder: Path) -> Iterator[tuple[str, str]]:
+    """File names and figures of one effect."""
+    where, parameters, site = SHOWN[name]
+    base = pipeline.load(ROOT / "scenarios" / where)
+    own = dict(base.effects.get(name, {})) | parameters
+    found = []
+    for word, named in (("before", {}), ("after", {name: own})):
+        scenario, out = base.with_effects(named), folder / where / (word if named else "plain") / (name if named else "")
+        workflow.run(scenario, out)
+        found.append((word, *seen(scenario, out, site)))
+    tpog = read_tpog(out / "tpog.parquet")
+    rows = read_scores(out / "scores.parquet").to_pylist()
+    row = next(r for r in rows if r["site"] == (site or rows[0]["site"]))
+    spot = figures.Spot(*(row[key] for key in ("site", "x_m", "y_m", "z_m", "egvs", "rank")))
+    box = figures.extent(tpog.grid, [spot])
+    layers = figures.footprints(read_ply(out / "statics.ply")[0], box)
+    peak = max(float(field.max()) for _, field, _ in found)
+    for word, field, crossed in found:
+        stand = figures.Stand(spot, crossed, layers, box)
+        what = f"score of site {site} by column" if site else "mean occupied voxels by column"
+        alt = f"{name}, {word}: {what}, from above, 0 to {peak:.3g}"
+        yield f"{name}-{word}.svg", figures.standalone(figures.view(tpog.grid, field, peak, stand, f"{name}-{word}", alt))
+
+
 def main() -> None:
-    """Draw the picture of the README."""
-    with tempfile.TemporaryDirectory() as folder:
-        pipeline.run(pipeline.load(ROOT / "scenarios" / "nishishinjuku"), folder)
-        page = (Path(folder) / "report.html").read_text(encoding="utf-8")
-    (ROOT / "docs" / "images" / "nishishinjuku.svg").write_text(figure(page, "Map of"), encoding="utf-8")
+    """Draw the picture of the README and those of the effects."""
+    assert set(SHOWN) == set(effects.KINDS) - {effects.SELF_ACTING}  # the slope cannot be left out where there is one
+    (IMAGES / "effects").mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        pipeline.run(pipeline.load(ROOT / "scenarios" / "nishishinjuku"), folder / "report")
+        page = (folder / "report" / "report.html").read_text(encoding="utf-8")
+        (IMAGES / "nishishinjuku.svg").write_text(figure(page, "Map of"), encoding="utf-8")
+        for name in SHOWN:
+            for file, drawn in before_and_after(name, folder):
+                (IMAGES / "effects" / file).write_text(drawn, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -195,17 +195,17 @@ def _shortest(settings: list[Setting]) -> Setting:
 
 
 def _times(bench: Bench, scenario: Scenario, trial: Trial, budget_s: float) -> int:
-    """How long the reference watches: a power of two that fits a share of the budget; as before, when a study goes on."""
+    """How long the reference watches: a power of two that fits a share of the budget; as before, when a study is repeated."""
     if scenario.traffic.fcd is not None:
         return 1
     kept = bench.note("study")
-    if kept.get("scenario") == trial.stages:
+    if (kept.get("scenario"), kept.get("budget_s")) == (trial.stages, budget_s):
         return int(kept["times"])
     once_s = sum(min(bench.spent(name, trial.stages[name]).seconds) for name in ("traffic", "tpog"))
     times = LONGEST
     while times > 1 and times * once_s > SHARE * budget_s:
         times //= 2
-    bench.keep_note("study", {"scenario": trial.stages, "times": times})
+    bench.keep_note("study", {"scenario": trial.stages, "budget_s": budget_s, "times": times})
     return times
 
 

@@ -25,14 +25,14 @@ from pipeline.sensors import Sensor, resolve
 APPROXIMATES, MEASURES, REFERENCE, SCENARIO = "approximates", "measures", "reference", "scenario"
 
 FRAMES = (250, 500, 1000, 2500)
-LONGER = (2, 4, 8, 16)
+LONGER = (2, 4, 8)
 """Times the scenario's own traffic."""
 PERIODS_S = (0.5, 1.0, 2.0)
 STEPS_S = (0.05, 0.1, 0.5, 1.0)
 THINNED = (2, 4)
 VOXELS_M = (1.0, 0.5, 0.25, 0.125)
 GAMMAS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
-GRID_LONGER, GRID_WATCHED_S = (1, 4, 16), ((None, None), (None, 1.0), (0.5, 0.5), (0.5, 1.0), (1.0, 1.0))
+GRID_LONGER, GRID_WATCHED_S = (1, 4, 8, 16), ((None, None), (None, 1.0), (0.5, 1.0), (1.0, 1.0))
 """The grid: lengths of the traffic, and pairs of SUMO step and frame period (None: the scenario's)."""
 
 

@@ -1,8 +1,9 @@
 """How does one see what accuracy costs?
 
-Two panels that share the axis of seconds: on the left the settings that approximate the scenario's number, by their error, with the
-front of those that no other beats in both; on the right those that measure something else, by how far their ranking agrees with the
-scenario's. Knobs are told apart by shape as well as by colour (Okabe and Ito's palette), and nothing depends on colour alone.
+Two panels: on the left the settings that approximate the scenario's number, seconds against error, with the front of those that no
+other beats in both; on the right those that measure something else, by how far their ranking agrees with the scenario's, with the
+regret and the seconds beside. Knobs are told apart by shape as well as by colour (Okabe and Ito's palette); nothing depends on
+colour alone, and the figure is readable in grey.
 """
 
 from __future__ import annotations
@@ -40,14 +41,15 @@ def draw(points: Sequence[Point], tolerance: float, title: str, path: Path) -> N
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11.0, 5.6), layout="constrained")
+    others = sorted((p for p in points if p.kind == "measures"), key=lambda p: (p.tau, -p.regret, -p.seconds))
+    figure = Figure(figsize=(13.0, max(5.6, 1.6 + 0.24 * len(others))), layout="constrained")
     FigureCanvasAgg(figure)
-    left, right = figure.subplots(1, 2, sharex=True)
+    left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     _approximations(left, [p for p in points if p.kind in ("approximates", "scenario")], tolerance)
-    _others(right, [p for p in points if p.kind in ("measures", "scenario")])
+    _others(right, others)
     figure.suptitle(f"What accuracy costs in time: {title}", fontsize=12)
     with tables.aside(path) as partial:
-        figure.savefig(partial, dpi=160, format="png", metadata={"Software": None})
+        figure.savefig(partial, dpi=150, format="png", metadata={"Software": None})
 
 
 def _styles(points: Sequence[Point]) -> dict[str, tuple[str, str]]:
@@ -57,56 +59,78 @@ def _styles(points: Sequence[Point]) -> dict[str, tuple[str, str]]:
 
 def _approximations(axes: Any, points: Sequence[Point], tolerance: float) -> None:
     """Seconds against error, with the front."""
-    axes.set(xscale="log", yscale="log", xlabel="seconds, all stages", ylabel="error of the scores, %")
+    axes.set(xscale="log", yscale="log", xlabel="seconds, all stages", ylabel="error of the scores (or its standard error), %")
     axes.set_title("Settings that approximate the same number", fontsize=10)
+    _plain_ticks(axes)
     axes.axhline(100 * tolerance, color="0.4", linewidth=1, linestyle="--")
     axes.annotate(
-        f"asked for: {100 * tolerance:g} %", (0.99, 100 * tolerance), xycoords=("axes fraction", "data"), xytext=(0, 3),
-        textcoords="offset points", ha="right", fontsize=8, color="0.25",
+        f"asked for: {100 * tolerance:g} %", (0.01, 100 * tolerance), xycoords=("axes fraction", "data"), xytext=(0, 3),
+        textcoords="offset points", fontsize=8, color="0.25",
     )  # fmt: skip
     front = sorted((p for p in points if p.front), key=lambda p: p.seconds)
     axes.step([p.seconds for p in front], [_percent(p) for p in front], where="post", color="0.35", linewidth=1.2, zorder=1)
-    _scatter(axes, points, _percent)
-    for p in front:
-        if not p.recommended and p.kind != "scenario":
-            _name(axes, p, _percent(p), p.name, (4, 4))
+    _scatter(axes, points)
     for p in points:
         if p.recommended:
             axes.scatter([p.seconds], [_percent(p)], s=230, facecolors="none", edgecolors="black", linewidths=1.6, zorder=4)
-            _name(axes, p, _percent(p), f"recommended: {p.name}", (-8, -16), "right")
-    axes.legend(fontsize=8, loc="lower left", framealpha=0.9)
+    slow = max((p.seconds for p in points), default=1.0) / 4
+    for p in points:
+        if (p.front or p.recommended) and p.kind != "scenario":
+            text = f"recommended: {p.name}" if p.recommended else p.name
+            _name(axes, p, text, "right" if p.seconds > slow else "left")
+    axes.margins(x=0.08, y=0.12)
+    axes.legend(fontsize=8, loc="upper right", framealpha=0.9, title="knob", title_fontsize=8)
 
 
-def _others(axes: Any, points: Sequence[Point]) -> None:
-    """Seconds against the agreement of the ranking, the regret beside each point where there is any."""
-    axes.set(xscale="log", xlabel="seconds, all stages", ylabel="Kendall's tau with the scenario's ranking")
-    axes.set_title("Settings that measure something else (same traffic)", fontsize=10)
-    _scatter(axes, points, lambda p: p.tau)
-    for number, p in enumerate(sorted(points, key=lambda p: (p.tau, p.seconds))):
-        if p.kind != "scenario":
-            lost = f" (loses {p.regret:.1%})" if p.regret > 0.0005 else ""
-            _name(axes, p, p.tau, p.name + lost, (6, 4) if number % 2 else (6, -9))
-    axes.legend(fontsize=8, loc="lower right", framealpha=0.9)
-    axes.margins(x=0.2, y=0.12)
+def _plain_ticks(axes: Any) -> None:
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_formatter(NullFormatter())
 
 
-def _scatter(axes: Any, points: Sequence[Point], height: Any) -> None:
+def _scatter(axes: Any, points: Sequence[Point]) -> None:
     for knob, (colour, shape) in _styles(points).items():
         mine = [p for p in points if p.knob == knob and p.kind != "scenario"]
-        x, y = [p.seconds for p in mine], [height(p) for p in mine]
+        x, y = [p.seconds for p in mine], [_percent(p) for p in mine]
         axes.scatter(x, y, s=46, marker=shape, facecolors=colour, edgecolors="black", linewidths=0.6, label=knob, zorder=3)
     own = [p for p in points if p.kind == "scenario"]
     axes.scatter(
-        [p.seconds for p in own], [height(p) for p in own], s=210, marker="*", facecolors="#F0E442", edgecolors="black",
+        [p.seconds for p in own], [_percent(p) for p in own], s=210, marker="*", facecolors="#F0E442", edgecolors="black",
         linewidths=1.0, label="the scenario's own setting", zorder=5,
     )  # fmt: skip
     axes.grid(True, which="major", color="0.88", linewidth=0.7)
     axes.tick_params(labelsize=8)
 
 
+def _others(axes: Any, points: Sequence[Point]) -> None:
+    """One line a setting: the agreement of its ranking, its regret and its seconds."""
+    axes.set(xlabel="Kendall's tau with the scenario's ranking (1: the same)")
+    axes.set_title("Settings that measure something else", fontsize=10)
+    styles = _styles(points)
+    for line, p in enumerate(points):
+        colour, shape = styles[p.knob]
+        axes.scatter([p.tau], [line], s=46, marker=shape, facecolors=colour, edgecolors="black", linewidths=0.6, zorder=3)
+        regret = "same best site" if p.regret == 0 else f"regret {p.regret:.2%}"
+        axes.annotate(
+            f"{regret}, {p.seconds:.2g} s", (1.02, line), xycoords=("axes fraction", "data"), va="center", fontsize=8,
+            annotation_clip=False,
+        )  # fmt: skip
+    axes.set_yticks(range(len(points)), [p.name for p in points], fontsize=8)
+    axes.grid(True, axis="both", color="0.88", linewidth=0.7)
+    axes.tick_params(labelsize=8)
+    axes.set_xlim(right=1.03)
+
+
 def _percent(point: Point) -> float:
     return 100 * max(point.error, _LEAST)
 
 
-def _name(axes: Any, point: Point, height: float, text: str, offset: tuple[int, int], align: str = "left") -> None:
-    axes.annotate(text, (point.seconds, height), xytext=offset, textcoords="offset points", fontsize=7, ha=align, zorder=6)
+def _name(axes: Any, point: Point, text: str, align: str) -> None:
+    offset = (6 if align == "left" else -9, -11)
+    axes.annotate(
+        text, (point.seconds, _percent(point)), xytext=offset, textcoords="offset points", fontsize=7.5, ha=align, zorder=6,
+        bbox={"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.75},
+    )  # fmt: skip

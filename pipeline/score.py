@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from pipeline import survey, tables, uncertainty, visibility
 from pipeline.entropy import Field, Score
+from pipeline.grid import Grid
 from pipeline.kernels import march
 from pipeline.ordered import in_order
-from pipeline.grid import Grid
 from pipeline.results import read_tpog
 from pipeline.scenario import Scenario
 from pipeline.stage import Progress, metadata, silent, threads

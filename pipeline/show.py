@@ -192,13 +192,16 @@ def summary(folder: Path, found: dict[str, Any]) -> None:
 
 def accuracy(study: Study, scenario: str) -> None:
     """What the study found: two tables, what was left out, the recommendation."""
-    console = Console(width=None if sys.stdout.isatty() else 160, highlight=False, soft_wrap=True)
+    console = Console(width=None if sys.stdout.isatty() else 175, highlight=False, soft_wrap=True)
     same = [row for row in study.rows if row.kind != "measures"]
-    other = [row for row in study.rows if row.kind in ("measures", "scenario")]
-    long = f"traffic {study.times} times as long" if study.times > 1 else "the scenario itself: nothing longer is to be had"
+    other = [row for row in study.rows if row.kind == "measures"]
+    long = "the scenario itself: nothing longer is to be had, or not within the budget"
+    for row in same:
+        if row.kind == "reference":
+            long = f"traffic {study.times} times as long, itself known to {row.error_se:.2%} (its largest standard error)"
     console.print(_settings("settings that approximate the same number, against the reference", same, True))
     console.print(f"reference: {long}. * on the front of time and error, = recommended\n", markup=False)
-    if len(other) > 1:
+    if other:
         console.print(_settings("settings that measure something else, against the scenario on the same traffic", other, False))
     for name, why in study.skipped.items():
         console.print(f"skipped: {name}: {why}", markup=False)
@@ -213,18 +216,17 @@ def accuracy(study: Study, scenario: str) -> None:
 
 def _settings(title: str, rows: Sequence[Row], errors: bool) -> Table:
     table = Table(box=None, pad_edge=False, title=title, title_justify="left")
-    names = ["", "setting", "knob", "seconds", "+-", "n", "traffic", "tpog", "scan", "score", "peak MB", "MB"]
+    names = ["", "setting", "seconds", "+-", "traffic", "tpog", "scan", "score", "peak MB", "MB"]
     names += ["error", "std error", "own change"] if errors else []
-    for name in (*names, "tau", "rho", "best", "three", "regret"):
-        left = name in ("", "setting", "knob")
-        table.add_column(name, justify="left" if left else "right", no_wrap=True)
+    for name in (*names, "tau", "rho", "kept", "regret"):
+        table.add_column(name, justify="left" if name in ("", "setting") else "right", no_wrap=name != "setting")
     for r in rows:
         parts = [f"{r.error:.2%}", f"{r.error_se:.2%}", f"{r.own_change:.2%}"] if errors else []
+        kept = ", ".join(["best"] * r.best_kept + ["three"] * r.best_three_kept) or "-"
         table.add_row(
-            "*" * r.front + "=" * r.recommended, r.setting, r.knob, f"{r.seconds:.2f}", f"{r.seconds_spread:.2f}", str(r.repeats),
-            f"{r.traffic_s:.2f}", f"{r.tpog_s:.2f}", f"{r.scan_s:.2f}", f"{r.score_s:.2f}", f"{r.peak_mb:.0f}",
-            f"{r.bytes / 1e6:.1f}", *parts, f"{r.tau:.3f}", f"{r.rho:.3f}",
-            "kept" if r.best_kept else "other", "kept" if r.best_three_kept else "other", f"{r.regret:.2%}",
+            "*" * r.front + "=" * r.recommended, r.setting, f"{r.seconds:.2f}", f"{r.seconds_spread:.2f}", f"{r.traffic_s:.2f}",
+            f"{r.tpog_s:.2f}", f"{r.scan_s:.2f}", f"{r.score_s:.2f}", f"{r.peak_mb:.0f}", f"{r.bytes / 1e6:.1f}", *parts,
+            f"{r.tau:.3f}", f"{r.rho:.3f}", kept, f"{r.regret:.2%}",
         )  # fmt: skip
     return table
 

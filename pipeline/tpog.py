@@ -5,8 +5,8 @@ frames in which a box shrunk by 0.1 mm shares positive volume with a voxel; leav
 write the sparse counts as ``tpog.parquet``.
 
 The Traffic Probabilistic Occupancy Grid (arXiv 2504.06772, section III) is :math:`p(v) = c(v) / T`, with :math:`c(v)` the sum of
-counts over blocks and :math:`T` the number of frames. Blocks are consecutive and of equal length; counts of several TPOGs on one grid
-add up. A voxel that static geometry fills has p = 1 and so no entropy; it is left out.
+counts over blocks and :math:`T` the number of frames. Blocks are consecutive and of equal length; counts of several TPOGs on one
+grid add up. A voxel that static geometry fills has p = 1 and so no entropy; it is left out.
 
 Memory holds one block's counters and one batch of frames, however many frames there are.
 """

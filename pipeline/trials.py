@@ -123,7 +123,7 @@ class Bench:
                 if not (self._folder(name, keys[name]) / "cost.json").is_file():
                     self._measure(name, keys[name], scenario, work)
                 _link(self._folder(name, keys[name]), work)
-            trial = _trial(scenario, work, keys)
+            trial = _trial(scenario, work, keys, setting.weight)
         kept = {"setting": setting.name, "overrides": setting.overrides, "trial": trial.__dict__}
         tables.write_text(self._result(setting), json.dumps(kept, indent=1) + "\n")
         return trial
@@ -234,11 +234,12 @@ def _same(path: Path, other: Path) -> None:
         shutil.copyfile(path, other)
 
 
-def _trial(scenario: Scenario, work: Path, keys: dict[str, str]) -> Trial:
+def _trial(scenario: Scenario, work: Path, keys: dict[str, str], weight: float) -> Trial:
     table = tables.read(work / "scores.parquet", "scores")[0].to_pydict()
     tpog, gamma = read_tpog(work / "tpog.parquet"), scenario.score.gamma
     names, scores = table["site"], np.array(table["egvs"])
-    most = Field.of(tpog.counts, tpog.frames, tpog.grid).limit(1.0 if math.isinf(gamma) else gamma)
+    unit = 1.0 / weight if math.isinf(gamma) else gamma  # a finite gamma is divided by the weight already
+    most = Field.of(tpog.counts, tpog.frames, tpog.grid).limit(unit)
     shares = scores / most if most > 0 else np.zeros(len(scores))
     leave_out = LeaveOut.of(work / "tpog.parquet")
     if leave_out is None:
@@ -246,7 +247,7 @@ def _trial(scenario: Scenario, work: Path, keys: dict[str, str]) -> Trial:
         return Trial(names, shares.tolist(), unknown, tpog.frames, scores.tolist(), unknown, unknown, math.nan, [], keys)
     visibility = Visibility(scenario, work, tpog.grid)
     left = np.array([leave_out.scores(visibility.hits(beams), gamma, visibility.unit) for beams in visibility.beams()])
-    limits = leave_out.limits(1.0 if math.isinf(gamma) else gamma)
+    limits = leave_out.limits(unit)
     raw = Estimate.of(left, leave_out.frames)
     normal = Estimate.of(left / np.where(limits > 0, limits, 1.0), leave_out.frames)
     return Trial(

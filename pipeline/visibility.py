@@ -1,8 +1,8 @@
 """How many beams of a site cross each voxel?
 
 Steps: take the site's empty scan from ``scans.parquet`` (with ``scan.keep = false``: cast it instead), move it into the grid's
-frame in float64, march every beam, count. Where the scan has weighted pieces, or effects of the score stage are named, the crossings are
-listed, weighted, and added up in whole multiples of 2**-32 instead.
+frame in float64, march every beam, count. Where the scan's rows are shares of beams, or effects of the score stage act, the
+crossings are listed, weighted, and added up in whole multiples of 2**-32 instead.
 """
 
 from __future__ import annotations
@@ -27,6 +27,9 @@ if TYPE_CHECKING:
     from pipeline.effects import Effect
 
 Hits = NDArray[np.uint32] | NDArray[np.int64]
+
+FARTHEST_M = 2e7
+"""From further away, float64 cannot tell whether a chord is longer than 1 micrometre."""
 
 UNIT = 2**32
 """What a whole beam adds to a voxel where beams are weighted: weights are rounded to whole multiples of 2**-32."""
@@ -96,8 +99,8 @@ class Visibility:
 
     def _add_weighted(self, beams: Beams, hits: Hits) -> None:
         from pipeline import crossings, sensors
-        from pipeline.kernels.crossings import accumulate
         from pipeline.effects import Detect, TransmitScore
+        from pipeline.kernels.crossings import accumulate
 
         sensor = sensors.resolve(beams.site["sensor"], self._scenario.sensors, f"site {beams.site['site']}")
         for found in crossings.listed(beams.site, beams.ends_m, self._grid):
@@ -121,11 +124,15 @@ def in_voxels(beams: Beams, grid: Grid) -> tuple[NDArray[np.float64], NDArray[np
     """Sensor (3,), beams (n, 3) and shape (3,) as :mod:`pipeline.kernels.march` wants them; InputError for what no grid holds."""
     place = f"scans.parquet: site {beams.site['site']}"
     position_m = np.array([beams.site["x_m"], beams.site["y_m"], beams.site["z_m"]])
-    o, d = grid.to_grid_m(position_m) / grid.voxel_m, beams.ends_m / grid.voxel_m
+    o_m, ends_m = grid.to_grid_m(position_m), beams.ends_m
+    with np.errstate(over="ignore"):
+        o, d = o_m / grid.voxel_m, ends_m / grid.voxel_m
     if not (np.isfinite(o).all() and np.isfinite(d).all()):
         raise InputError(place, "a beam with an end that is no number", "finite metres")
-    if len(d) > np.iinfo(np.uint32).max:
-        raise InputError(place, f"{len(d)} beams", "fewer than 2**32")
+    if np.abs(o_m).max() > FARTHEST_M:
+        raise InputError(place, f"stands {np.abs(o_m).max():g} m from the grid", f"within {FARTHEST_M:g} m")
+    if len(ends_m) > np.iinfo(np.uint32).max:
+        raise InputError(place, f"{len(ends_m)} beams", "fewer than 2**32")
     return o, d, np.asarray(grid.shape, dtype=np.int64)
 
 

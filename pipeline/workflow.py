@@ -166,13 +166,12 @@ def verify(
     return wrong
 
 
-def _differences(name: str, record: dict[str, Any], again: dict[str, Any]) -> list[str]:
+def _differences(name: str, record: dict[str, Any], again: dict[str, Any]) -> Iterator[str]:
     before, after = record["stages"][name]["artefacts"], again["stages"][name]["artefacts"]
-    return [
-        f"{artefact} differs from what the run made: {before.get(artefact, 'absent')[:12]} then, {after.get(artefact, 'absent')[:12]} now"
-        for artefact in sorted(before.keys() | after.keys())
-        if before.get(artefact) != after.get(artefact)
-    ]
+    for artefact in sorted(before.keys() | after.keys()):
+        then, now = (digests.get(artefact, "absent")[:12] for digests in (before, after))
+        if then != now:
+            yield f"{artefact} differs from what the run made: {then} then, {now} now"
 
 
 def _altered(folder: Path, record: dict[str, Any]) -> Iterator[str]:

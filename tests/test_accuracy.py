@@ -200,6 +200,13 @@ def test_thinned_beams_score_as_if_each_counted_twice(mini: Path, tmp_path: Path
         assert share == pytest.approx((entropy * twice).sum() / (4.0 * entropy.sum()), rel=1e-12)
 
 
+def test_thinned_beams_are_weighted_up_without_a_cap_too(mini: Path, tmp_path: Path) -> None:
+    bench = Bench(mini, ["score.gamma=inf"], tmp_path / "out", 1, lambda *_: None)
+    found = {s.name: s for s in knobs.settings(bench.scenario(knobs.Setting("scenario", "scenario", "")))}
+    whole, thin = (np.array(bench.run(found[name]).shares) for name in ("scenario", "every 2nd azimuth"))
+    assert np.abs(thin / whole - 1).max() < 0.1
+
+
 @pytest.mark.parametrize("sensor", ["VLP-32C", "OS1-64"])
 def test_a_thinned_catalogue_sensor_has_the_beams_of_the_whole_one(mini: Path, sensor: str) -> None:
     from pipeline.sensors import CATALOGUE, resolve

@@ -1,7 +1,7 @@
 """Do imports point one way, and does the package stay what it promises to be?
 
-errors, grid, schemas, scenario -> kernels -> tables, statics, sensors -> stages -> workflow -> command line: no edge runs back, none
-runs from stage to stage, and heavy libraries are imported only where they are needed.
+errors, grid, schemas, scenario -> kernels -> tables, statics, sensors -> stages -> workflow -> command line: no edge runs back,
+none runs from stage to stage, and heavy libraries are imported only where they are needed.
 """
 
 from __future__ import annotations

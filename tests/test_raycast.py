@@ -164,10 +164,11 @@ def test_no_leak_at_a_closed_box():
     assert np.abs(ranges - box_ranges(o, d, low, high)).max() < 1e-9
 
 
-def test_no_leak_at_the_vertices_and_edges_of_a_sphere():
-    """10,242 vertices and 30,720 edges, aimed at exactly from inside; Embree alone leaks at some."""
+@pytest.mark.parametrize("centre", [(0.0, 0.0, 0.0), (50.0, 50.0, 5.0)])
+def test_no_leak_at_the_vertices_and_edges_of_a_sphere(centre):
+    """10,242 vertices and 30,720 edges, aimed at exactly from inside; Embree alone leaks at 34 vertices of the first."""
     ball = trimesh.creation.icosphere(subdivisions=5, radius=10.0)
-    centre, o = np.array([50.0, 50.0, 5.0]), np.array([50.3, 50.2, 5.1])
+    o = np.array([3.0, 2.0, 1.0]) + centre
     targets = np.concatenate([ball.vertices, ball.vertices[ball.edges_unique].mean(axis=1)]) + centre
     assert len(targets) == 10_242 + 30_720
     ranges, doubtful = caster(ball.triangles + centre).first_hits(o, towards(o, targets))

@@ -55,6 +55,7 @@ _LEVEL_M = 1.5
 _RING_M = 50.0
 _OFF_M = 1.0
 _MARGIN_M = 100.0
+_HAIR = 1e-12
 _UPRIGHT = "pedestrian"
 
 
@@ -105,12 +106,29 @@ class Surface:
         # a hair inside, since a point on the hull's own edge may count as outside
         hair = 1e-6 * (self.high_m - self.low_m)
         at = np.clip(np.column_stack([x_m, y_m]), self.low_m + hair, self.high_m - hair) - self.low_m
-        face = self._triangulation.find_simplex(at)
-        to_share, corners = self._triangulation.transform[face], self._triangulation.simplices[face]
-        shares = np.einsum("nij,nj->ni", to_share[:, :2], at - to_share[:, 2])
-        z = self.vertices_m[corners, 2]
-        heights: Floats = z[:, 2] + ((z[:, :2] - z[:, 2:]) * shares).sum(axis=1)
+        corners, shares = self._round(at)
+        heights: Floats = (self.vertices_m[corners, 2] * shares).sum(axis=1)
         return heights
+
+    def _round(self, at: Floats) -> tuple[NDArray[np.int64], Floats]:
+        """The triangle round each point (n, 2): its vertices (n, 3) and their shares in the point (n, 3).
+
+        A walk from the nearest vertex to the neighbour across the side that the point lies beyond; on a Delaunay triangulation it
+        ends. (Qhull's own search asks LAPACK for thousands of 2 x 2 matrices, whose threads may take seconds on a busy machine.)
+        """
+        net, points = self._triangulation, self.vertices_m[:, :2] - self.low_m
+        face = np.maximum(net.vertex_to_simplex[_nearest(points, at)], 0).astype(np.int64)
+        shares, active = _shares(points[net.simplices[face]], at), np.arange(len(at))
+        for _ in range(len(net.simplices)):
+            beyond = shares[active].argmin(axis=1)
+            onward = net.neighbors[face[active], beyond]
+            goes = (shares[active, beyond] < -_HAIR) & (onward >= 0)
+            if not goes.any():
+                break
+            active = active[goes]
+            face[active] = onward[goes]
+            shares[active] = _shares(points[net.simplices[face[active]]], at[active])
+        return net.simplices[face], shares
 
     def lowest_m(self, outline_m: Floats) -> float:
         """The lowest ground along an outline (n, 2), a sample every metre."""
@@ -182,6 +200,14 @@ def ground(path: Path, low_m: Floats | None = None, high_m: Floats | None = None
     rim = _rim(low, high)
     rim = np.column_stack([rim, points[_nearest(points[:, :2], rim), 2]])
     return _triangulated(np.concatenate([points[inside], rim]), low, high)
+
+
+def _shares(triangles: Floats, at: Floats) -> Floats:
+    """Barycentric coordinates (n, 3) of points (n, 2) in triangles (n, 3, 2)."""
+    (ax, ay), (bx, by), (cx, cy) = ((triangles[:, i] - at).T for i in range(3))
+    parts = np.column_stack([bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx])
+    shares: Floats = parts / parts.sum(axis=1)[:, None]
+    return shares
 
 
 def _nearest(points: Floats, at: Floats) -> NDArray[np.int64]:
