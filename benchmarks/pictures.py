@@ -6,6 +6,7 @@ score (or, where an effect changes traffic, the occupancy) looks like from above
 
 from __future__ import annotations
 
+import math
 import re
 import tempfile
 from collections.abc import Iterator
@@ -17,7 +18,7 @@ import numpy as np
 import pipeline
 from pipeline import effects, figures, workflow
 from pipeline.entropy import Field
-from pipeline.results import read_scores, read_tpog
+from pipeline.results import read_scores, read_tpog, read_trajectories
 from pipeline.scenario import Scenario
 from pipeline.visibility import hits_of
 from pipeline.world import read_ply
@@ -82,6 +83,24 @@ def before_and_after(name: str, folder: Path) -> Iterator[tuple[str, str]]:
         yield f"{name}-{word}.svg", figures.standalone(figures.view(tpog.grid, field, peak, stand, f"{name}-{word}", alt))
 
 
+def side_view(out: Path, pitched: bool) -> str:
+    """Boxes of one frame on the main road of the hill, seen from the south, heights five times enlarged; laid flat when not pitched."""
+    rows = read_trajectories(out / "trajectories.parquet").to_pylist()
+    busiest = max((sum(r["frame"] == f for r in rows if abs(r["y_m"]) < 9), -f) for f in range(0, 2000, 100))
+    shapes = []
+    for row in (r for r in rows if r["frame"] == -busiest[1] and abs(r["y_m"]) < 9 and -150 < r["x_m"] < 150):
+        tilt = row["pitch_rad"] * math.copysign(1.0, math.cos(row["yaw_rad"])) if pitched else 0.0
+        z = row["z_m"] if pitched else row["height_m"] / 2
+        corners = [(a * row["length_m"] / 2, b * row["height_m"] / 2) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+        turned = [(a * math.cos(tilt) - b * math.sin(tilt), a * math.sin(tilt) + b * math.cos(tilt)) for a, b in corners]
+        points = " ".join(f"{2 * (row['x_m'] + a) + 310:.1f},{170 - 10 * (z + b):.1f}" for a, b in turned)
+        shapes.append(f'<polygon points="{points}" fill="#3b528b" fill-opacity="0.75"/>')
+    words = "after: boxes on the grade" if pitched else "before: everything on z = 0"
+    text = '<text x="10" y="18" font-family="sans-serif" font-size="13" fill="#555">'
+    head = '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 620 185" role="img"'
+    return f'{head} aria-label="slope, {words}">{text}{words}; heights x 5</text>{"".join(shapes)}</svg>\n'
+
+
 def main() -> None:
     """Draw the picture of the README and those of the effects."""
     assert set(SHOWN) == set(effects.KINDS) - {effects.SELF_ACTING}  # the slope cannot be left out where there is one
@@ -94,6 +113,9 @@ def main() -> None:
         for name in SHOWN:
             for file, drawn in before_and_after(name, folder):
                 (IMAGES / "effects" / file).write_text(drawn, encoding="utf-8")
+        for word, pitched in (("before", False), ("after", True)):
+            drawn = side_view(folder / "hill" / "plain", pitched)
+            (IMAGES / "effects" / f"slope-{word}.svg").write_text(drawn, encoding="utf-8")
 
 
 if __name__ == "__main__":

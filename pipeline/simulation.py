@@ -236,7 +236,7 @@ class Prepared:
             "precision": str(_PRECISION),
             "collision-output": COLLISIONS,
         }
-        if self.crowd:
+        if self.crowd or not self.drawn:  # else SUMO writes a user's persons among the vehicles
             wanted |= {"person-fcd-output": PERSONS}
         return wanted if self.drawn else wanted | {"stop-output": STOPS, "stop-output.write-unfinished": "true"}
 

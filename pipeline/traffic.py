@@ -71,21 +71,20 @@ class Acting:
         """Those whose parameters count."""
         return tuple(effect for effect in (self.articulated, self.crowd) if effect is not None)
 
-    @property
-    def apart(self) -> frozenset[str]:
-        """SUMO's types of those who do not count as vehicles."""
+    def apart(self, sizes: Mapping[str, Size]) -> frozenset[str]:
+        """SUMO's types of those who do not count as vehicles: what the effect brings, and a user's own persons."""
         if self.crowd is None:
             return frozenset()
         from pipeline.effects.pedestrians_bicycles import TYPES
 
-        return TYPES
+        return TYPES | {name for name, size in sizes.items() if size.vclass == "pedestrian"}
 
     def prepare(self, scenario: Scenario, sizes: Mapping[str, Size]) -> None:
         """Once sizes are known; further calls do nothing."""
         if self.articulated is not None and self.follower is None:
             from pipeline.effects import articulated
 
-            own = {name: size for name, size in sizes.items() if name not in self.apart}
+            own = {name: size for name, size in sizes.items() if name not in self.apart(sizes)}
             self.follower = articulated.Follower(self.articulated.geometries(own, articulated.place_of(scenario)))
 
     def result(self, recorded: dict[str, Any]) -> dict[str, Any]:
@@ -209,7 +208,7 @@ def run(
         period_s = recording.window.period_ms / 1000.0
         for group in _groups(recording):
             effects.prepare(scenario, recording.sizes)
-            boxes = effects.change(motion.boxes(group, recording.sizes, period_s, recording.place, effects.apart))
+            boxes = effects.change(motion.boxes(group, recording.sizes, period_s, recording.place, effects.apart(recording.sizes)))
             if boxes.frame.size:
                 file.write(boxes.columns())
             tally.add(boxes)

@@ -538,18 +538,29 @@ def test_same_seed_same_bytes_and_the_same_over_traci(hill, climbed, tmp_path, p
     assert all(np.array_equal(one[name], other[name]) for name in one)
 
 
-def test_a_users_own_routes_get_people_beside_them(flat, tmp_path):
-    shutil.copy(flat / "road.net.xml", tmp_path)
+def own_demand(flat, folder):
+    """A user's route file with vehicles and one person who walks from the road's west end."""
+    shutil.copy(flat / "road.net.xml", folder)
     trips = "".join(f'<trip id="{i}" depart="{2 * i}" from="ab" to="cd"/>' for i in range(80))
-    (tmp_path / "own.rou.xml").write_text(f"<routes>{trips}</routes>")
-    keys = {k: v for k, v in SMALL.items() if k not in ("trips_per_s", "kinds")} | {
-        "routes": ["own.rou.xml"],
-        "vehicles": 4,
-        "hold": "at_most",
-    }
+    person = '<person id="own" depart="0"><walk from="ab" to="cd"/></person>'
+    (folder / "own.rou.xml").write_text(f"<routes>{person}{trips}</routes>")
+    keys = {k: v for k, v in SMALL.items() if k not in ("trips_per_s", "kinds")}
+    return keys | {"routes": ["own.rou.xml"], "vehicles": 4, "hold": "at_most"}
+
+
+def test_a_users_own_routes_get_people_beside_them(flat, tmp_path):
+    keys = own_demand(flat, tmp_path)
     result = traffic.run(scenario(tmp_path, CROWD, **keys), tmp_path / "out")
     assert result["vehicles"]["most"] == 4 and result["vehicles"]["fewest"] >= 3
     assert set(result["beside_vehicles"]) == {"bicycle", "pedestrian", "overlapping_pairs"}
+    assert "own" in rows(tmp_path / "out")["vehicle"]
+
+
+def test_in_the_plain_scene_a_users_own_persons_are_no_vehicles(flat, tmp_path):
+    """Without a file of their own, SUMO writes persons among the vehicles."""
+    result = traffic.run(scenario(tmp_path, **own_demand(flat, tmp_path)), tmp_path / "out")
+    assert result["vehicles"]["most"] == 4
+    assert set(rows(tmp_path / "out")["kind"]) == {"passenger"}
 
 
 # ---- wrong input
