@@ -57,6 +57,7 @@ class Row:
     overrides: str
     seconds: float
     seconds_spread: float
+    busy_s: float
     repeats: int
     statics_s: float
     scan_s: float
@@ -292,6 +293,7 @@ def _row(bench: Bench, setting: Setting, trials: dict[str, Trial]) -> Row:
         overrides=" ".join(f"--set {shlex.quote(o)}" for o in setting.overrides),
         seconds=sum(median(cost.seconds) for cost in spent.values()),
         seconds_spread=sum(max(cost.seconds) - min(cost.seconds) for cost in spent.values()),
+        busy_s=sum(median(cost.busy) for cost in spent.values()),
         repeats=min(len(cost.seconds) for cost in spent.values()),
         statics_s=median(spent["statics"].seconds),
         scan_s=median(spent["scan"].seconds),

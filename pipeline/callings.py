@@ -40,7 +40,7 @@ class Change:
     effect
         Its name; "all" for all that the scenario names together; "none" for the plain scene.
     seconds
-        Time of scan and score, and of other stages where the effect made them run again (in the plain scene: of all).
+        Time of all stages but the report; a stage that the effect does not touch counts with what it took in the plain scene.
     sites, scores, ranks
         Of each site, in the order of the sites.
     """
@@ -101,14 +101,8 @@ def ablation(scenario: Scenario, out: Path, *, jobs: int | None = None, progress
         folder = out / "ablation" / name
         if not folder.exists() and plain.exists():
             shutil.copytree(plain, folder, ignore=shutil.ignore_patterns(".lock"))
-        ran: dict[str, str] = {}
-
-        def note(stage: str, state: str, _: dict[str, Any], ran: dict[str, str] = ran) -> None:
-            ran[stage] = state
-
-        record = workflow.run(scenario.with_effects(named), folder, jobs=jobs, progress=progress, told=note)
-        counted = [s for s in record["stages"] if s in ("scan", "score") or (ran[s] == "done" and s not in ("report", "statics"))]
-        seconds = sum(record["stages"][s]["cost"]["seconds"] for s in counted)
+        record = workflow.run(scenario.with_effects(named), folder, jobs=jobs, progress=progress)
+        seconds = sum(done["cost"]["seconds"] for stage, done in record["stages"].items() if stage != "report")
         scores = read_scores(folder / "scores.parquet")
         names = tuple(scores["site"].to_pylist())
         changes.append(Change(name, seconds, names, tuple(scores["egvs"].to_pylist()), tuple(scores["rank"].to_pylist())))

@@ -131,6 +131,6 @@ def _percent(point: Point) -> float:
 def _name(axes: Any, point: Point, text: str, align: str) -> None:
     offset = (6 if align == "left" else -9, -11)
     axes.annotate(
-        text, (point.seconds, _percent(point)), xytext=offset, textcoords="offset points", fontsize=7.5, ha=align, zorder=6,
+        text, (point.seconds, _percent(point)), xytext=offset, textcoords="offset points", fontsize=7.5, ha=align, zorder=2,
         bbox={"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.75},
     )  # fmt: skip

@@ -30,7 +30,7 @@ class Screen:
     """Shows a run as it goes on, and what came of it."""
 
     def __init__(self) -> None:
-        self._out = Console(width=None if sys.stdout.isatty() else 120, highlight=False, soft_wrap=True)
+        self._out = Console(width=None if sys.stdout.isatty() else 150, highlight=False, soft_wrap=True)
         self._err = Console(stderr=True, highlight=False, soft_wrap=True)
         self._stage, self._ran = "", False
         self._bar = Progress(
@@ -216,7 +216,7 @@ def accuracy(study: Study, scenario: str) -> None:
 
 def _settings(title: str, rows: Sequence[Row], errors: bool) -> Table:
     table = Table(box=None, pad_edge=False, title=title, title_justify="left")
-    names = ["", "setting", "seconds", "+-", "traffic", "tpog", "scan", "score", "peak MB", "MB"]
+    names = ["", "setting", "seconds", "+-", "busy", "traffic", "tpog", "scan", "score", "peak MB", "MB"]
     names += ["error", "std error", "own change"] if errors else []
     for name in (*names, "tau", "rho", "kept", "regret"):
         table.add_column(name, justify="left" if name in ("", "setting") else "right", no_wrap=name != "setting")
@@ -224,9 +224,9 @@ def _settings(title: str, rows: Sequence[Row], errors: bool) -> Table:
         parts = [f"{r.error:.2%}", f"{r.error_se:.2%}", f"{r.own_change:.2%}"] if errors else []
         kept = ", ".join(["best"] * r.best_kept + ["three"] * r.best_three_kept) or "-"
         table.add_row(
-            "*" * r.front + "=" * r.recommended, r.setting, f"{r.seconds:.2f}", f"{r.seconds_spread:.2f}", f"{r.traffic_s:.2f}",
-            f"{r.tpog_s:.2f}", f"{r.scan_s:.2f}", f"{r.score_s:.2f}", f"{r.peak_mb:.0f}", f"{r.bytes / 1e6:.1f}", *parts,
-            f"{r.tau:.3f}", f"{r.rho:.3f}", kept, f"{r.regret:.2%}",
+            "*" * r.front + "=" * r.recommended, r.setting, f"{r.seconds:.2f}", f"{r.seconds_spread:.2f}", f"{r.busy_s:.2f}",
+            f"{r.traffic_s:.2f}", f"{r.tpog_s:.2f}", f"{r.scan_s:.2f}", f"{r.score_s:.2f}", f"{r.peak_mb:.0f}",
+            f"{r.bytes / 1e6:.1f}", *parts, f"{r.tau:.3f}", f"{r.rho:.3f}", kept, f"{r.regret:.2%}",
         )  # fmt: skip
     return table
 

@@ -80,9 +80,10 @@ class Trial:
 
 @dataclass(frozen=True)
 class Spent:
-    """What one stage cost: seconds of each repeat, peak memory of the process, bytes of its artefacts."""
+    """What one stage cost: seconds of each repeat (of the clock, and of all processors), peak memory, bytes of its artefacts."""
 
     seconds: tuple[float, ...]
+    busy: tuple[float, ...]
     peak_mb: float
     bytes: int
 
@@ -147,7 +148,7 @@ class Bench:
         folder = self._folder(name, key)
         cost = json.loads((folder / "cost.json").read_text(encoding="utf-8"))
         size = sum(path.stat().st_size for path in folder.iterdir() if path.name != "cost.json")
-        return Spent(tuple(cost["seconds"]), cost["peak_mb"], size)
+        return Spent(tuple(cost["seconds"]), tuple(cost["busy"]), cost["peak_mb"], size)
 
     def artefact(self, trial: Trial, stage: str, name: str) -> Path:
         """Where one of a trial's artefacts is kept."""
@@ -173,14 +174,16 @@ class Bench:
         tables.write_text(self._kept / f"{name}.json", json.dumps(value, indent=1) + "\n")
 
     def _measure(self, name: str, key: str, scenario: Scenario, work: Path) -> None:
+        began = _busy_s()
         with measured() as cost:
             _module(name).run(scenario, work, jobs=self._jobs, progress=self._progress)
+        busy_s = _busy_s() - began
         written = [work / artefact for artefact in _module(name).ARTEFACTS if (work / artefact).exists()]
         digests = {path.name: tables.sha256_of(path) for path in written}
         folder = self._folder(name, key)
         folder.mkdir(parents=True, exist_ok=True)
         file = folder / "cost.json"
-        before: dict[str, Any] = {"seconds": [], "peak_mb": 0.0, "sha256": digests}
+        before: dict[str, Any] = {"seconds": [], "busy": [], "peak_mb": 0.0, "sha256": digests}
         if file.is_file():
             before = json.loads(file.read_text(encoding="utf-8"))
         if before["sha256"] != digests:
@@ -188,9 +191,13 @@ class Bench:
         for path in written:
             if not (folder / path.name).exists():
                 _same(path, folder / path.name)
-        seconds = [*before["seconds"], round(cost.seconds, 4)]
-        peak = max(before["peak_mb"], round(cost.peak_mb, 1))
-        tables.write_text(file, json.dumps({"seconds": seconds, "peak_mb": peak, "sha256": digests}) + "\n")
+        now = {
+            "seconds": [*before["seconds"], round(cost.seconds, 4)],
+            "busy": [*before["busy"], round(busy_s, 4)],
+            "peak_mb": max(before["peak_mb"], round(cost.peak_mb, 1)),
+            "sha256": digests,
+        }
+        tables.write_text(file, json.dumps(now) + "\n")
 
     def _result(self, setting: Setting) -> Path:
         scenario = self.scenario(setting)
@@ -212,6 +219,11 @@ class Bench:
     def _workshop(self) -> Iterator[Path]:
         with tempfile.TemporaryDirectory(prefix=".work-", dir=self._kept) as folder:
             yield Path(folder)
+
+
+def _busy_s() -> float:
+    """Seconds that processors worked for this process and those that it waited for (SUMO): other people's work is not in it."""
+    return sum(os.times()[:4])
 
 
 def _module(name: str) -> ModuleType:

@@ -109,8 +109,9 @@ def test_two_walls_a_millimetre_apart(graze_deg, first):
     assert np.abs(ranges - 0.0005 / np.sin(angle)).max() < 1e-9
 
 
-@pytest.mark.parametrize("width_m", [1e-1, 1e-3, 1e-5, 1e-6, 1e-7])
-def test_fan_of_slivers(width_m):
+@pytest.mark.parametrize("start", [(30.0, 50.123, 1.0), (20.0, 50.0, 4.5), (1.0, 50.0, -40.0)])
+@pytest.mark.parametrize("width_m", [1e-1, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7])
+def test_fan_of_slivers(width_m, start):
     """A roof of needles that share a tip: as one plane, without a gap."""
     n = 600
     rim = np.column_stack([np.zeros(n + 1), 50 + (np.arange(n + 1) - n / 2) * width_m, np.full(n + 1, 5.0)])
@@ -119,7 +120,7 @@ def test_fan_of_slivers(width_m):
     rng = np.random.default_rng(4)
     s = rng.random((1500, 1)) * 0.99
     target = tip * s + (rim[[0]] + rng.random((1500, 1)) * (rim[[-1]] - rim[[0]])) * (1 - s)
-    o = np.array([30.0, 50.123, 1.0])
+    o = np.array(start)
     found, true = cast_both(fan, o, towards(o, target))
     assert not cast.differ(found, true).any()
     assert np.abs(found - np.linalg.norm(target - o, axis=1)).max() < 1e-6
