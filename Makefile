@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: run test lint bench numerics pictures schema clean
+.PHONY: run test lint bench scaling numerics pictures schema clean
 
 run: $(VENV)/.installed
 	$(BIN)/egvs run scenarios/nishishinjuku
@@ -19,6 +19,9 @@ lint: $(VENV)/.installed-dev
 
 bench: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks
+
+scaling: $(VENV)/.installed-dev
+	$(BIN)/python -m benchmarks.scaling
 
 numerics: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.numerics --markdown docs/numerics-table.md

@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 import pipeline
-from benchmarks import casting, stability
+from benchmarks import casting, others, stability
 from pipeline import score, survey, tpog
 from pipeline.entropy import Field
 from pipeline.kernels import march
@@ -137,7 +137,11 @@ def main() -> None:
         table.add_row(what, measured, bound, ("yes" if reached else "NO") if bound else "")
     console = Console(width=140, highlight=False)
     console.print(table)
-    for title, measure in (("what stability costs", stability.rows), ("what exact hits cost", casting.rows)):
+    for title, measure in (
+        ("what stability costs", stability.rows),
+        ("what exact hits cost", casting.rows),
+        ("what other ways cost, and how wrong they are", others.rows),
+    ):
         console.print(f"\n{title}")
         for row in measure():
             console.print("  " + "   ".join(f"{value:.3f}" if isinstance(value, float) else str(value) for value in row))

@@ -44,14 +44,14 @@ def _work(name: str) -> tuple[dict[str, Callable[[], Any]], int, int]:
         start, single = np.tile((position - origin).astype(np.float32), (len(d), 1)), d.astype(np.float32)
         proposed = caster._owner[caster._scene.run(start, single)]
         ranges, doubtful = np.empty(len(d)), np.empty(len(d), dtype=np.int64)
-        count = rays.settle(proposed, caster._triangles, caster._planes, position - origin, d, ranges, doubtful)
+        count = rays.settle(proposed, caster._triangles, caster._planes, position - origin, d, sensor.range_m, ranges, doubtful)
         jobs.append(
             (site.position_m, directions, sensor.range_m, position - origin, d, start, single, proposed, ranges, doubtful, count)
         )
 
     def settle() -> None:
-        for *_, o, d, _start, _single, proposed, ranges, doubtful, _count in jobs:
-            rays.settle(proposed, caster._triangles, caster._planes, o, d, ranges, doubtful)
+        for _, _, range_m, o, d, _start, _single, proposed, ranges, doubtful, _count in jobs:
+            rays.settle(proposed, caster._triangles, caster._planes, o, d, range_m, ranges, doubtful)
 
     def search() -> None:
         for *_, o, d, _start, _single, _proposed, ranges, doubtful, count in jobs:

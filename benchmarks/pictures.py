@@ -48,7 +48,7 @@ def figure(page: str, label: str) -> str:
 
 
 def seen(scenario: Scenario, out: Path, site: str) -> tuple[np.ndarray, np.ndarray]:
-    """Score of each column of voxels, bits (nx, ny), or its mean occupied voxels where no site is named; voxels that beams cross."""
+    """Score of each column, bits (nx, ny), or its mean occupied voxels where no site is named; the voxels that beams cross."""
     tpog = read_tpog(out / "tpog.parquet")
     if not site:
         return tpog.p.sum(axis=2), np.ones(tpog.grid.shape, dtype=np.bool_)
@@ -84,7 +84,7 @@ def before_and_after(name: str, folder: Path) -> Iterator[tuple[str, str]]:
 
 
 def side_view(out: Path, pitched: bool) -> str:
-    """Boxes of one frame on the main road of the hill, seen from the south, heights five times enlarged; laid flat when not pitched."""
+    """Boxes of one frame on the hill's main road, seen from the south, heights five times enlarged; flat when not pitched."""
     rows = read_trajectories(out / "trajectories.parquet").to_pylist()
     busiest = max((sum(r["frame"] == f for r in rows if abs(r["y_m"]) < 9), -f) for f in range(0, 2000, 100))
     shapes = []

@@ -181,7 +181,8 @@ def study(
     longest = knobs.reference(scenario, times)
     found, skipped = _run_all(bench, [longest, *settings] if times > 1 else settings, trials, clock, told)
     repeated = _repeat(bench, found, trials, clock, progress)
-    rows = _judged([_row(bench, setting, trials) for setting in found], tolerance)
+    lasts = scenario.traffic.fcd is None
+    rows = _judged([_row(bench, setting, trials, lasts) for setting in found], tolerance)
     checked = _between_seeds(bench, scenario, seeds, told) if seeds else None
     best = next((row for row in rows if row.recommended), None)
     files = (out / "accuracy.parquet", out / "accuracy.png")
@@ -278,7 +279,8 @@ def _medians(bench: Bench, trial: Trial) -> dict[str, float]:
     return {name: median(bench.spent(name, trial.stages[name]).seconds) for name in STAGES}
 
 
-def _row(bench: Bench, setting: Setting, trials: dict[str, Trial]) -> Row:
+def _row(bench: Bench, setting: Setting, trials: dict[str, Trial], lasts: bool) -> Row:
+    """Compare one setting. ``lasts``: traffic could be longer, so that its shortness is an error that time can mend."""
     trial, own = trials[setting.name], trials[SCENARIO]
     against = own if setting.kind == MEASURES else trials.get(REFERENCE, own)
     beside = trials.get(setting.beside, own)
@@ -306,18 +308,13 @@ def _row(bench: Bench, setting: Setting, trials: dict[str, Trial]) -> Row:
         error_se=error_se,
         error_rms=float(np.sqrt(np.mean(changes**2))) if len(changes) else 0.0,
         own_change=float(relative(s, np.array(beside.shares)).max(initial=0.0)),
-        judged=max(error, error_se) if _is_longer(trials) else error,
+        judged=max(error, error_se) if lasts else error,
         tau=agreement(s, r, "tau"),
         rho=agreement(s, r, "rho"),
         best_kept=best(s, 1) == best(r, 1),
         best_three_kept=best(s, 3) == best(r, 3),
         regret=regret(s, r),
     )  # fmt: skip
-
-
-def _is_longer(trials: dict[str, Trial]) -> bool:
-    """Whether there is traffic beyond the scenario's own, so that its shortness is an error that time can mend."""
-    return REFERENCE in trials and trials[REFERENCE].frames > trials[SCENARIO].frames
 
 
 def _largest_se(trial: Trial) -> float:

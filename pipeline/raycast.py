@@ -6,12 +6,12 @@ Embree (float32) answers *which triangle*, float64 *where*:
 2. Embree holds every triangle enlarged by a rim that is wider than float32's error, and a low fin upright on each side that is not
    shared with a steep neighbour. What a beam truly meets, it meets there too: none leaks through a shared edge or vertex, and
    none slips in along a surface that it sees at a fraction of a degree.
-3. Each proposed hit is placed in float64 on the true triangle. A beam that met only a rim or fin, or came within 0.02 mm of an
-   edge, is doubtful (one in a thousand); its first hit is searched among all true triangles in float64.
+3. Each proposed hit is placed in float64 on the true triangle. A beam that met only a rim or fin, came within 0.02 mm of an
+   edge, or met a surface at less than 0.6 degrees, is doubtful (one in a thousand); its first hit is searched among all true
+   triangles in float64.
 
-So which surface comes first is float32's choice only away from the edges of what it proposes. What that leaves: where a
-surface stands on the middle of another (a wall on the ground), a beam within some 1e-5 m of the line between them may be
-given the farther of the two.
+What is left to float32: where a surface stands on the middle of another (a wall on the ground), a beam within some 1e-5 m of the
+line between them may be given the farther of the two, rarely more than 1 mm and at most some millimetres behind the nearer.
 """
 
 from __future__ import annotations
@@ -115,15 +115,17 @@ class Caster:
         rays.can_meet(o, directions * range_m, self._size_m, reaches)
         beam = np.flatnonzero(reaches)
         d = directions[beam]
-        ranges, doubtful = self.first_hits(o, d)
+        ranges, doubtful = self.first_hits(o, d, range_m)
         returned = ranges <= range_m
         ends = d * np.where(returned, ranges, range_m)[:, None]
         return EmptyScan(beam.astype(np.uint32), ends, returned, doubtful)
 
-    def first_hits(self, o_roi_m: NDArray[np.float64], d: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
+    def first_hits(
+        self, o_roi_m: NDArray[np.float64], d: NDArray[np.float64], range_m: float = float("inf")
+    ) -> tuple[NDArray[np.float64], int]:
         """Range of each ray's first hit (infinity for none), and how many rays had to be searched in float64.
 
-        ``o_roi_m`` is the sensor in the ROI's frame, (3,); ``d`` are unit directions (n, 3).
+        ``o_roi_m`` is the sensor in the ROI's frame, (3,); ``d`` are unit directions (n, 3); hits beyond ``range_m`` do not matter.
         """
         ranges = np.full(len(d), np.inf)
         if self._scene is None or len(d) == 0:
@@ -132,7 +134,7 @@ class Caster:
         found = self._scene.run(np.ascontiguousarray(start), d.astype(np.float32))
         proposed = self._owner[found]
         doubtful = np.empty(len(d), dtype=np.int64)
-        count = rays.settle(proposed, self._triangles, self._planes, o_roi_m, d, ranges, doubtful)
+        count = rays.settle(proposed, self._triangles, self._planes, o_roi_m, d, range_m, ranges, doubtful)
         rays.search(doubtful[:count], self._triangles, self._planes, self._boxes, self._starts, o_roi_m, d, ranges)
         return ranges, int(count)
 

@@ -163,6 +163,13 @@ def test_a_budget_leaves_settings_out_and_names_them(mini: Path, tmp_path: Path,
     assert [row["setting"] for row in rows] == ["scenario"]
 
 
+def test_without_a_longer_reference_simulated_traffic_is_judged_by_its_standard_error(junction: Path, tmp_path: Path) -> None:
+    study = accuracy.study(junction, [], tmp_path / "out", budget_s=0.001)
+    assert [row.setting for row in study.rows] == ["scenario"]
+    assert (study.times, study.best) == (1, None)
+    assert study.rows[0].judged == study.rows[0].error_se > study.tolerance
+
+
 def test_a_setting_that_fails_is_named_and_the_rest_goes_on(
     mini: Path, tmp_path: Path, few: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -81,7 +81,12 @@ def test_a_scenario_may_extend_another(mini: Path, tmp_path: Path, egvs) -> None
     wet.mkdir()
     (wet / "scenario.toml").write_text('extends = "../mini"\n\n[effects.rain]\nrate_mm_h = 20\n\n[score]\ngamma = 3\n')
     scenario = pipeline.load(wet)
-    assert (scenario.name, scenario.score.gamma, scenario.roi.voxel_m, scenario.effects) == ("wet", 3, 0.5, {"rain": {"rate_mm_h": 20}})
+    assert (scenario.name, scenario.score.gamma, scenario.roi.voxel_m, scenario.effects) == (
+        "wet",
+        3,
+        0.5,
+        {"rain": {"rate_mm_h": 20}},
+    )
     out = tmp_path / "out"
     assert egvs("run", wet, "--out", out)[0] == 0
     assert egvs("verify", out)[0] == 0

@@ -126,6 +126,20 @@ def test_fan_of_slivers(width_m, start):
     assert np.abs(found - np.linalg.norm(target - o, axis=1)).max() < 1e-6
 
 
+def test_sides_of_a_needle_met_squarely():
+    """A cable of 2 mm, 100 m long; beams that pass 0.1 to 3 micrometres inside its sides, where no fin stands in the way."""
+    rng = np.random.default_rng(5)
+    for _ in range(20):
+        turn = trimesh.transformations.random_rotation_matrix(rng.random(3))[:3, :3]
+        cable = np.array([[[-50.0, -1e-3, 0.0], [-50.0, 1e-3, 0.0], [50.0, 0.0, 0.0]]])
+        x, inside = rng.uniform(-0.5, 0.5, 500), 10.0 ** rng.uniform(-7, -5.5, 500)
+        y = rng.choice([-1, 1], 500) * (1e-3 * (50 - x) / 100 - inside)
+        target = np.column_stack([x, y, np.zeros(500)]) @ turn.T + [50, 50, 5]
+        o = turn @ np.array([0.0, 0.0, 30.0]) + [50, 50, 5]
+        found, _ = caster(cable @ turn.T + [50, 50, 5]).first_hits(o, towards(o, target))
+        assert np.abs(found - np.linalg.norm(target - o, axis=1)).max() < 1e-6
+
+
 def test_duplicates_and_triangles_without_area_change_nothing():
     rng = np.random.default_rng(5)
     scene = rng.random((200, 3, 3)) * [100, 100, 10]

@@ -45,7 +45,7 @@ def done(mini: Path, tmp_path: Path) -> tuple[Path, Path]:
 
 
 def test_artefacts_are_there_and_the_record_names_them(done: tuple[Path, Path]) -> None:
-    mini, out = done
+    _, out = done
     record = json.loads((out / "run.json").read_text())
     assert list(record["stages"]) == list(workflow.STAGES)
     for stage in record["stages"].values():

@@ -28,6 +28,9 @@ GRAZE = 1e-9
 SURE_M = 2e-5
 """Nearer to an edge than this, float32 may take the wrong one of the two triangles that share it: its rounding at 200 m."""
 
+SHALLOW = 0.01
+"""A surface seen at a smaller angle (its sine): float32's rounding, some 1e-5 m, moves the hit on it by millimetres."""
+
 CHORD_M = 1e-6
 """A ray that shares no longer piece with the region of interest is not cast."""
 
@@ -92,7 +95,7 @@ def _inside(triangle, plane, x, y, z):  # type: ignore[no-untyped-def]
 
 @_inlined
 def meet(triangle, plane, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Range at which a ray meets one triangle (infinity when it does not), and how far inside the triangle that is.
+    """Range at which a ray meets one triangle (infinity when it does not), how far inside that is, and the sine of the angle.
 
     Parameters
     ----------
@@ -104,16 +107,16 @@ def meet(triangle, plane, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-de
     facing = plane[0, 0] * dx + plane[0, 1] * dy + plane[0, 2] * dz
     away = plane[0, 3] - (plane[0, 0] * ox + plane[0, 1] * oy + plane[0, 2] * oz)
     if not (abs(facing) >= GRAZE and abs(away) > EDGE_M):
-        return np.inf, -np.inf
+        return np.inf, -np.inf, 0.0
     t = away / facing
     if t < 0.0:
-        return np.inf, -np.inf
+        return np.inf, -np.inf, 0.0
     depth, on = _inside(triangle, plane, ox + t * dx, oy + t * dy, oz + t * dz)
-    return (t if on else np.inf), depth
+    return (t if on else np.inf), depth, abs(facing)
 
 
 @_kernel
-def settle(proposed, triangles, planes, o, d, ranges, doubtful):  # type: ignore[no-untyped-def]
+def settle(proposed, triangles, planes, o, d, range_m, ranges, doubtful):  # type: ignore[no-untyped-def]
     """Place the hits that were proposed, and tell which proposals float32 cannot be trusted with.
 
     Parameters
@@ -124,10 +127,13 @@ def settle(proposed, triangles, planes, o, d, ranges, doubtful):  # type: ignore
         All triangles (m, 3, 3) and their planes (m, 4, 4), float64.
     o, d
         The sensor (3,) and the rays' unit directions (n, 3), float64.
+    range_m
+        Of a hit that is further away, it is enough to know that it is.
     ranges
         Filled: range of each hit, infinity where nothing is met, (n,) float64.
     doubtful
-        Filled: the rays that met a triangle less than ``SURE_M`` inside, or its enlargement only, (n,) int64.
+        Filled: the rays that met a triangle less than ``SURE_M`` inside, its enlargement only, or at an angle below ``SHALLOW``,
+        (n,) int64.
 
     Returns
     -------
@@ -138,8 +144,8 @@ def settle(proposed, triangles, planes, o, d, ranges, doubtful):  # type: ignore
     for ray in range(proposed.shape[0]):
         ranges[ray], k = np.inf, proposed[ray]
         if k >= 0:
-            ranges[ray], depth = meet(triangles[k], planes[k], ox, oy, oz, d[ray, 0], d[ray, 1], d[ray, 2])
-            if not depth >= SURE_M:
+            ranges[ray], depth, sine = meet(triangles[k], planes[k], ox, oy, oz, d[ray, 0], d[ray, 1], d[ray, 2])
+            if not depth >= SURE_M or (sine < SHALLOW and ranges[ray] <= range_m + 1.0):
                 doubtful[count] = ray
                 count += 1
     return count
@@ -180,7 +186,7 @@ def search(rays, triangles, planes, boxes, starts, o, d, ranges):  # type: ignor
                 level, k = level - 1, k * GROUP
                 continue
             if first <= last:
-                t, _ = meet(triangles[k], planes[k], ox, oy, oz, dx, dy, dz)
+                t, _, _ = meet(triangles[k], planes[k], ox, oy, oz, dx, dy, dz)
                 best = min(best, t)
             k += 1
             while level < top and (k % GROUP == 0 or k == starts[level + 1] - starts[level]):

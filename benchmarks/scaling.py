@@ -1,0 +1,299 @@
+"""How do time and memory grow with the size of the job?
+
+``python -m benchmarks.scaling`` (``make scaling``) takes a synthetic junction - boxes for buildings, cars that drive straight, no
+SUMO - and makes one thing larger at a time: sites, frames, vehicles, the region of interest, beams, triangles. Each size is a whole
+``egvs run`` from a finished FCD file with ``scan.keep = false``, in a process of its own, after a small run that compiles the
+kernels; small sizes are run three times and the median is taken. Memory is a stage's peak above what the process held before.
+
+A slope is fitted on log-log axes by least squares over the larger half of the sizes (three at least), where what every run costs no
+longer hides it; 1 is linear. Written are ``docs/images/scaling.png`` and the tables of ``docs/scaling.md``.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import math
+import multiprocessing
+import re
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from pyarrow import csv
+
+import pipeline
+from pipeline import workflow
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGE, FIGURE = ROOT / "docs" / "scaling.md", ROOT / "docs" / "images" / "scaling.png"
+BETWEEN = ("<!-- measured -->", "<!-- end -->")
+
+REPEATS, ENOUGH_S = 3, 2.0
+"""A size is run so often, unless that long has passed."""
+
+LINEAR = 1.1
+"""A steeper slope is told."""
+
+
+@dataclass(frozen=True)
+class Size:
+    """A synthetic junction."""
+
+    sites: int = 10
+    frames: int = 500
+    vehicles: int = 50
+    hectares: float = 0.5
+    beams: int = 16 * 360
+    triangles: int = 1200
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One thing that grows: a field of :class:`Size`, its sizes, and the stages that are shown."""
+
+    name: str
+    label: str
+    sizes: tuple[float, ...]
+    stages: tuple[str, ...]
+
+
+AXES = (
+    Axis("sites", "sites", (10, 50, 200, 1000, 5000), ("score", "report")),
+    Axis("frames", "frames", (500, 1500, 5000, 15000, 50000), ("traffic", "tpog", "score")),
+    Axis("vehicles", "vehicles a frame", (10, 30, 100, 250, 500), ("traffic", "tpog", "score")),
+    Axis("hectares", "region of interest, ha at 0.25 m", (0.5, 1, 2, 5, 10), ("tpog", "score", "report")),
+    Axis("beams", "beams a sensor", (1_000, 10_000, 100_000, 300_000, 1_000_000), ("score", "report")),
+    Axis("triangles", "triangles", (1_000, 10_000, 100_000, 300_000, 1_000_000), ("statics", "tpog", "score", "report")),
+)
+
+Points = dict[str, dict[float, tuple[float, float]]]
+"""Stage -> size -> (seconds, MB)."""
+
+
+def prepare(size: Size, folder: Path) -> Path:
+    """Write a scenario of this size; its folder."""
+    folder.mkdir(parents=True)
+    long, wide = _sides(size.hectares)
+    channels = min(128, max(4, round(math.sqrt(size.beams / 22.5))))
+    spots = max(1, math.ceil(math.sqrt(size.sites)))
+    values = {
+        "roi": {"center_m": [long / 2, wide / 2, 2.5], "size_m": [long, wide, 5], "voxel_m": 0.25},
+        "traffic": {"fcd": "fcd.csv", "frames": size.frames, "frame_period_s": 0.25, "warmup_s": 0},
+        "statics": {"footprints": ["city.geojson"]},
+        "sites": {"file": "sites.csv", "sensor": "own"},
+        "scan": {"keep": False},
+    }
+    lines = [
+        f"[{table}]\n" + "".join(f"{key} = {json.dumps(value)}\n" for key, value in keys.items()) for table, keys in values.items()
+    ]
+    lines.append(
+        f"[sensors.own]\nelevations_deg = [-25, 5]\nchannels = {channels}\n"
+        f"azimuth_step_deg = {360 / max(1, round(size.beams / channels))!r}\nrange_m = 200\n"
+    )
+    lines.append('[[traffic.kinds]]\nname = "car"\nlength_m = 4.5\nwidth_m = 1.75\nheight_m = 1.5\n')
+    (folder / "scenario.toml").write_text("\n".join(lines), encoding="utf-8")
+    rows = [f"s{i},{long * (i % spots + 0.5) / spots!r},{wide * (i // spots + 0.5) / spots!r},4" for i in range(size.sites)]
+    (folder / "sites.csv").write_text("\n".join(["site,x_m,y_m,z_m", *rows]) + "\n", encoding="utf-8")
+    (folder / "city.geojson").write_text(_city(max(1, size.triangles // 12), long, wide), encoding="utf-8")
+    _traffic(size, long, wide, folder / "fcd.csv")
+    return folder
+
+
+def _sides(hectares: float) -> tuple[float, float]:
+    """Length and width of a region about twice as long as wide, whole voxels."""
+    wide = round(math.sqrt(hectares * 1e4 / 2) * 4) / 4
+    return round(hectares * 1e4 / wide * 4) / 4, wide
+
+
+def _city(buildings: int, long: float, wide: float) -> str:
+    """Square towers of 12 triangles on a lattice 12 m apart, round the region of interest: GeoJSON."""
+    features, ring = [], 1
+    while len(features) < buildings:
+        reach = 12.0 * ring + 4.0
+        low, high = (-reach, -reach), (long + reach, wide + reach)
+        along = [low[0] + 12.0 * i for i in range(int((high[0] - low[0]) / 12.0) + 1)]
+        upward = [low[1] + 12.0 * i for i in range(1, int((high[1] - low[1]) / 12.0) + 1)]
+        spots = [(x, y) for y in (low[1], high[1]) for x in along] + [
+            (x, y) for x in (low[0], high[0]) for y in upward if y < high[1] - 11
+        ]
+        for x, y in spots[: buildings - len(features)]:
+            corners = [[x - 3, y - 3], [x + 3, y - 3], [x + 3, y + 3], [x - 3, y + 3], [x - 3, y - 3]]
+            about = {"name": f"b{len(features)}", "kind": "building", "height_m": 8 + len(features) % 13}
+            features.append({"type": "Feature", "geometry": {"type": "Polygon", "coordinates": [corners]}, "properties": about})
+        ring += 1
+    return json.dumps({"type": "FeatureCollection", "features": features})
+
+
+def _traffic(size: Size, long: float, wide: float, path: Path) -> None:
+    """Cars on lanes along x, each at a speed of its own, that come in again at the other end: SUMO's FCD as CSV."""
+    rng = np.random.default_rng(1)
+    lane, speed = np.arange(size.vehicles), rng.uniform(4.0, 14.0, size.vehicles)
+    y, first = wide * (lane + 0.5) / size.vehicles, rng.uniform(0, long, size.vehicles)
+    names = np.array([f"v{i}" for i in lane])
+    parts = range(0, size.frames, 2000)
+    with path.open("wb") as file:
+        for part in parts:
+            times = np.arange(part, min(part + 2000, size.frames)) * 0.25
+            x = (first + speed * times[:, None]) % (long + 10.0) - 5.0
+            n = len(times)
+            columns = {
+                "timestep_time": np.repeat(times, size.vehicles),
+                "vehicle_id": np.tile(names, n),
+                "vehicle_x": x.ravel().round(3),
+                "vehicle_y": np.tile(y, n),
+                "vehicle_angle": np.full(x.size, 90.0),
+                "vehicle_type": np.full(x.size, "car"),
+                "vehicle_speed": np.tile(speed, n),
+            }
+            options = csv.WriteOptions(include_header=part == 0, delimiter=";", quoting_style="none")
+            csv.write_csv(pa.table(columns), file, options)
+
+
+def _held_mb() -> float:
+    gc.collect()
+    pa.default_memory_pool().release_unused()
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmRSS:"))
+
+
+def measure(size: Size, folder: Path, pipe: Any) -> None:
+    """Send seconds and MB of each stage, medians of some runs."""
+    workflow.run(pipeline.load(prepare(Size(sites=2, frames=10), folder / "warm")), folder / "warm" / "run")
+    scenario, found, begin = pipeline.load(prepare(size, folder / "scene")), [], time.perf_counter()
+    held = _held_mb()
+    for turn in range(REPEATS):
+        told = lambda *_: _held_mb()  # noqa: E731 - lets go of what an earlier stage left
+        record = workflow.run(scenario, folder / f"run{turn}", told=told)
+        found.append({name: stage["cost"] for name, stage in record["stages"].items()})
+        if time.perf_counter() - begin > ENOUGH_S:
+            break
+    pipe.send(
+        {
+            name: (
+                statistics.median(run[name]["seconds"] for run in found),
+                max(statistics.median(run[name]["peak_mb"] for run in found) - held, 0.1),
+            )
+            for name in found[0]
+        }
+    )
+
+
+def apart(size: Size) -> dict[str, tuple[float, float]]:
+    """:func:`measure` in a process of its own: stage -> (seconds, MB)."""
+    context = multiprocessing.get_context("spawn")
+    with tempfile.TemporaryDirectory() as temporary:
+        here, there = context.Pipe(duplex=False)
+        process = context.Process(target=measure, args=(size, Path(temporary), there))
+        process.start()
+        there.close()
+        try:
+            found: dict[str, tuple[float, float]] = here.recv()
+        except EOFError:
+            raise RuntimeError(f"the run of {size} failed") from None
+        process.join()
+    return found
+
+
+def slope(sizes: Sequence[float], costs: Sequence[float]) -> float:
+    """Exponent of growth over the larger half of the sizes, three at least: least squares of log cost on log size."""
+    pairs = sorted(zip(sizes, costs, strict=True))
+    pairs = pairs[-max(3, (len(pairs) + 1) // 2) :]
+    x, y = np.log([pair[0] for pair in pairs]), np.log([pair[1] for pair in pairs])
+    x -= x.mean()
+    return float((x * y).sum() / (x * x).sum())
+
+
+def study() -> dict[str, Points]:
+    """Every axis, size by size."""
+    found: dict[str, Points] = {}
+    for axis in AXES:
+        points: Points = {}
+        for value in axis.sizes:
+            start = time.perf_counter()
+            size = replace(Size(), **{axis.name: value if axis.name == "hectares" else int(value)})
+            for stage, cost in apart(size).items():
+                points.setdefault(stage, {})[value] = cost
+            print(f"{axis.label} {value:g}: {time.perf_counter() - start:.1f} s", file=sys.stderr)
+        found[axis.name] = points
+    return found
+
+
+def table(found: dict[str, Points]) -> str:
+    """Markdown: the largest size's cost, and the slopes; those above linear are bold."""
+    lines = ["| grows | stage | smallest | largest | slope of seconds | slope of memory |", "|---|---|---|---|---|---|"]
+    for axis in AXES:
+        low, high = axis.sizes[0], axis.sizes[-1]
+        for stage in axis.stages:
+            points = found[axis.name][stage]
+            ends = [f"{points[n][0]:.3g} s, {points[n][1]:.0f} MB" for n in (low, high)]
+            slopes = [slope(list(points), [cost[i] for cost in points.values()]) for i in (0, 1)]
+            told = [f"**{s:.2f}**" if s > LINEAR else f"{s:.2f}" for s in slopes]
+            lines.append(f"| {axis.label}: {low:g} to {high:,g} | {stage} | {ends[0]} | {ends[1]} | {told[0]} | {told[1]} |")
+    return "\n".join(lines)
+
+
+# Okabe and Ito's colours, told apart by the colour-blind; markers and dashes tell them apart in print.
+LOOKS = {
+    "statics": ("#999999", "v", ":"),
+    "traffic": ("#E69F00", "s", "--"),
+    "tpog": ("#009E73", "^", "-."),
+    "score": ("#0072B2", "o", "-"),
+    "report": ("#D55E00", "D", (0, (1, 1))),
+}
+
+
+def draw(found: dict[str, Points], path: Path) -> None:
+    """Small multiples: seconds above, memory below, one column an axis."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, panels = pyplot.subplots(2, len(AXES), figsize=(16, 6.2), sharex="col", sharey="row", layout="constrained")
+    for column, axis in enumerate(AXES):
+        for row in (0, 1):
+            panel = panels[row, column]
+            for stage in axis.stages:
+                colour, marker, dashes = LOOKS[stage]
+                points = found[axis.name][stage]
+                costs = [cost[row] for cost in points.values()]
+                told = f"{stage} {slope(list(points), costs):.2f}"
+                panel.loglog(list(points), costs, color=colour, marker=marker, linestyle=dashes, markersize=5, label=told)
+            panel.grid(True, which="major", color="0.88")
+            panel.legend(fontsize=8, title="slope", title_fontsize=8, loc="upper left", framealpha=0.85)
+        panels[1, column].set_xlabel(axis.label)
+    panels[0, 0].set_ylabel("seconds")
+    panels[1, 0].set_ylabel("memory above the start, MB")
+    for row in (0, 1):  # a line of slope 1 to compare with
+        for column, axis in enumerate(AXES):
+            low, high = panels[row, column].get_ylim()
+            x = np.array([axis.sizes[0], axis.sizes[-1]])
+            panels[row, column].plot(x, high * x / x[1], color="0.6", linewidth=0.8, zorder=0)
+            panels[row, column].set_ylim(low, high * 12 if column == 0 else None)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)
+
+
+def main() -> None:
+    """Measure, draw, and put the table into the page."""
+    found = study()
+    draw(found, FIGURE)
+    told = table(found)
+    page = PAGE.read_text(encoding="utf-8")
+    start, end = (re.escape(mark) for mark in BETWEEN)
+    page = re.sub(f"{start}.*{end}", lambda _: f"{BETWEEN[0]}\n{told}\n{BETWEEN[1]}", page, flags=re.DOTALL)
+    PAGE.write_text(page, encoding="utf-8")
+    print(told)
+
+
+if __name__ == "__main__":
+    main()
