@@ -3,7 +3,8 @@
 ``python -m benchmarks.scaling`` (``make scaling``) takes a synthetic junction - boxes for buildings, cars that drive straight, no
 SUMO - and makes one thing larger at a time: sites, frames, vehicles, the region of interest, beams, triangles. Each size is a whole
 ``egvs run`` from a finished FCD file with ``scan.keep = false``, in a process of its own, after a small run that compiles the
-kernels; small sizes are run three times and the median is taken. Memory is a stage's peak above what the process held before.
+kernels; small sizes are run three times and the median is taken. Seconds are the processor's, of all threads: they do not depend
+on what else the machine does. Memory is a stage's peak above what the process held before.
 
 A slope is fitted on log-log axes by least squares over the larger half of the sizes (three at least), where what every run costs no
 longer hides it; 1 is linear. Written are ``docs/images/scaling.png`` and the tables of ``docs/scaling.md``.
@@ -167,23 +168,30 @@ def _held_mb() -> float:
 def measure(size: Size, folder: Path, pipe: Any) -> None:
     """Send seconds and MB of each stage, medians of some runs."""
     workflow.run(pipeline.load(prepare(Size(sites=2, frames=10), folder / "warm")), folder / "warm" / "run")
-    scenario, found, begin = pipeline.load(prepare(size, folder / "scene")), [], time.perf_counter()
-    held = _held_mb()
+    scenario, begin, held = pipeline.load(prepare(size, folder / "scene")), time.perf_counter(), _held_mb()
+    found: list[dict[str, tuple[float, float]]] = []
     for turn in range(REPEATS):
-        told = lambda *_: _held_mb()  # noqa: E731 - lets go of what an earlier stage left
-        record = workflow.run(scenario, folder / f"run{turn}", told=told)
-        found.append({name: stage["cost"] for name, stage in record["stages"].items()})
+        clock = _Clock(held)
+        workflow.run(scenario, folder / f"run{turn}", told=clock)
+        found.append(clock.costs)
         if time.perf_counter() - begin > ENOUGH_S:
             break
-    pipe.send(
-        {
-            name: (
-                statistics.median(run[name]["seconds"] for run in found),
-                max(statistics.median(run[name]["peak_mb"] for run in found) - held, 0.1),
-            )
-            for name in found[0]
-        }
-    )
+    both = [{name: statistics.median(run[name][i] for run in found) for name in found[0]} for i in (0, 1)]
+    pipe.send({name: (both[0][name], both[1][name]) for name in both[0]})
+
+
+class _Clock:
+    """Told of a run's stages, it notes the processor seconds of each and its peak of memory above ``held`` MB."""
+
+    def __init__(self, held: float) -> None:
+        self._held, self._start = held, 0.0
+        self.costs: dict[str, tuple[float, float]] = {}
+
+    def __call__(self, stage: str, state: str, record: dict[str, Any]) -> None:
+        if state == "done":
+            self.costs[stage] = (time.process_time() - self._start, max(record["cost"]["peak_mb"] - self._held, 1.0))
+        _held_mb()  # lets go of what the stage left
+        self._start = time.process_time()
 
 
 def apart(size: Size) -> dict[str, tuple[float, float]]:
@@ -270,7 +278,7 @@ def draw(found: dict[str, Points], path: Path) -> None:
             panel.grid(True, which="major", color="0.88")
             panel.legend(fontsize=8, title="slope", title_fontsize=8, loc="upper left", framealpha=0.85)
         panels[1, column].set_xlabel(axis.label)
-    panels[0, 0].set_ylabel("seconds")
+    panels[0, 0].set_ylabel("processor seconds")
     panels[1, 0].set_ylabel("memory above the start, MB")
     for row in (0, 1):  # a line of slope 1 to compare with
         for column, axis in enumerate(AXES):

@@ -211,7 +211,7 @@ def _quality(scenario: Scenario) -> Iterator[Setting]:
     """Each named effect's own knobs, which its class lists from cheap to fine as ``QUALITY``: a value for each parameter."""
     for name, parameters in scenario.effects.items():
         effect = effects.make(name, dict(parameters), f"{scenario.file}: effects")
-        for key, values in getattr(effect, "QUALITY", {}).items():
+        for key, values in effect.QUALITY.items():
             own = getattr(effect.parameters, key)
             finest = SCENARIO if values[-1] == own else f"{name} {key} {values[-1]}"
             for value in reversed(values):

@@ -98,7 +98,7 @@ class TrafficModel(_Model):
     vehicles: int = Field(50, ge=1, description="Vehicles in the whole network at all times")
     hold: Literal["exactly", "at_most"] = Field("exactly", description="Whether a frame with fewer vehicles is an error")
     frames: int = Field(5000, ge=1, le=2**32 - 1, description="Frames to record")
-    frame_period_s: Positive = Field(0.25, description="Time between two frames; a whole number of steps")
+    frame_period_s: Positive = Field(1.0, description="Time between two frames; a whole number of steps")
     step_s: Positive = Field(0.25, description="SUMO's step length")
     warmup_s: float = Field(300.0, ge=0, description="Time before the first frame")
     lateral_resolution_m: float = Field(0.8, ge=0, description="SUMO's sublane width; 0 makes lane changes instant jumps")

@@ -49,7 +49,7 @@ def scenario(folder, effects=None, **keys):
         "roi": {"center_m": [300, 0, 10], "size_m": [60, 40, 20], "voxel_m": 0.5},
         "tpog": {"blocks": 1},
         "sites": {"grid": {"low_m": [300, 10], "high_m": [300, 10], "spacing_m": 1, "heights_m": [12]}},
-        "traffic": keys,
+        "traffic": {"frame_period_s": 0.25, **keys},
         "effects": effects or {},
     }
     return from_values(values, folder, str(folder / "scenario.toml"))

@@ -34,7 +34,7 @@ def scenario(folder, seed=1, **keys):
         "roi": {"center_m": [0, 0, 2.5], "size_m": [50, 100, 5]},
         "tpog": {"blocks": 1},
         "sites": {"grid": {"low_m": [0, 0], "high_m": [1, 1], "spacing_m": 1, "heights_m": [3]}},
-        "traffic": keys,
+        "traffic": {"frame_period_s": 0.25, **keys},
     }
     return from_values(values, folder, str(folder / "scenario.toml"))
 

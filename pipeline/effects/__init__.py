@@ -81,12 +81,15 @@ class Effect:
         The effect's name, and where its model is published.
     Model
         The class of ``parameters``.
+    QUALITY
+        Parameters that trade time for accuracy, and values from cheap to fine; the accuracy study tries them.
     """
 
     parameters: Any
     NAME: ClassVar[str]
     SOURCE: ClassVar[str]
     Model: ClassVar[type[Parameters]]
+    QUALITY: ClassVar[dict[str, tuple[Any, ...]]] = {}
 
     @property
     def reads(self) -> tuple[str, ...]:

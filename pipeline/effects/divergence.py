@@ -18,7 +18,7 @@ that gets there, not by what a detector makes of it; angles are taken as their t
 from __future__ import annotations
 
 import math
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,6 +60,7 @@ class Divergence(Expand):
     NAME: ClassVar[str] = "divergence"
     SOURCE: ClassVar[str] = "Gaussian beam (Siegman 1986); cubature E2r2 5-1 of Stroud (1971)"
     Model: ClassVar[type[Parameters]] = Model
+    QUALITY: ClassVar[dict[str, tuple[Any, ...]]] = {"sub_beams": (7, 19)}
 
     def idle(self, scene: Scene) -> str | None:
         """A single sub-beam, or a cone without width, is the plain beam."""

@@ -27,7 +27,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,6 +68,7 @@ class Foliage(TransmitScan):
     NAME: ClassVar[str] = "foliage"
     SOURCE: ClassVar[str] = "Beer-Lambert with G = 1/2 (Ross 1981); winter from Wilkinson (1992), Gardner and Sydnor (1984)"
     Model: ClassVar[type[Parameters]] = Model
+    QUALITY: ClassVar[dict[str, tuple[Any, ...]]] = {"step_m": (2.0, 0.5, 0.1)}
 
     def extinction_per_m(self) -> float:
         """Nepers a metre within a crown."""

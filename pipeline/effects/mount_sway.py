@@ -15,7 +15,7 @@ move it by 9 cm); no torsion about the pole; within one turn of the sensor the p
 from __future__ import annotations
 
 import math
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +51,7 @@ class MountSway(Expand):
     NAME: ClassVar[str] = "mount_sway"
     SOURCE: ClassVar[str] = "Gaussian tilt; Gauss-Hermite rule (Abramowitz and Stegun 1964, 25.4.46)"
     Model: ClassVar[type[Parameters]] = Model
+    QUALITY: ClassVar[dict[str, tuple[Any, ...]]] = {"samples": (4, 9, 16)}
 
     def idle(self, scene: Scene) -> str | None:
         """A pole at rest is the plain one."""

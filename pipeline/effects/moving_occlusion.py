@@ -161,6 +161,7 @@ class MovingOcclusion(TransmitScore):
     NAME: ClassVar[str] = "moving_occlusion"
     SOURCE: ClassVar[str] = "doi:10.1177/03611981251327575 (frames); Julian, Karaman, Rus 2014 (independent)"
     Model: ClassVar[type[Parameters]] = Model
+    QUALITY: ClassVar[dict[str, tuple[Any, ...]]] = {"frames": (50, 500, 0)}
 
     ready: Replay | Independent | None = field(default=None, compare=False, repr=False)
 
