@@ -9,8 +9,8 @@ packages do instead:
 - the cast: trimesh without Embree, on every nth beam; Embree's own float32 range (``tfar``) on the bare triangles.
 
 Ours is the reference: that it is right is shown by ``make numerics``. Wrong are beams (frames, for occupancy) that a voxel misses
-or has too many; where one voxel gains what it loses, both cancel, so these are lower bounds. Repeats are interleaved; seconds are
-medians as multiples of ours; of the sites' errors the worst is shown.
+or has too many; where one voxel gains what it loses, both cancel, so these are lower bounds. Repeats are interleaved; processor
+seconds are medians, as multiples of ours; of the sites' errors the worst is shown.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from pipeline.world import World
 SCENARIO = Path(__file__).resolve().parent.parent / "scenarios" / "nishishinjuku"
 SITES = ("c08", "c10")
 FRAMES = 400
-REPEATS = 5
+REPEATS = 7
 CAST_BEAMS = 400
 """trimesh casts about so many beams a site; its seconds are scaled up."""
 
@@ -259,14 +259,14 @@ class Scene:
 
 
 def medians(works: Sequence[Callable[[], object]]) -> list[float]:
-    """Seconds of each, measured in turns after one call that is not counted."""
+    """Processor seconds of each, measured in turns after one call that is not counted."""
     times: list[list[float]] = [[] for _ in works]
     for turn in range(REPEATS + 1):
         for work, taken in zip(works, times, strict=True):
-            begin = time.perf_counter()
+            begin = time.process_time()
             work()
             if turn:
-                taken.append(time.perf_counter() - begin)
+                taken.append(time.process_time() - begin)
     return [statistics.median(taken) for taken in times]
 
 
@@ -357,9 +357,9 @@ def cast_rows(scene: Scene) -> list[Row]:
     slow, single = by_trimesh(triangles), by_embree(triangles)
     tree = "rtree" if importlib.util.find_spec("rtree") else "NumPy for rtree"
     seconds = medians([all_of(ours), all_of(single)])
-    start = time.perf_counter()
+    start = time.process_time()
     all_of(slow, step)()
-    seconds.append((time.perf_counter() - start) * sum(len(j[2]) for j in jobs) / sum(len(j[2][::step]) for j in jobs))
+    seconds.append((time.process_time() - start) * sum(len(j[2]) for j in jobs) / sum(len(j[2][::step]) for j in jobs))
     ways = (
         ("Embree's float32 ranges", single, 1),
         (f"trimesh, {tree}; 1 beam in {step}, scaled", slow, step),

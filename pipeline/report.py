@@ -9,6 +9,7 @@ machine. A second run with the same costs writes the same bytes.
 
 from __future__ import annotations
 
+import base64
 import json
 import math
 from collections import Counter
@@ -24,13 +25,15 @@ from pipeline import __version__, figures, tables, visibility
 from pipeline.entropy import Field
 from pipeline.errors import InputError
 from pipeline.figures import Spot
-from pipeline.results import Tpog, read_scores, read_tpog
+from pipeline.results import SEPARABLE, Tpog, read_scores, read_tpog
 from pipeline.scenario import Scenario
 from pipeline.stage import Progress, silent
 from pipeline.world import read_ply
 
 NAME = "report"
 ARTEFACTS = ("report.html",)
+ACCURACY = "accuracy.png"
+"""Shown where the accuracy study was made in the run's folder."""
 
 LISTED, FIRST, LAST = 40, 30, 5
 """More than ``LISTED`` sites are shown as the first and the last of them."""
@@ -70,10 +73,16 @@ def inputs(scenario: Scenario, out: Path) -> dict[str, Any]:
     return {
         "settings": {"shown": _shown(scenario), "keep": scenario.scan.keep, **more},
         "costs": _costs(record),
-        "files": {name: tables.sha256_of(out / name) for name in read if (out / name).is_file()},
+        "files": {name: tables.sha256_of(out / name) for name in (*read, ACCURACY) if (out / name).is_file()},
         "said": {name: _said(record, name) for name in _STAGES},
         "effects": record.get("effects", []),
     }
+
+
+def _accuracy(out: Path) -> str:
+    """The figure of ``egvs accuracy`` in base 64, where the study was made in this folder."""
+    figure = out / ACCURACY
+    return base64.b64encode(figure.read_bytes()).decode("ascii") if figure.is_file() else ""
 
 
 def _shown(scenario: Scenario) -> dict[str, Any]:
@@ -103,7 +112,7 @@ def run(scenario: Scenario, out: Path, *, jobs: int | None = None, progress: Pro
     progress("artefacts read", 1, 3)
     drawn = _figures(scenario, out, ranking, tpog)
     progress("figures drawn", 2, 3)
-    page = _page(scenario, ranking, tpog, drawn, _record(out))
+    page = _page(scenario, ranking, tpog, drawn, _record(out), _accuracy(out))
     tables.write_text(out / ARTEFACTS[0], page)
     progress("page written", 3, 3)
     return {
@@ -255,7 +264,7 @@ def _columns(field: Field, which: NDArray[np.bool_]) -> NDArray[np.float64]:
 # ---- the page
 
 
-def _page(scenario: Scenario, ranking: Ranking, tpog: Tpog, drawn: Drawn, record: dict[str, Any]) -> str:
+def _page(scenario: Scenario, ranking: Ranking, tpog: Tpog, drawn: Drawn, record: dict[str, Any], accuracy: str) -> str:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 
@@ -270,6 +279,9 @@ def _page(scenario: Scenario, ranking: Ranking, tpog: Tpog, drawn: Drawn, record
     rows, effects = ranking.rows, _effects(scenario, record)
     shortened = len(rows) > LISTED
     return environment.get_template("report.html.j2").render(
+        accuracy=accuracy,
+        unsure="egvs_se" in rows[0],
+        separable=SEPARABLE,
         scenario=scenario,
         ranking=ranking,
         first=rows[:FIRST] if shortened else rows,
@@ -336,6 +348,8 @@ def _nearest(ranking: Ranking) -> str:
     lead = f"{behind:.1%}" if behind >= 0.0005 else "less than 0.1%"
     text = f"It leads {second['site']}, the next, by {lead} of its score." if len(ranking.best) == 1 else (
         f"They lead {second['site']}, the next, by {lead} of their score.")  # fmt: skip
+    if ranking.best[0].get("beats_next", 1.0) < SEPARABLE:
+        text += " With this much traffic the two cannot be told apart."
     if len(ranking.close) > 1:
         names = ", ".join(row["site"] for row in ranking.close[:4])
         more = f" and {len(ranking.close) - 4} more" if len(ranking.close) > 4 else ""

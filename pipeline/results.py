@@ -17,6 +17,9 @@ from pipeline import tables
 from pipeline.errors import InputError
 from pipeline.grid import Grid
 
+SEPARABLE = 0.9
+"""Neighbours in rank are told apart when the chance that the better is better (``beats_next``) reaches this."""
+
 
 @dataclass(frozen=True)
 class Tpog:

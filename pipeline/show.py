@@ -15,15 +15,12 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from pipeline.results import SEPARABLE
 from pipeline.sensors import Sensor
 
 if TYPE_CHECKING:
     from pipeline.accuracy import Row, Seeds, Study
     from pipeline.callings import Call, Change
-
-
-SEPARABLE = 0.9
-"""Neighbours in rank are told apart when the chance that the better is better reaches this."""
 
 
 class Screen:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -159,7 +160,11 @@ def verify(
     with tempfile.TemporaryDirectory(prefix="egvs-verify-") as temporary:
         again = _new_record(scenario, Path(temporary))
         for name in STAGES:
-            if name == "report":  # the report shows what the stages cost, which is part of the record
+            if (
+                name == "report"
+            ):  # it shows what the stages cost, which is part of the record, and an accuracy study if there is one
+                for study in folder.glob("accuracy.png"):
+                    shutil.copy(study, temporary)
                 again["stages"] |= {n: {**again["stages"][n], "cost": record["stages"][n]["cost"]} for n in again["stages"]}
             run_stage(name, scenario, Path(temporary), again, jobs=jobs, progress=progress, told=told)
             wrong += _differences(name, record, again)

@@ -280,7 +280,7 @@ def test_effects_are_named_and_no_longer_left_out(made):
     assert "Effects none" in Reader(text).text and "fog" in text
     record = a_record() | {"effects": ["fog", "moving_occlusion"]}
     shown = report._page(about, report.Ranking.of(results.read_scores(out / "scores.parquet").to_pylist(), out),
-                         results.read_tpog(out / "tpog.parquet"), report.Drawn("", "", (), "", ()), record)  # fmt: skip
+                         results.read_tpog(out / "tpog.parquet"), report.Drawn("", "", (), "", ()), record, "")  # fmt: skip
     assert "this run models fog, moving occlusion. Left out are rain, " in Reader(shown).text
 
 
@@ -436,3 +436,13 @@ def test_footprints_are_cut_to_what_is_shown():
 )
 def test_ticks_are_round(low, high, texts):
     assert [text for _, text in figures._nice(low, high, 5)] == texts
+
+
+def test_the_accuracy_study_is_shown_where_there_is_one(made, tmp_path):
+    about, out, text = made
+    assert "What accuracy costs in time" not in text
+    shutil.copytree(out, tmp_path / "out")
+    before = report.inputs(about, tmp_path / "out")
+    (tmp_path / "out" / report.ACCURACY).write_bytes(b"\x89PNG\r\n\x1a\n")
+    assert "data:image/png;base64,iVBORw0KGgo=" in page(about, tmp_path / "out")
+    assert report.inputs(about, tmp_path / "out") != before
