@@ -22,12 +22,14 @@ from rich.console import Console
 from rich.table import Table
 
 import pipeline
-from benchmarks import casting, others, stability
-from pipeline import score, survey, tpog
+from benchmarks import casting, others, savings, stability
+from pipeline import survey, tpog
 from pipeline.entropy import Field
 from pipeline.kernels import march
 from pipeline.ordered import in_order
 from pipeline.results import read_tpog
+from pipeline.sites import Site
+from pipeline.visibility import Beams, Visibility, in_voxels
 from pipeline.world import read_ply
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -44,6 +46,13 @@ def seconds(work: Callable[[], Any], repeats: int = REPEATS) -> float:
         work()
         times.append(time.perf_counter() - start)
     return statistics.median(times)
+
+
+def once(work: Callable[[], Any]) -> float:
+    """Wall time of one call."""
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
 
 
 def egvs(*arguments: str) -> tuple[float, float]:
@@ -86,41 +95,37 @@ def sites(folder: Path) -> list[tuple[str, str, str, bool]]:
     """Scan and score, site by site: from the static world and the TPOG in memory to a score."""
     scenario, run = pipeline.load(SCENARIO), folder / "run"
     world, _ = read_ply(run / "statics.ply")
-    grid_of = read_tpog(run / "tpog.parquet")
-    field = Field.of(grid_of.counts, grid_of.frames, grid_of.grid)
+    counted = read_tpog(run / "tpog.parquet")
+    field = Field.of(counted.counts, counted.frames, counted.grid)
     surveyed = survey.Survey(scenario, world)
-    scans = [surveyed.scan(site) for site in surveyed.sites]
-    grid = field.grid
-    shape, origin = np.asarray(grid.shape, dtype=np.int64), np.asarray(grid.origin_m)
-    hits = np.zeros(int(np.prod(grid.shape)), dtype=np.uint32)
+    visibility = Visibility(scenario, run, counted.grid)
+    beams = {site: Beams(scan.about, scan.scan.ends_m) for site in surveyed.sites for scan in [surveyed.scan(site)]}
+    hits = np.zeros(int(np.prod(counted.grid.shape)), dtype=np.uint32)
 
-    def score_one(site: Any) -> float:
-        mine = np.zeros_like(hits)
+    def score_one(site: Site) -> float:
         found = surveyed.scan(site)
-        score.count_hits(found.about, found.scan.ends_m, field, mine)
-        return field.score(mine, 10.0).egvs
+        return field.score(visibility.hits(Beams(found.about, found.scan.ends_m)), 10.0).egvs
 
-    def march_one(scan: Any) -> None:
-        o = (np.asarray(scan.site.position_m) - origin) / grid.voxel_m
-        march.count_hits(o, scan.scan.ends_m / grid.voxel_m, shape, grid.voxel_m, hits)
+    def march_one(site: Site) -> None:
+        o, d, shape = in_voxels(beams[site], counted.grid)
+        hits.fill(0)
+        march.count_hits(o, d, shape, counted.grid.voxel_m, hits)
 
-    one, marching = [], []
-    for site, scan in zip(surveyed.sites, scans, strict=True):
-        one.append(seconds(lambda site=site: score_one(site)))
-        marching.append(seconds(lambda scan=scan: march_one(scan)))
-    many = surveyed.sites * 4
-    times: dict[int, list[float]] = {1: [], 2: []}
+    whole = statistics.median(seconds(lambda site=site: score_one(site)) for site in surveyed.sites)
+    part = statistics.median(seconds(lambda site=site: march_one(site)) for site in surveyed.sites)
+    times: dict[str, list[float]] = {"1": [], "2": [], "bare": [], "plain": []}
     for _ in range(REPEATS):
-        for threads, taken in times.items():
-            start = time.perf_counter()
-            list(in_order(score_one, many, threads))
-            taken.append(time.perf_counter() - start)
-    gain = statistics.median(a / b for a, b in zip(times[1], times[2], strict=True))
-    whole, part = statistics.median(one), statistics.median(marching)
+        for threads in (1, 2):
+            times[str(threads)].append(once(lambda threads=threads: list(in_order(score_one, surveyed.sites * 4, threads))))
+        times["bare"].append(once(lambda: [march_one(site) for site in surveyed.sites]))
+        times["plain"].append(once(lambda: [visibility.hits(beams[site]) for site in surveyed.sites]))
+    gain = statistics.median(a / b for a, b in zip(times["1"], times["2"], strict=True))
+    extra = statistics.median(a / b for a, b in zip(times["plain"], times["bare"], strict=True))
     return [
         ("scan + score of a site, one thread, median", f"{whole * 1e3:.1f} ms", "20 ms", whole < 0.020),
         ("  of which the march", f"{part * 1e3:.1f} ms", "13 ms", part < 0.013),
         ("  two threads against one", f"{gain:.2f} x", "1.7 x", gain >= 1.7),
+        ("  plain scene where effects could be, against the bare march", f"{extra:.3f} x", "1.03 x", extra <= 1.03),
     ]
 
 
@@ -140,6 +145,7 @@ def main() -> None:
     for title, measure in (
         ("what stability costs", stability.rows),
         ("what exact hits cost", casting.rows),
+        ("what leaving out the unseen saves", savings.rows),
         ("what other ways cost, and how wrong they are", others.rows),
     ):
         console.print(f"\n{title}")
