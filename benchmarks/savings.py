@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 import pipeline
-from pipeline import statics, survey
+from pipeline import statics, survey, tpog
 from pipeline.raycast import Caster
 from pipeline.world import World
 
@@ -46,7 +46,43 @@ def city(world: World, spacing_m: float = 700.0) -> World:
 
 def rows() -> list[tuple[str, str, str, bool]]:
     """What was saved, the ratio, what is wanted, and whether it is so."""
-    return [*_pair("junction", lambda world: world), *_pair("city of nine", city)]
+    return [*_pair("junction", lambda world: world), *_pair("city of nine", city), *_beams(), *_flat()]
+
+
+def _beams() -> list[tuple[str, str, str, bool]]:
+    """Only beams that can meet the region of interest are cast."""
+    scenario = pipeline.load(SCENARIO)
+    roi, surveyed = scenario.roi.box, survey.Survey(scenario, statics.build(scenario, statics.Tally.empty()))
+    sensor = surveyed._sensors[surveyed.sites[0].site]
+    directions, range_m, caster = sensor.directions(), sensor.range_m, surveyed._caster
+    starts = [np.asarray(site.position_m) - np.asarray(roi.origin_m) for site in surveyed.sites]
+    scans = [caster.scan(site.position_m, directions, range_m) for site in surveyed.sites]
+    same = True
+    for start, scan in zip(starts, scans, strict=True):
+        ranges = np.minimum(caster.first_hits(start, directions, range_m)[0], range_m)
+        same &= (directions * ranges[:, None])[scan.beam].tobytes() == scan.ends_m.tobytes()
+    took = in_turn(
+        lambda: [caster.first_hits(start, directions[scan.beam], range_m) for start, scan in zip(starts, scans, strict=True)],
+        lambda: [caster.first_hits(start, directions, range_m) for start in starts],
+    )
+    part = sum(len(scan.beam) for scan in scans) / (len(directions) * len(scans))
+    return [
+        ("beams that can meet the region", f"{part:.0%}", "same bytes", same),
+        ("  casting these / all", f"{took[0] / took[1]:.2f}", "1", took[0] <= took[1]),
+    ]
+
+
+def _flat() -> list[tuple[str, str, str, bool]]:
+    """Flat boxes take the flat path."""
+    grid = pipeline.load(SCENARIO).roi.grid
+    rng, n = np.random.default_rng(5), 20_000
+    centres = np.column_stack([rng.uniform(0, 100, n), rng.uniform(0, 50, n), np.full(n, 0.75)])
+    sizes = np.tile([4.5, 1.75, 1.5], (n, 1))
+    flat = tpog.Boxes(np.arange(n) // 20, np.column_stack([centres, rng.uniform(-3, 3, n), np.zeros(n), sizes]))
+    tipped = tpog.Boxes(flat.frame, flat.values + np.array([0, 0, 0, 0, 1e-15, 0, 0, 0]))
+    same = np.array_equal(tpog.count(flat, grid, n // 20), tpog.count(tipped, grid, n // 20))
+    took = in_turn(lambda: tpog.count(flat, grid, n // 20), lambda: tpog.count(tipped, grid, n // 20))
+    return [("flat boxes: flat path / separating axes", f"{took[0] / took[1]:.3f}", "1, same counts", same and took[0] <= took[1])]
 
 
 def _pair(name: str, grown: Callable[[World], World]) -> list[tuple[str, str, str, bool]]:
