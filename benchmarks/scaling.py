@@ -37,7 +37,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PAGE, FIGURE = ROOT / "docs" / "scaling.md", ROOT / "docs" / "images" / "scaling.png"
 BETWEEN = ("<!-- measured -->", "<!-- end -->")
 
-REPEATS, ENOUGH_S = 3, 2.0
+REPEATS, ENOUGH_S = 3, 1.0
 """A size is run so often, unless that long has passed."""
 
 LINEAR = 1.1
@@ -227,9 +227,11 @@ def study() -> dict[str, Points]:
         for value in axis.sizes:
             start = time.perf_counter()
             size = replace(Size(), **{axis.name: value if axis.name == "hectares" else int(value)})
-            for stage, cost in apart(size).items():
+            costs = apart(size)
+            for stage, cost in costs.items():
                 points.setdefault(stage, {})[value] = cost
-            print(f"{axis.label} {value:g}: {time.perf_counter() - start:.1f} s", file=sys.stderr)
+            told = ", ".join(f"{stage} {costs[stage][0]:.2f} s {costs[stage][1]:.0f} MB" for stage in axis.stages)
+            print(f"{axis.label} {value:g}: {told}; whole {time.perf_counter() - start:.1f} s", file=sys.stderr)
         found[axis.name] = points
     return found
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pipeline import tables
 from pipeline.errors import InputError
 from pipeline.grid import Grid
+from pipeline.kernels.crossings import accumulate
 
 SEPARABLE = 0.9
 """Neighbours in rank are told apart when the chance that the better is better (``beats_next``) reaches this."""
@@ -48,19 +49,21 @@ class Tpog:
 def read_tpog(path: str | Path) -> Tpog:
     """Read ``tpog.parquet``; InputError when it is corrupt or a row lies outside the grid."""
     path = Path(path)
-    table, about = tables.read(path, "tpog")
-    grid = Grid.from_json(about["grid"])
-    index = [table.column(name).to_numpy() for name in ("ix", "iy", "iz")]
-    for axis, (values, size) in enumerate(zip(index, grid.shape, strict=True)):
-        if len(values) and not (values.min() >= 0 and values.max() < size):
-            raise InputError(path, f"i{'xyz'[axis]} leaves the grid", f"0 to {size - 1}")
-    flat = np.ravel_multi_index(index, grid.shape) if len(table) else np.empty(0, dtype=np.int64)
-    # bincount adds float64: exact, as no sum of counts reaches 2**53
-    weights = table.column("count").to_numpy()
-    counts = np.bincount(flat, weights=weights, minlength=int(np.prod(grid.shape))).astype(np.int64)
-    if len(counts) and counts.max(initial=0) > about["frames"]:
-        raise InputError(path, f"a voxel is occupied in {counts.max()} of {about['frames']} frames", "counts up to the frames")
-    return Tpog(grid, int(about["frames"]), counts.reshape(grid.shape))
+    with tables.reader(path, "tpog") as (file, about):
+        grid, frames = Grid.from_json(about["grid"]), int(about["frames"])
+        counts = np.zeros(int(np.prod(grid.shape)), dtype=np.int64)
+        for group in range(file.num_row_groups):  # one block each: memory does not grow with their number
+            table = tables.read_group(file, group, path, ["ix", "iy", "iz", "count"])
+            index = [table.column(name).to_numpy() for name in ("ix", "iy", "iz")]
+            for axis, (values, size) in enumerate(zip(index, grid.shape, strict=True)):
+                if len(values) and not (values.min() >= 0 and values.max() < size):
+                    raise InputError(path, f"i{'xyz'[axis]} leaves the grid", f"0 to {size - 1}")
+            if len(table):
+                flat = np.ravel_multi_index(index, grid.shape)
+                accumulate(flat, table.column("count").to_numpy().astype(np.int64), counts)
+    if counts.max(initial=0) > frames:
+        raise InputError(path, f"a voxel is occupied in {counts.max()} of {frames} frames", "counts up to the frames")
+    return Tpog(grid, frames, counts.reshape(grid.shape))
 
 
 def read_scores(path: str | Path) -> pa.Table:
