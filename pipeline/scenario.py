@@ -36,11 +36,15 @@ from pipeline.grid import Grid, Roi
 FILE = "scenario.toml"
 _SUMO = "$SUMO_HOME/"
 
+FARTHEST_M = 1e8
+"""Coordinates beyond this are a mistake: the Earth is 4e7 m round."""
+
 Positive = Annotated[float, Field(gt=0)]
+Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
 NotNegative = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
-Point2 = tuple[float, float]
-Point3 = tuple[float, float, float]
+Point2 = tuple[Coordinate, Coordinate]
+Point3 = tuple[Coordinate, Coordinate, Coordinate]
 Name = Annotated[str, Field(min_length=1, pattern=r"^[^\s/\\:*?\"<>|]+$")]
 
 
@@ -123,6 +127,18 @@ class TrafficModel(_Model):
             raise ValueError(f"two kinds have the same name: {', '.join(sorted({n for n in names if names.count(n) > 1}))}")
         return self
 
+    @model_validator(mode="after")
+    def _not_endless(self) -> TrafficModel:
+        lasts_s = self.warmup_s + self.frames * self.frame_period_s
+        for what, amount, most in (
+            ("frames", self.frames, 10_000_000),
+            ("seconds of traffic", lasts_s, 1e7),
+            ("drawn trips (trips_per_s times these seconds)", lasts_s * self.trips_per_s, 1e7),
+        ):
+            if amount > most:
+                raise ValueError(f"{amount:,.0f} {what}: at most {most:,.0f} can be handled")
+        return self
+
     def idle_keys(self) -> tuple[str, set[str]]:
         """The source of the traffic, and the keys that the user set although they act on nothing with this source."""
         drawn = {"trips_per_s", "min_trip_m", "edge_weights", "kinds"}
@@ -139,7 +155,7 @@ class MeshModel(_Model):
 
     file: str
     offset_m: Point3 = Field((0.0, 0.0, 0.0), description="Added to every vertex to reach the world frame")
-    kind: str = Field("mesh", description="Shown in messages and in the report")
+    kind: Name = Field("mesh", description="Shown in messages and in the report")
 
 
 class StaticsModel(_Model):
@@ -161,6 +177,9 @@ class TpogModel(_Model):
 
 
 _OPTICS = ("wavelength_nm", "divergence_mrad", "rated_range_m", "rated_reflectivity")
+
+
+_MOST_BEAMS = 10_000_000
 
 
 class SensorModel(_Model):
@@ -201,6 +220,8 @@ class SensorModel(_Model):
                 f"channels = {self.channels} needs elevations_deg with 2 values (uniform) or {self.channels}, found {listed}"
             )
         rings = self.channels or listed
+        if rings * 360.0 / self.azimuth_step_deg > _MOST_BEAMS:
+            raise ValueError(f"{rings} rings every {self.azimuth_step_deg:g} degrees are more than {_MOST_BEAMS:,} beams")
         if self.azimuth_offsets_deg and len(self.azimuth_offsets_deg) != rings:
             raise ValueError(
                 f"azimuth_offsets_deg has {len(self.azimuth_offsets_deg)} values, one for each of {rings} rings is needed"
@@ -348,6 +369,8 @@ def load(path: str | Path, overrides: Iterable[str] = ()) -> Scenario:
     file = path / FILE if path.is_dir() else path
     values = _read(file, ())
     for override in overrides:
+        if override.partition("=")[0].strip() == "extends":
+            raise InputError(f"--set {override}", "a scenario is extended by its file alone", "extends = ... in a scenario.toml")
         _lay_over(values, override)
     scenario = from_values(values, file.parent, str(file))
     if scenario.effects:

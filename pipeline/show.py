@@ -62,7 +62,9 @@ class Screen:
         if self._lively:
             self._bar.update(self._task, visible=False)
         took = "unchanged" if state == "skipped" else f"{record['cost']['seconds']:.2f} s"
-        self._err.print(f"{stage:<8} {took:>10}   {_in_words(record['said'])}", markup=False)
+        self._err.print(
+            f"{stage:<8} {took:>10}   {_in_words({k: v for k, v in record['said'].items() if k != 'flags'})}", markup=False
+        )
 
     def setting(self, name: str, state: str, said: dict[str, Any]) -> None:
         """A :data:`pipeline.accuracy.Told`."""
@@ -124,19 +126,22 @@ def ranking(rows: list[dict[str, Any]]) -> Table:
     for name in columns:
         table.add_column(name, justify="left" if name in ("site", "sensor") else "right")
     best = max((row["egvs"] for row in rows), default=0.0)
-    for row in sorted(rows, key=lambda row: row["rank"]):
+    ordered = sorted(rows, key=lambda row: row["rank"])
+    for row in ordered:
         share = f"{row['egvs'] / best:.1%}" if best > 0 else "-"
+        doubt = _doubt(row, row is ordered[-1]) if unsure else ()
         table.add_row(
             str(row["rank"]), row["site"], f"{row['x_m']:.2f}", f"{row['y_m']:.2f}", f"{row['z_m']:.2f}", row["sensor"],
-            f"{row['egvs']:.1f}", *(_doubt(row) if unsure else ()), share, f"{row['entropy_seen']:.1%}", str(row["beams_in_roi"]),
+            f"{row['egvs']:.1f}", *doubt, share, f"{row['entropy_seen']:.1%}", str(row["beams_in_roi"]),
         )  # fmt: skip
     return table
 
 
-def _doubt(row: dict[str, Any]) -> tuple[str, str]:
+def _doubt(row: dict[str, Any], last: bool) -> tuple[str, str]:
     """How far a score may be off, and whether the site is told from the next."""
     mark = "~ " if row["beats_next"] < SEPARABLE else ""
-    return f"{row['egvs_se'] / row['egvs']:.1%}" if row["egvs"] > 0 else "-", f"{mark}{row['beats_next']:.0%}"
+    beats = "-" if last else f"{mark}{row['beats_next']:.0%}"
+    return f"{row['egvs_se'] / row['egvs']:.1%}" if row["egvs"] > 0 else "-", beats
 
 
 def catalogue(sensors: Iterable[Sensor]) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,11 +18,12 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import InputError
-from pipeline.scenario import Scenario, SiteGrid, SiteLine
+from pipeline.scenario import FARTHEST_M, Scenario, SiteGrid, SiteLine
 
 _NEEDED = ("site", "x_m", "y_m", "z_m")
 _POSE = ("yaw_deg", "pitch_deg", "roll_deg")
 _TEXTS = ("sensor", "points")
+_NAME = re.compile(r"[^/\\\x00-\x1f]{1,80}")  # becomes part of file names
 
 
 @dataclass(frozen=True)
@@ -96,6 +98,8 @@ def _site(place: str, row: dict[str, Any], scenario: Scenario) -> Site:
         if row.get(key) in (None, ""):
             raise InputError(place, f"{key} is missing", f"the columns {', '.join(_NEEDED)}")
     values: dict[str, Any] = {"site": str(row["site"]).strip()}
+    if not _NAME.fullmatch(values["site"]):
+        raise InputError(f"{place}: site", f"{values['site'][:80]!r}", "a name of up to 80 characters without / and \\")
     for key in (*_NEEDED[1:], *_POSE):
         value = row.get(key)
         values[key] = _number(place, key, getattr(scenario.sites, key) if value in (None, "") else value)
@@ -111,15 +115,19 @@ def _number(place: str, key: str, value: Any) -> float:
         number = float(value)
     except (TypeError, ValueError):
         number = math.nan
-    if not math.isfinite(number) or isinstance(value, bool):
-        raise InputError(f"{place}: {key}", f"{value!r}", "a finite number")
+    if not abs(number) <= FARTHEST_M or isinstance(value, bool):
+        raise InputError(f"{place}: {key}", f"{value!r}", f"a finite number, at most {FARTHEST_M:g}")
     return number
 
 
 def _csv(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
-            for row in csv.DictReader(file, skipinitialspace=True):
+            rows = csv.DictReader(file, skipinitialspace=True)
+            names = list(rows.fieldnames or ())
+            if twice := sorted({name for name in names if names.count(name) > 1}):
+                raise InputError(path, f"the column {twice[0]!r} stands there twice", "each column once")
+            for row in rows:
                 place = f"{path}: row {row.get('site') or '?'}"
                 if None in row or None in row.values():
                     raise InputError(place, "has more or fewer values than the header has columns", "one value a column")
@@ -139,7 +147,7 @@ def _geojson(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
             row = dict(zip(("x_m", "y_m", "z_m"), geometry["coordinates"], strict=False))
             name = properties.pop("name", None)
             yield place, {"site": name, **row, **properties}
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
+    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise InputError(path, f"cannot be read as GeoJSON ({error})", "a FeatureCollection of Points") from None
 
 

@@ -12,7 +12,6 @@ heights count from the ground below the footprint's centre; what stands on the g
 from __future__ import annotations
 
 import json
-import math
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -24,7 +23,7 @@ from numpy.typing import NDArray
 
 from pipeline import network, safexml, tables
 from pipeline.errors import InputError
-from pipeline.scenario import MeshModel, Scenario
+from pipeline.scenario import FARTHEST_M, MeshModel, Scenario
 from pipeline.stage import Progress, metadata, silent
 from pipeline.world import World, write_ply
 
@@ -159,7 +158,7 @@ def _geojson(path: Path, tally: Tally) -> Iterator[Footprint]:
     """Footprints of a GeoJSON FeatureCollection in world-frame metres."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(path, f"is not valid JSON: {error}", "a GeoJSON FeatureCollection") from None
     if not isinstance(document, dict) or not isinstance(document.get("features"), list):
         raise InputError(path, "has no list of features", "a GeoJSON FeatureCollection in world-frame metres")
@@ -182,8 +181,8 @@ def _metres(properties: dict[str, Any], key: str, place: str, default: float | N
     value = properties.get(key, default)
     if value is None:
         raise InputError(place, f"{key} is missing", "a number of metres")
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{place}: {key}", f"{value!r}", "a finite number of metres")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= FARTHEST_M:
+        raise InputError(f"{place}: {key}", f"{value!r}", f"a finite number of metres, at most {FARTHEST_M:g}")
     return float(value)
 
 
@@ -195,10 +194,14 @@ def _polygons(geometry: Any, properties: dict[str, Any], place: str, tally: Tall
         with np.errstate(invalid="ignore"):  # what is no number is refused below
             shape: BaseGeometry = shapely.geometry.shape(geometry)
         coordinates = shapely.get_coordinates(shape)
-    except (shapely.errors.ShapelyError, TypeError, ValueError, KeyError, AttributeError, IndexError) as error:
+    except (shapely.errors.ShapelyError, TypeError, ValueError, KeyError, AttributeError, IndexError, RecursionError) as error:
         raise InputError(f"{place}: geometry", f"cannot be understood ({error})", "a GeoJSON geometry") from None
     if shape.is_empty or not np.isfinite(coordinates).all():
         raise InputError(f"{place}: geometry", "is empty or has a coordinate that is no number", "finite metres")
+    if np.abs(coordinates).max() > FARTHEST_M:
+        raise InputError(
+            f"{place}: geometry", f"lies {np.abs(coordinates).max():g} m from the world's zero", f"within {FARTHEST_M:g} m"
+        )
     if shapely.has_z(shape) and np.any(shapely.get_coordinates(shape, include_z=True)[:, 2] != 0):
         raise InputError(f"{place}: geometry", "has z coordinates", "two coordinates a point; heights go into base_m, height_m")
     if shape.geom_type.endswith(("Point", "LineString")):
@@ -267,13 +270,16 @@ def _add_mesh(builder: _Builder, path: Path, model: MeshModel, tally: Tally) -> 
 
     try:
         mesh = trimesh.load(path, force="mesh", process=False)
-    except (ValueError, KeyError, IndexError, OSError, NotImplementedError, AttributeError, TypeError) as error:
+    except (ValueError, LookupError, OSError, NotImplementedError, AttributeError, TypeError, ImportError) as error:
         raise InputError(path, f"cannot be loaded ({error})", "a mesh that trimesh reads: PLY, OBJ, STL, GLB") from None
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise InputError(path, "holds no triangles", "a triangle mesh")
-    if not np.isfinite(mesh.vertices).all():
-        bad = int(np.flatnonzero(~np.isfinite(mesh.vertices).all(axis=1))[0])
-        raise InputError(f"{path}: vertex {bad}", f"{mesh.vertices[bad].tolist()}", "finite coordinates")
+    near = (np.abs(mesh.vertices) <= FARTHEST_M).all(axis=1)
+    if not near.all():
+        bad = int(np.flatnonzero(~near)[0])
+        raise InputError(f"{path}: vertex {bad}", f"{mesh.vertices[bad].tolist()}", f"finite coordinates, at most {FARTHEST_M:g} m")
+    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
+        raise InputError(path, f"a triangle names vertex {mesh.faces.max()} of {len(mesh.vertices)}", "a whole mesh")
     faces = len(mesh.faces)
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())

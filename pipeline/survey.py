@@ -129,6 +129,9 @@ class Survey:
         o = np.asarray(site.position_m) - np.asarray(self._roi.origin_m)
         rays.can_meet(o, ends / away * self._sensors[site.site].range_m, np.asarray(self._roi.size_m), reaches)
         beam = np.flatnonzero(reaches)
+        if not len(beam):
+            found = f"none of {len(points)} points lies on a beam that can meet the region of interest"
+            raise InputError(place, found, "points in the world frame")
         weight = np.ones(len(beam)) if self.columns else None
         return EmptyScan(beam.astype(np.uint32), ends[beam], np.ones(len(beam), dtype=np.bool_), weight=weight), len(points)
 

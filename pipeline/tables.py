@@ -116,12 +116,14 @@ def aside(path: Path) -> Iterator[Path]:
     """Yield a path to write to; rename it to ``path`` when the block ends well, remove it when it does not."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.partial")
+    if path.is_dir():
+        raise InputError(path, "is a folder", "a file, or nothing, where an artefact is written")
     try:
         yield partial
+        partial.replace(path)
     except BaseException:
         partial.unlink(missing_ok=True)
         raise
-    partial.replace(path)
 
 
 def write_text(path: Path, text: str) -> None:

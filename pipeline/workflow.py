@@ -90,7 +90,19 @@ def run_one(
         record = _read_record(out, scenario)
         record["stages"].pop(name, None)
         run_stage(name, scenario, out, record, jobs=jobs, progress=progress, told=told, **options)
+        for other in [stage for stage in record["stages"] if stage != name and not _is_of(stage, scenario, out, record)]:
+            del record["stages"][other]  # of other settings: the record would contradict itself
+        _write_record(out, record)
         return record
+
+
+def _is_of(name: str, scenario: Scenario, out: Path, record: dict[str, Any]) -> bool:
+    """Whether a stage's last run is what this scenario, and the artefacts as they are now, would give."""
+    try:
+        inputs = tables.hash_of({"egvs": __version__, **_stage(name).inputs(scenario, out)})
+    except InputError:
+        return False
+    return bool(record["stages"][name]["inputs"] == inputs)
 
 
 def default_folder(scenario: Scenario) -> Path:
@@ -220,10 +232,13 @@ def _load_record(folder: Path) -> dict[str, Any]:
     try:
         record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         record["stages"].items()
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         raise InputError(path, "no such file", "a folder that egvs run has written") from None
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError) as error:
+    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(path, f"is not a run's record ({error})", "remove it and run again") from None
+    for key, kind in (("egvs", str), ("seed", int), ("scenario", dict), ("scenario_folder", str), ("effects", list)):
+        if not isinstance(record.get(key), kind):
+            raise InputError(path, f"is not a run's record ({key!r} is {record.get(key)!r})", "remove it and run again")
     return record
 
 

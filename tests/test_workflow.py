@@ -176,6 +176,32 @@ def test_a_record_that_is_none_is_refused(done: tuple[Path, Path]) -> None:
         pipeline.run(pipeline.load(mini), out)
 
 
+@pytest.mark.parametrize("key", ["scenario", "scenario_folder", "egvs", "seed", "effects"])
+def test_a_record_with_an_odd_value_is_refused(done: tuple[Path, Path], key: str, egvs) -> None:
+    mini, out = done
+    record = json.loads((out / "run.json").read_text())
+    (out / "run.json").write_text(json.dumps(record | {key: [None] if key != "effects" else "all"}))
+    for arguments in (("run", mini, "--out", out), ("verify", out)):
+        code, _, said = egvs(*arguments)
+        assert (code, f"'{key}' is" in said) == (2, True), said
+
+
+def test_a_single_stage_with_other_settings_leaves_no_mixed_record(done: tuple[Path, Path], egvs) -> None:
+    mini, out = done
+    assert egvs("score", mini, "--out", out, "--set", "score.gamma=7", "--set", "sites.yaw_deg=5")[0] == 0
+    code, _, said = egvs("verify", out)
+    assert (code, "the stage scan is not done" in said) == (2, True), said
+    assert egvs("run", mini, "--out", out)[0] == 0
+    assert egvs("verify", out)[0] == 0
+
+
+def test_an_artefacts_name_that_is_a_folder_is_told_and_nothing_is_left(mini: Path, tmp_path: Path, egvs) -> None:
+    (tmp_path / "out" / "scans.parquet").mkdir(parents=True)
+    code, _, said = egvs("run", mini, "--out", tmp_path / "out")
+    assert (code, "scans.parquet: is a folder" in said) == (2, True), said
+    assert not list((tmp_path / "out").glob(".*.partial"))
+
+
 def start(mini: Path, out: Path) -> subprocess.Popen[bytes]:
     code = "from pipeline.cli import main; main()"
     return subprocess.Popen(
