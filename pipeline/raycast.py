@@ -11,7 +11,7 @@ Embree (float32) answers *which triangle*, float64 *where*:
    triangles in float64.
 
 What is left to float32: where a surface stands on the middle of another (a wall on the ground), a beam within some 1e-5 m of the
-line between them may be given the farther of the two, rarely more than 1 mm and at most some millimetres behind the nearer.
+line between them may be given the farther of the two, which then lies less than 1 mm behind the nearer.
 """
 
 from __future__ import annotations
@@ -226,7 +226,7 @@ def _boxes(triangles: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray
 
 
 def _tree(triangles: NDArray[np.float64]) -> tuple[NDArray[np.int64], Any]:
-    """Embree's tree over the enlarged triangles; and the triangle behind each of its own, the last one being none (-1).
+    """Embree's tree over the enlarged triangles; and the triangle behind each of its own, FIN for a fin; the last is none (-1).
 
     A triangle is scaled from its incentre so that its sides move out by the rim. That moves a needle's tip far; a needle is
     held as the two triangles of a rectangle that covers it. Then the fins.
@@ -248,16 +248,14 @@ def _tree(triangles: NDArray[np.float64]) -> tuple[NDArray[np.int64], Any]:
     enlarged = triangles + from_centre * share[:, None, None]
     first, second = _rectangles(triangles[needles], sides[needles], cross[needles], rim[needles])
     enlarged[needles] = first
-    fins, finned = _fins(triangles, cross, rim)
+    fins = _fins(triangles, cross, rim)
     scene = EmbreeScene()
     TriangleMesh(scene, np.concatenate([enlarged, second, fins]).astype(np.float32))
-    return np.concatenate([np.arange(len(triangles)), needles, finned, [-1]]), scene
+    return np.concatenate([np.arange(len(triangles)), needles, np.full(len(fins), rays.FIN), [-1]]), scene
 
 
-def _fins(
-    triangles: NDArray[np.float64], cross: NDArray[np.float64], rim: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Strips upright on the sides that no steep neighbour guards, (f, 3, 3), and the triangle behind each.
+def _fins(triangles: NDArray[np.float64], cross: NDArray[np.float64], rim: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Strips upright on the sides that no steep neighbour guards, (f, 3, 3).
 
     A rim in the triangle's plane is no guard against a beam along that plane. The rim of a neighbour that stands steep on it
     is; elsewhere the side gets a strip as high above and below as the rim is wide.
@@ -279,7 +277,7 @@ def _fins(
     along = (b - a) / np.sqrt(((b - a) ** 2).sum(axis=1))[:, None] * wide
     corners = [a - along - n * wide, b + along - n * wide, b + along + n * wide, a - along + n * wide]
     strips = [np.stack([corners[0], corners[i], corners[i + 1]], axis=1) for i in (1, 2)]
-    return np.concatenate(strips), np.tile(owner[side], 2)
+    return np.concatenate(strips)
 
 
 def _before(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.bool_]:

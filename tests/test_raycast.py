@@ -209,6 +209,25 @@ def test_no_leak_along_a_surface_of_many_triangles(graze_deg, size_m):
     assert np.abs(ranges - np.linalg.norm(targets - o, axis=1)).max() < 1e-3
 
 
+@pytest.mark.parametrize("height_m", [2.0, 0.3])
+def test_feet_of_poles_on_the_ground(height_m):
+    """Where surfaces stand on each other, a beam may be given the farther of the two only when it is less than 1 mm behind."""
+    rng = np.random.default_rng(12)
+    ground = quad([-600, -600, 0], [700, -600, 0], [700, 700, 0], [-600, 700, 0])
+    places = np.column_stack([rng.uniform(20, 150, 40), rng.uniform(30, 70, 40), np.full(40, 4.75)])
+    pole = trimesh.creation.cylinder(radius=0.09, height=9.5, sections=16).triangles
+    scene = np.concatenate([ground, *(pole + place for place in places)])
+    o, n = np.array([0.0, 50.0, height_m]), 8000
+    corners = scene[2:].reshape(-1, 3)
+    corners = corners[(corners[:, 2] == 0) & (np.linalg.norm(corners - np.repeat(places, len(pole) * 3, axis=0), axis=1) > 4.75)]
+    spread = 10.0 ** rng.uniform(-6, -3.5, (n, 3)) * rng.choice([-1, 1], (n, 3))
+    target = corners[rng.integers(0, len(corners), n)] + spread
+    found, true = cast_both(scene, o, towards(o, target))
+    assert not cast.differ(found, true, 1e-5).mean() > 1e-3
+    assert np.abs(found - true)[np.isfinite(true)].max() < 1e-3
+    assert (np.isfinite(found) == np.isfinite(true)).all()
+
+
 COARSE = st.tuples(*[st.integers(0, 8).map(lambda v: v * 1.25)] * 3)
 
 

@@ -115,7 +115,8 @@ def test_poses_that_a_hand_can_show(pose, x, y, z):
 def test_tilted_beams_are_the_rotated_table():
     sensor = CATALOGUE["VLP-16"]
     for pose in ((10.0, -20.0, 5.0), (0.0, 0.0, 90.0), (200.0, 30.0, 0.0)):
-        assert np.abs(sensor.directions(*pose) - sensor.directions() @ rotation(*pose).T).max() < 1e-15
+        for table in (sensor, CATALOGUE["VLP-32C"]):
+            assert np.abs(table.directions(*pose) - table.directions() @ rotation(*pose).T).max() < 1e-15
     level_ahead = 0 * sensor.channels + sensor.elevations_deg.index(1.0)
     assert sensor.directions(0.0, -10.0, 0.0)[level_ahead][2] == pytest.approx(np.sin(np.radians(-9.0)), abs=1e-15)
 

@@ -34,6 +34,9 @@ SHALLOW = 0.01
 CHORD_M = 1e-6
 """A ray that shares no longer piece with the region of interest is not cast."""
 
+FIN = -2
+"""Stands for a fin, which is no triangle: a ray that meets it first is doubtful."""
+
 GROUP = 8
 """Boxes that share the next larger box in :func:`search`."""
 
@@ -122,7 +125,7 @@ def settle(proposed, triangles, planes, o, d, range_m, ranges, doubtful):  # typ
     Parameters
     ----------
     proposed
-        Index of the triangle that each ray meets first in slightly enlarged form, -1 for none, (n,) int32.
+        Index of the triangle that each ray meets first in slightly enlarged form, -1 for none, ``FIN`` for a fin, (n,) int64.
     triangles, planes
         All triangles (m, 3, 3) and their planes (m, 4, 4), float64.
     o, d
@@ -145,9 +148,11 @@ def settle(proposed, triangles, planes, o, d, range_m, ranges, doubtful):  # typ
         ranges[ray], k = np.inf, proposed[ray]
         if k >= 0:
             ranges[ray], depth, sine = meet(triangles[k], planes[k], ox, oy, oz, d[ray, 0], d[ray, 1], d[ray, 2])
-            if not depth >= SURE_M or (sine < SHALLOW and ranges[ray] <= range_m + 1.0):
-                doubtful[count] = ray
-                count += 1
+            if depth >= SURE_M and (sine >= SHALLOW or ranges[ray] > range_m + 1.0):
+                continue
+        if k != -1:
+            doubtful[count] = ray
+            count += 1
     return count
 
 
