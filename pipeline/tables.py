@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,6 +22,7 @@ import pyarrow.parquet as pq
 
 from pipeline import schemas
 from pipeline.errors import InputError
+from pipeline.grid import MAX_VOXELS, Grid
 
 _KEY = b"egvs"
 _WRITE = {"compression": "zstd", "compression_level": 3, "version": "2.6", "write_statistics": True}
@@ -91,9 +93,7 @@ def reader(path: Path, artefact: str) -> Iterator[tuple[pq.ParquetFile, dict[str
         raw = (file.metadata.metadata or {}).get(_KEY)
         if raw is None:
             raise InputError(path, "no metadata under the key 'egvs'", f"a {artefact} file written by egvs")
-        metadata = json.loads(raw)
-        if metadata.get("schema") != schemas.VERSION:
-            raise InputError(path, f"schema version {metadata.get('schema')}", f"version {schemas.VERSION}")
+        metadata = _metadata(path, artefact, raw)
         yield file, metadata
 
 
@@ -164,6 +164,45 @@ def _check_columns(path: Path, artefact: str, found: pa.Schema) -> None:
     extra = sorted(set(found.names) - set(wanted.names) - set(schemas.optional_columns(artefact)))
     if extra:
         raise InputError(path, f"unknown columns {', '.join(extra)}", f"the columns {', '.join(wanted.names)}")
+
+
+_PROMISED: dict[str, tuple[str, ...]] = {
+    "trajectories": ("frames",),
+    "tpog": ("grid", "frames", "block_frames"),
+    "scans": ("sites",),
+    "visibility": ("grid", "sites"),
+}
+"""What the metadata of an artefact must hold for those who read it."""
+
+_SITE = ("site", "x_m", "y_m", "z_m", "sensor")
+
+
+def _metadata(path: Path, artefact: str, raw: bytes) -> dict[str, Any]:
+    """The checked metadata; InputError naming what is wrong with it."""
+    try:
+        metadata = json.loads(raw)
+    except (ValueError, RecursionError) as error:
+        raise InputError(path, f"its metadata is no JSON ({error})", "an unaltered file; make it again") from None
+    if not isinstance(metadata, dict):
+        raise InputError(path, f"its metadata is {metadata!r}", "an unaltered file; make it again")
+    if metadata.get("schema") != schemas.VERSION:
+        raise InputError(path, f"schema version {metadata.get('schema')}", f"version {schemas.VERSION}")
+    for key in _PROMISED.get(artefact, ()):
+        if not _is_sound(key, metadata.get(key)):
+            raise InputError(path, f"its metadata says {key} = {metadata.get(key)!r}", "an unaltered file; make it again")
+    return metadata
+
+
+def _is_sound(key: str, value: Any) -> bool:
+    if key == "grid":
+        try:
+            grid = Grid.from_json(value)
+        except (KeyError, TypeError, ValueError, AttributeError):
+            return False
+        return grid.voxel_m > 0 and min(grid.shape) > 0 and math.prod(grid.shape) <= MAX_VOXELS
+    if key == "sites":
+        return isinstance(value, list) and all(isinstance(s, dict) and all(k in s for k in _SITE) for s in value)
+    return isinstance(value, int) and not isinstance(value, bool) and value > 0
 
 
 def _corrupt(path: Path, error: Exception) -> InputError:

@@ -282,6 +282,43 @@ def test_a_damaged_artefact_is_named_by_the_stage_that_reads_it(mini: Path, tmp_
     assert "Traceback" not in said
 
 
+def metadata_of(path: Path, metadata: object) -> None:
+    """Write a Parquet file again with other metadata under the key egvs."""
+    import pyarrow.parquet as pq
+
+    table = pq.read_table(path)
+    raw = metadata if isinstance(metadata, bytes) else json.dumps(metadata).encode()
+    pq.write_table(table.replace_schema_metadata({b"egvs": raw}), path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda about: b"{", "its metadata is no JSON"),
+        (lambda about: [about], "its metadata is \\["),
+        (lambda about: about | {"schema": 99}, "schema version 99"),
+        (lambda about: about | {"grid": None}, "grid = None"),
+        (lambda about: about | {"grid": {"origin_m": [0, 0, 0], "voxel_m": 0, "shape": [1, 1, 1]}}, "grid = "),
+        (lambda about: about | {"grid": {"origin_m": [0, 0, 0], "voxel_m": 1, "shape": [10**6, 10**6, 10**6]}}, "grid = "),
+        (lambda about: {k: v for k, v in about.items() if k != "frames"}, "frames = None"),
+        (lambda about: about | {"frames": "many"}, "frames = 'many'"),
+        (lambda about: about | {"block_frames": 0}, "block_frames = 0"),
+    ],
+)
+def test_altered_metadata_is_named(mini: Path, tmp_path: Path, egvs, change, message: str) -> None:
+    import re
+
+    from pipeline import tables
+
+    out = tmp_path / "out"
+    for stage in ("traffic", "statics", "tpog", "scan"):
+        assert egvs(stage, mini, "--out", out)[0] == 0
+    path = out / "tpog.parquet"
+    metadata_of(path, change(tables.read_metadata(path, "tpog")))
+    code, _, said = egvs("score", mini, "--out", out)
+    assert (code, bool(re.search(rf"tpog.parquet: .*{message}", said))) == (2, True), said
+
+
 def test_an_empty_set_of_features_is_a_world_of_ground_alone(mini: Path, tmp_path: Path, egvs) -> None:
     (mini / "statics.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": []}))
     code, _, said = egvs("statics", mini, "--out", tmp_path / "out")
