@@ -66,7 +66,7 @@ def _stretches(triangles, planes, ball, o, d, far, ts, low, high, count):  # typ
     ox, oy, oz, dx, dy, dz = o[0], o[1], o[2], d[0], d[1], d[2]
     met = 0
     for m in range(triangles.shape[0]):
-        t, _ = meet(triangles[m], planes[m], ox, oy, oz, dx, dy, dz)
+        t, _, _ = meet(triangles[m], planes[m], ox, oy, oz, dx, dy, dz)
         if t < np.inf:
             ts[met] = t
             met += 1
