@@ -42,7 +42,6 @@ FARTHEST_M = 1e8
 Positive = Annotated[float, Field(gt=0)]
 Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
 NotNegative = Annotated[float, Field(ge=0)]
-Share = Annotated[float, Field(ge=0, le=1)]
 Point2 = tuple[Coordinate, Coordinate]
 Point3 = tuple[Coordinate, Coordinate, Coordinate]
 Name = Annotated[str, Field(min_length=1, pattern=r"^[^\s/\\:*?\"<>|]+$")]

@@ -21,7 +21,7 @@ from types import ModuleType
 from typing import Any
 
 from pipeline import __version__, tables
-from pipeline.cost import Cost, measured
+from pipeline.cost import measured
 from pipeline.errors import InputError, RunError
 from pipeline.scenario import Scenario, from_values
 from pipeline.stage import Progress, silent
@@ -264,4 +264,4 @@ def _alone(folder: Path) -> Iterator[None]:
         yield
 
 
-__all__ = ["RECORD", "STAGES", "Cost", "default_folder", "run", "run_one", "run_stage", "verify"]
+__all__ = ["RECORD", "STAGES", "default_folder", "run", "run_one", "run_stage", "verify"]
