@@ -22,7 +22,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +39,8 @@ BETWEEN = ("<!-- measured -->", "<!-- end -->")
 
 REPEATS, ENOUGH_S = 3, 1.0
 """A size is run so often, unless that long has passed."""
+
+_LANE_M, _CAR_M = 3.5, 4.5
 
 LINEAR = 1.1
 """A steeper slope is told."""
@@ -64,12 +66,14 @@ class Axis:
     label: str
     sizes: tuple[float, ...]
     stages: tuple[str, ...]
+    others: Size = field(default_factory=Size)
+    """What stays as it is."""
 
 
 AXES = (
     Axis("sites", "sites", (10, 50, 200, 1000, 5000), ("score", "report")),
     Axis("frames", "frames", (500, 1500, 5000, 15000, 50000), ("traffic", "tpog", "score")),
-    Axis("vehicles", "vehicles a frame", (10, 30, 100, 250, 500), ("traffic", "tpog", "score")),
+    Axis("vehicles", "vehicles a frame", (10, 30, 100, 250, 500), ("traffic", "tpog", "score"), Size(hectares=2)),
     Axis("hectares", "region of interest, ha at 0.25 m", (0.5, 1, 2, 5, 10), ("tpog", "score", "report")),
     Axis("beams", "beams a sensor", (1_000, 10_000, 100_000, 300_000, 1_000_000), ("score", "report")),
     Axis("triangles", "triangles", (1_000, 10_000, 100_000, 300_000, 1_000_000), ("statics", "tpog", "score", "report")),
@@ -99,7 +103,7 @@ def prepare(size: Size, folder: Path) -> Path:
         f"[sensors.own]\nelevations_deg = [-25, 5]\nchannels = {channels}\n"
         f"azimuth_step_deg = {360 / max(1, round(size.beams / channels))!r}\nrange_m = 200\n"
     )
-    lines.append('[[traffic.kinds]]\nname = "car"\nlength_m = 4.5\nwidth_m = 1.75\nheight_m = 1.5\n')
+    lines.append(f'[[traffic.kinds]]\nname = "car"\nlength_m = {_CAR_M}\nwidth_m = 1.75\nheight_m = 1.5\n')
     (folder / "scenario.toml").write_text("\n".join(lines), encoding="utf-8")
     rows = [f"s{i},{long * (i % spots + 0.5) / spots!r},{wide * (i // spots + 0.5) / spots!r},4" for i in range(size.sites)]
     (folder / "sites.csv").write_text("\n".join(["site,x_m,y_m,z_m", *rows]) + "\n", encoding="utf-8")
@@ -134,16 +138,21 @@ def _city(buildings: int, long: float, wide: float) -> str:
 
 
 def _traffic(size: Size, long: float, wide: float, path: Path) -> None:
-    """Cars on lanes along x, each at a speed of its own, that come in again at the other end: SUMO's FCD as CSV."""
+    """Cars on lanes along x, a lane's at equal distances and one speed, that come in again at the other end: SUMO's FCD as CSV."""
     rng = np.random.default_rng(1)
-    lane, speed = np.arange(size.vehicles), rng.uniform(4.0, 14.0, size.vehicles)
-    y, first = wide * (lane + 0.5) / size.vehicles, rng.uniform(0, long, size.vehicles)
-    names = np.array([f"v{i}" for i in lane])
+    lanes, round_m = max(1, int(wide / _LANE_M)), long + 10.0
+    lane, place = np.arange(size.vehicles) % lanes, np.arange(size.vehicles) // lanes
+    cars = np.bincount(lane, minlength=lanes)
+    if round_m / cars.max() < _CAR_M + 1.0:
+        raise ValueError(f"{size.vehicles} cars overlap on {lanes} lanes of {long:g} m")
+    speed = rng.uniform(4.0, 14.0, lanes)[lane]
+    y, first = wide * (lane + 0.5) / lanes, rng.uniform(0, round_m, lanes)[lane] + place * round_m / cars[lane]
+    names = np.array([f"v{i}" for i in range(size.vehicles)])
     parts = range(0, size.frames, 2000)
     with path.open("wb") as file:
         for part in parts:
             times = np.arange(part, min(part + 2000, size.frames)) * 0.25
-            x = (first + speed * times[:, None]) % (long + 10.0) - 5.0
+            x = (first + speed * times[:, None]) % round_m - 5.0
             n = len(times)
             columns = {
                 "timestep_time": np.repeat(times, size.vehicles),
@@ -226,7 +235,7 @@ def study() -> dict[str, Points]:
         points: Points = {}
         for value in axis.sizes:
             start = time.perf_counter()
-            size = replace(Size(), **{axis.name: value if axis.name == "hectares" else int(value)})
+            size = replace(axis.others, **{axis.name: value if axis.name == "hectares" else int(value)})
             costs = apart(size)
             for stage, cost in costs.items():
                 points.setdefault(stage, {})[value] = cost

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from pipeline import safexml
 from pipeline.errors import InputError
+from pipeline.scenario import FARTHEST_M
 
 SCHEMA = pa.schema(
     [
@@ -187,13 +188,13 @@ def _checked(batches: Iterable[pa.RecordBatch], path: Path, unit: str) -> Iterat
 
 
 def _finite(values: dict[str, Any], name: str, row: NDArray[np.int64], path: Path, unit: str) -> None:
-    bad = np.flatnonzero(~np.isfinite(_floats(values[name])))
+    bad = np.flatnonzero(~(np.abs(_floats(values[name])) <= FARTHEST_M))
     if bad.size:
         found = values[name][int(bad[0])].as_py()
         raise InputError(
             f"{path}: {unit} {row[bad[0]]}",
             f"{name} of vehicle {values['id'][int(bad[0])].as_py()!r} is {'empty' if found is None else found}",
-            "a finite number",
+            f"a finite number, at most {FARTHEST_M:g}",
         )
 
 

@@ -27,6 +27,9 @@ STANDING_M_S = 0.1
 """A vehicle slower than this stands."""
 
 _SHRINK_M = 1e-3
+_MOST_CELLS = 2**20
+"""Along x and along y, so that the number of a cell in a frame of a group fits 64 bits."""
+
 _POSITION_DIGITS, _ANGLE_DIGITS = 6, 9
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -220,27 +223,35 @@ def _strings(values: list[str], code: Ints) -> pa.Array:
 def overlapping(found: Boxes) -> NDArray[np.int64]:
     """Pairs of rows (n, 2) in the same frame whose boxes, made 1 mm smaller on each side, share area and height.
 
-    Exact for rectangles (separating axes). Candidates come from sorting each frame by x: neighbours at distance 1, 2, ...
-    in that order are tried for as long as any pair is closer along x than the two largest diagonals reach.
+    Exact for rectangles (separating axes). Candidates come from square cells, at least as wide as the longest diagonal: a pair that
+    overlaps lies in one cell or in two that touch. Cells are numbered along y, then x, then by frame, with an empty row and column
+    between, so that a box's later neighbours are two runs: its own cell and the next, and three cells of the next column.
     """
     if not found.frame.size:
         return np.empty((0, 2), dtype=np.int64)
-    order = np.lexsort((found.x_m, found.frame))
-    frame, x = found.frame[order], found.x_m[order]
-    reach = float(np.hypot(found.length_m, found.width_m).max())
-    first, hits, ahead = np.arange(order.size), [np.empty((0, 2), np.int64)], 0
-    while first.size:
-        ahead += 1
-        first = first[first + ahead < order.size]
-        second = first + ahead
-        near = (frame[first] == frame[second]) & (x[second] - x[first] < reach)
-        first = first[near]
-        a, b = order[first], order[first + ahead]
-        close = np.abs(found.y_m[a] - found.y_m[b]) < reach
-        a, b = a[close], b[close]
-        hit = _share_space(found, a, b)
-        hits.append(np.column_stack([np.minimum(a, b)[hit], np.maximum(a, b)[hit]]))
-    return np.concatenate(hits)
+    half = np.hypot(found.length_m, found.width_m) / 2
+    side = max(2 * half.max(), max(np.ptp(found.x_m), np.ptp(found.y_m)) / _MOST_CELLS)
+    column, row = (np.floor((m - m.min()) / side).astype(np.int64) for m in (found.x_m, found.y_m))
+    high, wide = int(row.max()) + 3, int(column.max()) + 2
+    cell = ((found.frame - found.first_frame) * wide + column) * high + row + 1
+    order = np.argsort(cell, kind="stable")
+    cell, x, y, half = cell[order], found.x_m[order], found.y_m[order], half[order]
+    everyone = np.arange(order.size)
+    runs = (
+        (everyone + 1, np.searchsorted(cell, cell + 1, side="right")),
+        (np.searchsorted(cell, cell + high - 1), np.searchsorted(cell, cell + high + 1, side="right")),
+    )
+    hits = []
+    for second, end in runs:
+        first = everyone
+        while (left := second < end).any():
+            first, second, end = first[left], second[left], end[left]
+            near = (x[second] - x[first]) ** 2 + (y[second] - y[first]) ** 2 < (half[first] + half[second]) ** 2
+            a, b = order[first[near]], order[second[near]]
+            hit = _share_space(found, a, b)
+            hits.append(np.column_stack([np.minimum(a, b)[hit], np.maximum(a, b)[hit]]))
+            second = second + 1
+    return np.concatenate([np.empty((0, 2), dtype=np.int64), *hits])
 
 
 def _share_space(found: Boxes, a: Ints, b: Ints) -> NDArray[np.bool_]:

@@ -73,7 +73,7 @@ def run(
     field = Field.of(tpog.counts, tpog.frames, tpog.grid)
     gamma = scenario.score.gamma
     visible_from = Visibility(scenario, out, tpog.grid)
-    leave_out = uncertainty.LeaveOut.of(out / "tpog.parquet") if scenario.score.standard_error else None
+    leave_out = uncertainty.LeaveOut.of(out / "tpog.parquet", tpog) if scenario.score.standard_error else None
     scorer = _Scorer(visible_from, field, scenario, audit, leave_out)
     done: list[_Scored] = []
     visible: list[dict[str, Any]] = []

@@ -113,15 +113,18 @@ def _plain(name: str, elevations: tuple[float, ...], azimuths: int, range_m: flo
     return Sensor(name, elevations, (0.0,) * len(elevations), azimuths, range_m, source, **optics)
 
 
-# Velodyne's manuals and datasheets: 903 nm; 3.0 mrad across and 1.5 mrad along the elevation; a range "up to" 100 m or 200 m, of no
-# stated reflectivity. Taken to be 0.8, at which the maker's HDL-64E datasheet rates that sensor (120 m; 50 m at 0.1).
+# Velodyne's VLP-16 and VLP-32C: 903 nm; a range "up to" 100 m or 200 m, of no stated reflectivity. Assumed: 0.8, at which the
+# maker rates its HDL-64E (120 m; 50 m at 0.1); and the divergence that it states for its VLS-128 (user manual 63-9483), 3.0 mrad
+# across and 1.5 mrad along the elevation.
 _VELODYNE: dict[str, Any] = {"wavelength_nm": 903.0, "divergence_mrad": (3.0, 1.5), "rated_reflectivity": 0.8}
 
-# Hesai PandarXT-32 User Manual: 905 nm, 80 m at 10 %, of no stated chance. A divergence is not published: Sensor's own stands in.
+# Hesai PandarXT-32: 905 nm, 80 m at 10 %, of no stated chance. The outer rings may reach less far, as they do in the PandarXT-16
+# (user manual: 80 m within 7 degrees of level, 50 m beyond). Its divergence is assumed: Sensor's own.
 _XT_32: dict[str, Any] = {"wavelength_nm": 905.0, "rated_range_m": 80.0, "rated_reflectivity": 0.1}
 
-# Ouster OS1 datasheet, revision 6 (generation 2): 865 nm; 0.35 deg full width at half maximum = 6.11 mrad; at 1024 columns and
-# 10 Hz, 10 % reflectivity and 100 klx, 55 m at a chance of 50 % (45 m at 90 %). At 80 % it says 120 m; the power law says 156 m.
+# Ouster OS1 datasheet, revision 6: 865 nm; at 1024 columns and 10 Hz, 10 % reflectivity and 100 klx, 55 m at a chance above 50 %
+# (45 m above 90 %). At 80 % it says 120 m (100 m); the power law says 156 m. The divergence here is 0.35 deg = 6.11 mrad, a full
+# width at half maximum that is quoted for the OS0; for the OS1, 0.18 deg = 3.14 mrad is quoted.
 _OS1: dict[str, Any] = {"wavelength_nm": 865.0, "divergence_mrad": (6.11, 6.11), "rated_range_m": 55.0, "rated_reflectivity": 0.1}
 
 CATALOGUE: Mapping[str, Sensor] = {

@@ -253,7 +253,7 @@ def _trial(scenario: Scenario, work: Path, keys: dict[str, str], weight: float) 
     unit = 1.0 / weight if math.isinf(gamma) else gamma  # a finite gamma is divided by the weight already
     most = Field.of(tpog.counts, tpog.frames, tpog.grid).limit(unit)
     shares = scores / most if most > 0 else np.zeros(len(scores))
-    leave_out = LeaveOut.of(work / "tpog.parquet")
+    leave_out = LeaveOut.of(work / "tpog.parquet", tpog)
     if leave_out is None:
         unknown = [math.nan] * len(names)
         return Trial(names, shares.tolist(), unknown, tpog.frames, scores.tolist(), unknown, unknown, math.nan, [], keys)

@@ -31,13 +31,17 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 from scipy.special import stdtr, stdtrit
 
 from pipeline import tables
 from pipeline.entropy import Field
+from pipeline.errors import InputError
 from pipeline.grid import Grid
 from pipeline.kernels import march
+from pipeline.kernels.crossings import accumulate
+from pipeline.results import Tpog
 
 GROUPS = 10
 """Blocks are joined to so many groups when there are at least twice as many."""
@@ -75,21 +79,16 @@ class LeaveOut:
     frames: NDArray[np.int64]
 
     @classmethod
-    def of(cls, path: Path) -> LeaveOut | None:
-        """From ``tpog.parquet``; None when it has one block only, which tells nothing."""
-        grid, counts, cells, block_frames = _read(path)
-        return cls.from_counts(counts, cells, block_frames, grid) if len(counts) > 1 else None
+    def of(cls, path: Path, tpog: Tpog) -> LeaveOut | None:
+        """From ``tpog.parquet``, which was read as ``tpog``; None when it has one block only, which tells nothing."""
+        cells = np.flatnonzero(tpog.counts)
+        counts, frames = _grouped(path, cells, tpog.grid)
+        return cls.from_counts(counts, cells, frames, tpog.grid) if len(frames) > 1 else None
 
     @classmethod
-    def from_counts(cls, counts: NDArray[np.uint32], cells: NDArray[np.int64], block_frames: int, grid: Grid) -> LeaveOut:
-        """From the counts of two or more blocks of equal length, (blocks, n), in the voxels ``cells``, (n,)."""
-        blocks = len(counts)
-        groups = blocks if blocks < 2 * GROUPS else GROUPS
-        sizes = [len(part) for part in np.array_split(np.arange(blocks), groups)]
-        if groups < blocks:
-            counts = np.add.reduceat(counts, np.cumsum([0, *sizes[:-1]]), axis=0)
-        frames = block_frames * np.array(sizes, dtype=np.int64)
-        keys = np.random.default_rng(_KEYS).integers(1, 2**63, size=groups, dtype=np.uint64)
+    def from_counts(cls, counts: NDArray[np.uint32], cells: NDArray[np.int64], frames: NDArray[np.int64], grid: Grid) -> LeaveOut:
+        """From the counts of two or more groups, (k, n), in the voxels ``cells``, (n,), and the frames in each group, (k,)."""
+        keys = np.random.default_rng(_KEYS).integers(1, 2**63, size=len(frames), dtype=np.uint64)
         # Two classes that share a sum of keys: a chance of (classes**2 / 2) / 2**64, 1e-10 for 50,000.
         sums = np.zeros(len(cells), dtype=np.uint64)
         for group, key in zip(counts, keys, strict=True):
@@ -116,19 +115,32 @@ class LeaveOut:
         return total
 
 
-def _read(path: Path) -> tuple[Grid, NDArray[np.uint32], NDArray[np.int64], int]:
-    """Counts of each block in each voxel that is ever occupied, (blocks, n); those voxels, (n,); frames a block."""
-    table, about = tables.read(path, "tpog")
-    grid = Grid.from_json(about["grid"])
-    blocks, block_frames = int(about["frames"]) // int(about["block_frames"]), int(about["block_frames"])
-    flat = np.ravel_multi_index([table.column(name).to_numpy() for name in ("ix", "iy", "iz")], grid.shape)
-    met = np.zeros(int(np.prod(grid.shape)), dtype=np.bool_)
-    met[flat] = True
-    cells = np.flatnonzero(met)
-    place = np.cumsum(met) - 1
-    counts = np.zeros((blocks, len(cells)), dtype=np.uint32)
-    counts[table.column("block").to_numpy(), place[flat]] = table.column("count").to_numpy()
-    return grid, counts, cells, block_frames
+def group_sizes(blocks: int) -> list[int]:
+    """How many consecutive blocks each group has."""
+    groups = blocks if blocks < 2 * GROUPS else GROUPS
+    return [len(part) for part in np.array_split(np.arange(blocks), groups)]
+
+
+def _grouped(path: Path, cells: NDArray[np.int64], grid: Grid) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
+    """Counts of each group of blocks in the voxels ``cells``, (k, n), and the frames in each group, (k,)."""
+    with tables.reader(path, "tpog") as (file, about):
+        block_frames = int(about["block_frames"])
+        sizes = group_sizes(int(about["frames"]) // block_frames)
+        group_of = np.repeat(np.arange(len(sizes)), sizes)
+        counts = np.zeros((len(sizes), len(cells)), dtype=np.uint32)
+        for number in range(file.num_row_groups):  # one block each: memory does not grow with their number
+            table = tables.read_group(file, number, path)
+            flat = np.ravel_multi_index([table.column(name).to_numpy() for name in ("ix", "iy", "iz")], grid.shape)
+            where = group_of[_block(table, path, len(group_of))] * len(cells) + np.searchsorted(cells, flat)
+            accumulate(where, table.column("count").to_numpy(), counts.reshape(-1))
+    return counts, block_frames * np.array(sizes, dtype=np.int64)
+
+
+def _block(table: pa.Table, path: Path, blocks: int) -> NDArray[np.uint16]:
+    block: NDArray[np.uint16] = table.column("block").to_numpy()
+    if block.max(initial=0) >= blocks:
+        raise InputError(path, f"block {block.max()} of {blocks}", f"0 to {blocks - 1}")
+    return block
 
 
 def _entropies(counts: NDArray[np.int64], frames: NDArray[np.int64], grid: Grid) -> NDArray[np.float64]:

@@ -105,6 +105,10 @@ BAD = {
     "not a number": (f"{HEADER}\n{row(x='here')}\n".encode(), r"cannot be read as CSV.*here"),
     "NaN angle": (f"{HEADER}\n{row()}\n{row(angle='nan')}\n".encode(), r"row 2: angle of vehicle 'v' is nan; a finite"),
     "empty angle": (f"{HEADER}\n{row(angle='')}\n".encode(), r"row 1: angle of vehicle 'v' is empty"),
+    "x beyond the Earth": (
+        f"{HEADER}\n{row(x='1e9')}\n".encode(),
+        r"row 1: x of vehicle 'v' is 1000000000.0; a finite number, at most",
+    ),
     "infinite x": (f"{HEADER}\n{row(x='inf')}\n".encode(), r"row 1: x of vehicle 'v' is inf"),
     "no type given": (f"{HEADER}\n{row(type='')}\n".encode(), r"row 1: vehicle 'v' has no type"),
     "time runs back": (f"{HEADER}\n{row(time='2')}\n{row()}\n".encode(), r"row 2: time 1 s comes after 2 s"),

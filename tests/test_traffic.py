@@ -209,6 +209,27 @@ def test_overlaps_are_those_that_polygons_find(seed):
         assert shapes[i].intersection(shapes[j]).area < 1e-5
 
 
+@pytest.mark.parametrize("spread_m", [10.0, 300.0, 1e8])
+def test_overlaps_are_those_of_all_pairs(spread_m):
+    """Wherever vehicles are, those in neighbouring cells are found, and none of another frame."""
+    rng = np.random.default_rng(7)
+    near = rng.uniform(-spread_m, spread_m, (40, 2))
+    places = np.concatenate([near, near + rng.uniform(-8, 8, (40, 2)), [[-spread_m, -spread_m], [spread_m, spread_m]]])
+    rows = [
+        (f, str(i), ["car", "bus"][i % 2], x, y, rng.uniform(0, 360), 1)
+        for f in range(3)
+        for i, (x, y) in enumerate(places.tolist())
+    ]
+    found = motion.boxes(group_of(rows), SIZES, 1.0, "place")
+    a, b = np.triu_indices(found.frame.size, 1)
+    a, b = a[found.frame[a] == found.frame[b]], b[found.frame[a] == found.frame[b]]
+    hit = motion._share_space(found, a, b)
+    expected = set(zip(a[hit].tolist(), b[hit].tolist(), strict=True))
+    got = [tuple(pair) for pair in motion.overlapping(found).tolist()]
+    assert len(got) == len(set(got)) > 20
+    assert set(got) == expected
+
+
 def test_standing_is_followed_across_groups():
     tally = Tally(6)
     for frames in ((0, 1), (2, 3), (4, 5)):

@@ -15,12 +15,20 @@ import pytest
 import pipeline
 from pipeline import show, tables, uncertainty
 from pipeline.entropy import Field, binary_entropy
+from pipeline.errors import InputError
 from pipeline.grid import Grid
 from pipeline.uncertainty import Estimate, LeaveOut
 from pipeline.visibility import Visibility
 
 GRID = Grid.from_json({"origin_m": [0.0, 0.0, 0.0], "voxel_m": 1.0, "shape": [6, 5, 2]})
 CELLS = np.arange(60)
+
+
+def left_out_of(blocks: np.ndarray, block_frames: int, cells: np.ndarray = CELLS) -> LeaveOut:
+    """From the counts of blocks, (blocks, n), joined to groups."""
+    sizes = uncertainty.group_sizes(len(blocks))
+    counts = np.array([part.sum(axis=0) for part in np.split(blocks, np.cumsum(sizes)[:-1])]).astype(np.uint32)
+    return LeaveOut.from_counts(counts, cells, block_frames * np.array(sizes), GRID)
 
 
 def random_counts(blocks: int, block_frames: int = 20) -> np.ndarray:
@@ -31,7 +39,7 @@ def random_counts(blocks: int, block_frames: int = 20) -> np.ndarray:
 @pytest.mark.parametrize(("gamma", "unit"), [(3.0, 1), (2.5, 4), (float("inf"), 1)])
 def test_each_column_is_the_score_without_that_group(blocks: int, groups: int, gamma: float, unit: int) -> None:
     counts = random_counts(blocks)
-    leave_out = LeaveOut.from_counts(counts, CELLS, 20, GRID)
+    leave_out = left_out_of(counts, 20)
     assert leave_out.frames.tolist() == [20 * len(p) for p in np.array_split(np.arange(blocks), groups)]
     hits = np.random.default_rng(4).integers(0, 30, size=60).astype(np.uint32 if unit == 1 else np.int64)
     found = leave_out.scores(hits, gamma, unit)
@@ -52,7 +60,7 @@ def test_each_column_is_the_score_without_that_group(blocks: int, groups: int, g
 def test_voxels_with_equal_counts_share_a_class_and_no_others_do() -> None:
     counts = random_counts(5)
     counts[:, 30:] = counts[:, :30]
-    leave_out = LeaveOut.from_counts(counts, CELLS, 20, GRID)
+    leave_out = left_out_of(counts, 20)
     rows = {tuple(column) for column in counts.T.tolist()}
     assert len(leave_out.entropies_bit) == len(rows)
     assert (leave_out.classes[:30] == leave_out.classes[30:]).all()
@@ -154,7 +162,7 @@ def test_intervals_cover_the_truth_as_often_as_they_say(blocks: int, frames: int
     counts = states.reshape(runs, blocks, frames // blocks, chains).sum(axis=2).astype(np.uint32)
     held, ses, scores = [], [], []
     for run in counts:
-        leave_out = LeaveOut.from_counts(run, CELLS, frames // blocks, GRID)
+        leave_out = left_out_of(run, frames // blocks)
         found = Estimate.of(np.array([leave_out.scores(w, 10.0) for w in weights]), leave_out.frames)
         low, high = found.intervals().T
         held.append((low <= truth) & (truth <= high))
@@ -172,11 +180,39 @@ def test_scores_say_how_sure_they_are(mini: Path, tmp_path: Path) -> None:
     assert all(row["egvs_se"] > 0 and row["egvs_bias"] < 0 for row in rows)
     assert sorted(row["beats_next"] for row in rows)[-1] == 1.0
     assert record["stages"]["score"]["said"]["standard_errors_from"] == "4 groups of 10 frames"
-    leave_out = LeaveOut.of(tmp_path / "out" / "tpog.parquet")
+    leave_out = LeaveOut.of(tmp_path / "out" / "tpog.parquet", pipeline.read_tpog(tmp_path / "out" / "tpog.parquet"))
     assert leave_out is not None
     visibility = Visibility(scenario, tmp_path / "out", scenario.roi.grid)
     for beams, row in zip(visibility.beams(), rows, strict=True):
         assert leave_out.scores(visibility.hits(beams), 4.0)[0] == pytest.approx(row["egvs"], rel=1e-12)
+
+
+def test_many_blocks_are_joined_as_they_are_read(mini: Path, tmp_path: Path) -> None:
+    """Group by group, what is read from the file is what the blocks add up to."""
+    pipeline.run(pipeline.load(mini, ["traffic.frames=40", "tpog.blocks=40"]), tmp_path)
+    path = tmp_path / "tpog.parquet"
+    tpog, table = pipeline.read_tpog(path), tables.read(path, "tpog")[0].to_pydict()
+    dense = np.zeros((40, *tpog.grid.shape), dtype=np.int64)
+    dense[tuple(table[name] for name in ("block", "ix", "iy", "iz"))] = table["count"]
+    leave_out = LeaveOut.of(path, tpog)
+    assert leave_out is not None
+    assert leave_out.frames.tolist() == [4] * 10
+    weights = np.arange(tpog.counts.size, dtype=np.uint32) % 7
+    found = leave_out.scores(weights, 5.0)
+    for column in range(1 + 10):
+        kept = np.delete(dense, slice(4 * column - 4, 4 * column) if column else [], axis=0)
+        entropy = [binary_entropy(c, len(kept)) for c in kept.sum(axis=0).ravel().tolist()]
+        assert found[column] == pytest.approx(float(np.minimum(weights, 5) @ np.array(entropy)), rel=1e-12)
+
+
+def test_a_block_that_does_not_exist_is_refused(mini: Path, tmp_path: Path) -> None:
+    pipeline.run(pipeline.load(mini), tmp_path)
+    path = tmp_path / "tpog.parquet"
+    table, about = tables.read(path, "tpog")
+    columns = {name: table.column(name).to_numpy() for name in table.column_names}
+    tables.write(path, "tpog", columns | {"block": np.full(len(table), 4, dtype=np.uint16)}, about)
+    with pytest.raises(InputError, match="block 4 of 4; 0 to 3"):
+        LeaveOut.of(path, pipeline.read_tpog(path))
 
 
 @pytest.mark.parametrize("change", ["score.standard_error=false", "tpog.blocks=1"])
@@ -202,7 +238,7 @@ def test_the_ranking_marks_neighbours_that_are_not_separable(mini: Path, tmp_pat
 
 def test_an_empty_road_has_no_error() -> None:
     counts = np.zeros((4, 0), dtype=np.uint32)
-    leave_out = LeaveOut.from_counts(counts, np.empty(0, dtype=np.int64), 10, GRID)
+    leave_out = left_out_of(counts, 10, np.empty(0, dtype=np.int64))
     scores = np.array([leave_out.scores(np.ones(60, dtype=np.uint32), 10.0) for _ in range(2)])
     found = Estimate.of(scores, leave_out.frames)
     assert found.se.tolist() == [0.0, 0.0]

@@ -16,7 +16,9 @@ A vehicle starts straight in its first frame, and again after a frame in which i
 joint) a part settles at :math:`\sin(\psi - \theta) = d / R`. On a straight road parts and gaps add up to SUMO's length.
 
 Source: Sayers 1991, "Exact Equations for Tractrix Curves Associated with Vehicle Offtracking", Vehicle System Dynamics 20(5),
-297-308. Default geometry: an articulated bus of 18.75 m and a semitrailer combination of 16.50 m, lengths of Directive 96/53/EC.
+297-308. Default geometry: the greatest lengths of Directive 96/53/EC as amended, 18.75 m for an articulated bus, 16.50 m for an
+articulated truck, 12.00 m of it from the king pin to the rear, so the joint is 4.5 m behind the front. How they divide (10.6 to
+7.5 m, a tractor of 6 m, a bogie 7.7 of 12 m behind the king pin, axles at 0.75 of a part) is assumed.
 
 Calls for it: buses and trucks of 16 m and more that turn in the region of interest. Limits: no tyre slip, no steered rear axle, no
 limit to the angle at the joint; SUMO itself leaves room for a stiff vehicle only, so a rear part may cut into a neighbour's lane.

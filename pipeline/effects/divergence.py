@@ -12,7 +12,8 @@ rule in s, :math:`s = 2`, or :math:`s = 3 \pm \sqrt 3`, with 6 and 12 sub-beams 
 
 Calls for it: poles, signs and edges at ranges where the beam is as wide as they are. Limits: a flat shadow edge falls between
 nodes, so a single beam's share comes in steps (7: twelfths, and half for the middle); a target in a voxel counts by the share
-that gets there, not by what a detector makes of it; angles are taken as their tangents (exact to 1e-5 below 10 mrad).
+that gets there, not by what a detector makes of it; angles are taken as their tangents (exact to 1e-5 below 10 mrad). A maker's angle is
+taken as that of 1/e^2, whatever its own definition: one at half maximum (Ouster's) is 1.70 times as wide at 1/e^2.
 """
 
 from __future__ import annotations

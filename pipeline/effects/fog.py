@@ -12,7 +12,7 @@ for a visibility V at which the contrast of a black target has fallen to epsilon
   :math:`0.585 \, V_{km}^{1/3}`. Made from haze; it says that fog is thinner in the infrared, which measurements in fog deny.
 - ``kim`` (Kim, McArthur and Korevaar 2001, Proc. SPIE 4214, 26-37), the default: the same above 6 km, then
   :math:`0.16 \, V_{km} + 0.34` above 1 km, :math:`V_{km} - 0.5` above 0.5 km, and 0 below: in fog all wavelengths suffer alike.
-  ITU-R P.1814-1 (09/2025) uses the same intervals.
+  ITU-R P.1814-1 (09/2025) has this exponent too; the edition of 2007 had Kruse's.
 
 Both models mean the visibility at a contrast of 2 % (-ln 0.02 = 3.91), so that is the default. Instruments at roads and airports
 report the meteorological optical range, which is at 5 % (-ln 0.05 = 3.00): for theirs, set ``contrast = 0.05``; V is converted to

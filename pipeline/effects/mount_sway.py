@@ -9,7 +9,8 @@ has all moments of the Gaussian up to degree :math:`2n - 1`:
 .. math:: E f(\alpha, \beta) \approx \sum_{i,j} w_i w_j\, f(\sigma x_i, \sigma x_j)
 
 Calls for it: slender poles, cantilever arms, bridges. Limits: the sensor turns but does not move (1 degree on a pole of 5 m would
-move it by 9 cm); no torsion about the pole; within one turn of the sensor the pole is taken to stand still.
+move it by 9 cm); no torsion about the pole; within one turn of the sensor the pole is taken to stand still. The Gaussian is an
+assumption, and no amplitude is taken from the literature: ``tilt_deg`` is the user's to measure or to guess.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ class MountSway(Expand):
     """A pose averaged over a tilt distribution."""
 
     NAME: ClassVar[str] = "mount_sway"
-    SOURCE: ClassVar[str] = "Gaussian tilt; Gauss-Hermite rule (Abramowitz and Stegun 1964, 25.4.46)"
+    SOURCE: ClassVar[str] = "Gaussian tilt (assumed); Gauss-Hermite rule (Abramowitz and Stegun 1964, 25.4.46)"
     Model: ClassVar[type[Parameters]] = Model
     QUALITY: ClassVar[dict[str, tuple[Any, ...]]] = {"samples": (4, 9, 16)}
 

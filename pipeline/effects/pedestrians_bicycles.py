@@ -14,9 +14,10 @@ road with the vehicles in one simulation; they give way and are given way to.
 
 Departures are drawn uniformly over the simulated time: rate times duration of them, from the scenario's seed.
 
-Boxes: 0.8 x 0.6 x 1.73 m a pedestrian, 1.76 x 0.6 x 1.73 m a bicycle with its rider, the mean sizes in the KITTI 3-D object
-benchmark as used by Lang et al. 2019, "PointPillars", CVPR, section 4.2 (arXiv 1812.05784): boxes that people drew around LiDAR
-returns of walking and riding people, arms and strides included.
+Boxes: 0.8 x 0.6 x 1.73 m a pedestrian, 1.76 x 0.6 x 1.73 m a bicycle with its rider: the anchor boxes with which Lang et al. 2019,
+"PointPillars", CVPR (arXiv 1812.05784) look for them in the KITTI 3-D object benchmark, sizes that Yan, Mao and Li 2018, "SECOND",
+Sensors 18(10):3337, chose after the means of KITTI's training labels, so arms and strides are included. SUMO's own are smaller:
+0.215 x 0.478 x 1.719 m and 1.6 x 0.65 x 1.7 m.
 
 Source: Erdmann and Krajzewicz 2015, "Modelling Pedestrian Dynamics in SUMO", SUMO 2015 Intermodal Simulation for Intermodal
 Transport, 103-118 (the striping model).

@@ -14,8 +14,8 @@ fixes the threshold: a target of reflectivity :math:`\rho_0`, met squarely at :m
 Why the normal distribution in the logarithm of power: what makes returns of one range and nominal reflectivity differ are factors
 (paint, tilt, alignment, gain of the receiver), and a product of many factors is log-normal. Unlike noise added to the power, it
 goes to 1 nearby and to 0 far away. The shape is chosen here; its width is from a datasheet: Ouster's OS1 (revision 6) notices 10 %
-targets at 45 m with a chance of 90 % and at 55 m with 50 %, which is s = 0.31; 80 % targets at 100 m and 120 m, which is s = 0.28.
-Hence 0.3.
+targets at 45 m with a chance above 90 % and at 55 m above 50 %. Read as equalities, that is s = 0.31; 80 % targets at 100 m and
+120 m are s = 0.28. Hence 0.3.
 
 Calls for it: dark vehicles, long ranges, sensors near their limit: wherever the region of interest reaches beyond the rated
 range at 10 %. Limits: one reflectivity and one incidence for all targets (a car's side at a glancing angle returns less, a number
