@@ -17,6 +17,7 @@ regret. Errors are deterministic; seconds are measured.
 
 from __future__ import annotations
 
+import math
 import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -28,7 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import knobs, pareto, tables
+from pipeline import effects, knobs, pareto, tables
 from pipeline.entropy import Field
 from pipeline.errors import EgvsError, InputError
 from pipeline.knobs import APPROXIMATES, MEASURES, REFERENCE, SCENARIO, Setting
@@ -36,10 +37,13 @@ from pipeline.results import read_tpog
 from pipeline.scenario import Scenario
 from pipeline.stage import Progress, metadata, silent
 from pipeline.trials import STAGES, Bench, Trial
+from pipeline.workflow import alone
 
 REPEATS = 3
 LONGEST = 32
 """The reference watches traffic at most so many times as long as the scenario."""
+BEYOND = "beyond the budget"
+"""Why a setting was not run."""
 SHARE = 1 / 3
 """Of the budget: the most that the reference may take."""
 
@@ -170,14 +174,18 @@ def study(
     """
     if not tolerance > 0:
         raise InputError("--tolerance", f"{tolerance:g}", "a share above 0, for example 0.02")
-    bench, clock = Bench(path, sets, out, jobs, progress), _Clock(budget_s)
+    with alone(out):
+        return _study(Bench(path, sets, out, jobs, progress), out, tolerance, _Clock(budget_s), seeds, progress, told)
+
+
+def _study(bench: Bench, out: Path, tolerance: float, clock: _Clock, seeds: int, progress: Progress, told: Told) -> Study:
     own = Setting(SCENARIO, SCENARIO, "")
     scenario = bench.scenario(own)
     settings = knobs.settings(scenario)
     if any(bench.known(setting) is None for setting in settings):
         bench.warm_up(_shortest(settings))
     trials = {SCENARIO: bench.run(own)}
-    times = _times(bench, scenario, trials[SCENARIO], budget_s)
+    times = _times(bench, scenario, trials[SCENARIO], clock.budget_s)
     longest = knobs.reference(scenario, times)
     found, skipped = _run_all(bench, [longest, *settings] if times > 1 else settings, trials, clock, told)
     repeated = _repeat(bench, found, trials, clock, progress)
@@ -214,24 +222,27 @@ def _times(bench: Bench, scenario: Scenario, trial: Trial, budget_s: float) -> i
 def _run_all(
     bench: Bench, settings: list[Setting], trials: dict[str, Trial], clock: _Clock, told: Told
 ) -> tuple[list[Setting], dict[str, str]]:
-    """Run one setting after another as long as the budget lasts; those that are known cost nothing."""
+    """Run one setting after another as long as the budget lasts; those that are known cost nothing.
+
+    Cheap ones go first; of those that cost about the same (within a factor of two), approximations.
+    """
     found, skipped, expected = [], {}, _Expected(bench, trials[SCENARIO])
-    for setting in settings:
-        known = bench.known(setting)
-        needs_s = 0.0 if known is not None or setting.name in (SCENARIO, REFERENCE) else expected.seconds(setting)
-        if needs_s > max(clock.left_s, 0.0):
-            skipped[setting.name] = f"about {needs_s:.0f} s, beyond the budget"
-            told(setting.name, "skipped", {"why": skipped[setting.name]})
+    known = {setting.name: bench.known(setting) for setting in settings}
+    needs_s = {s.name: 0.0 if known[s.name] or s.name in (SCENARIO, REFERENCE) else expected.seconds(s) for s in settings}
+    for setting in sorted(settings, key=lambda s: (math.frexp(needs_s[s.name])[1], s.kind == MEASURES, needs_s[s.name])):
+        if needs_s[setting.name] > max(clock.left_s, 0.0):
+            skipped[setting.name] = BEYOND
+            told(setting.name, "skipped", {"why": f"about {needs_s[setting.name]:.0f} s, {BEYOND}"})
             continue
         try:
-            trial = known or bench.run(setting)
+            trial = known[setting.name] or bench.run(setting)
         except EgvsError as error:
             skipped[setting.name] = str(error)
             told(setting.name, "skipped", {"why": str(error)})
             continue
         trials[setting.name] = trial
         found.append(setting)
-        told(setting.name, "kept" if known else "done", {"seconds": sum(_medians(bench, trial).values())})
+        told(setting.name, "kept" if known[setting.name] else "done", {"seconds": sum(_medians(bench, trial).values())})
     return found, skipped
 
 
@@ -246,11 +257,24 @@ class _Expected:
     def seconds(self, setting: Setting) -> float:
         other, own, took = self._bench.scenario(setting), self._scenario, self._took
         finer = own.roi.voxel_m / other.roi.voxel_m
-        stepped = _steps(other) / _steps(own) if other.traffic != own.traffic else 0.0
+        stepped = _steps(other) / _steps(own) if _traffic(other) != _traffic(own) else 0.0
         watched = other.traffic.frames / own.traffic.frames * max(1.0, finer**3)
         counted = watched if stepped or finer != 1.0 else 0.0
         cast = 1.0 if other.sensors != own.sensors or other.effects != own.effects else 0.0
-        return took["traffic"] * stepped + took["tpog"] * counted + took["scan"] * cast + took["score"] * max(1.0, finer**2)
+        beams = _copies(other) / _copies(own)
+        score = took["score"] * beams * max(1.0, finer**2)
+        return took["traffic"] * stepped + took["tpog"] * counted + took["scan"] * beams * cast + score
+
+
+def _copies(scenario: Scenario) -> int:
+    """Sub-beams of a beam."""
+    expanding = (effect for effect in effects.of(scenario, "scan") if isinstance(effect, effects.Expand))
+    return math.prod(effect.copies for effect in expanding)
+
+
+def _traffic(scenario: Scenario) -> tuple[object, ...]:
+    """What traffic depends on, as far as settings change it."""
+    return scenario.traffic, *(values for name, values in scenario.effects.items() if effects.KINDS[name][0] == "traffic")
 
 
 def _steps(scenario: Scenario) -> float:
@@ -360,10 +384,10 @@ def _judged(rows: list[Row], tolerance: float) -> list[Row]:
     rivals = [row for row in rows if row.kind in (APPROXIMATES, SCENARIO)]
     front = {row.setting for row in rivals if not any(_beats(other, row) for other in rivals)}
     within = [row for row in rivals if row.judged <= tolerance]
-    chosen = min(within, key=lambda row: row.seconds).setting if within else None
+    chosen = min(within, key=lambda row: (row.seconds, row.setting)).setting if within else None
     marked = [replace(row, front=row.setting in front, recommended=row.setting == chosen) for row in rows]
     places = {SCENARIO: 0, REFERENCE: 1, APPROXIMATES: 2, MEASURES: 3}
-    return sorted(marked, key=lambda row: (places[row.kind], row.seconds))
+    return sorted(marked, key=lambda row: (places[row.kind], row.seconds, row.setting))
 
 
 def _beats(one: Row, other: Row) -> bool:
@@ -379,8 +403,13 @@ def _point(row: Row) -> pareto.Point:
 
 def _write(path: Path, scenario: Scenario, rows: list[Row], times: int, tolerance: float) -> None:
     columns = {f.name: [getattr(row, f.name) for row in rows] for f in fields(Row)}
-    about = metadata(scenario, {"settings": scenario.model_dump(mode="json")}, reference_times=times, tolerance=tolerance)
+    about = metadata(scenario, about_of(scenario), reference_times=times, tolerance=tolerance)
     tables.write(path, "accuracy", columns, about)
+
+
+def about_of(scenario: Scenario) -> dict[str, Any]:
+    """What a study is of, as its metadata has it."""
+    return {"settings": scenario.model_dump(mode="json")}
 
 
 def _between_seeds(bench: Bench, scenario: Scenario, count: int, told: Told) -> Seeds:

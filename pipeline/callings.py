@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline import effects, sites, statics, workflow
+from pipeline import effects, knobs, sites, statics, tables, workflow
+from pipeline.accuracy import about_of
 from pipeline.results import read_scores
 from pipeline.scenario import Scenario
 from pipeline.stage import Progress, silent
@@ -29,6 +30,28 @@ class Call:
     state: str
     why: str
     source: str
+
+
+@dataclass(frozen=True)
+class Price:
+    """What one effect costs and changes, as an accuracy study found.
+
+    Attributes
+    ----------
+    seconds
+        Of all stages: with the effect less without it.
+    change
+        Largest relative change of a site's share of the limit, against the scenario as it is.
+    tau
+        Kendall's tau of the rankings with and without it.
+    regret
+        Share of the best score that is lost by trusting the other ranking's best site.
+    """
+
+    seconds: float
+    change: float
+    tau: float
+    regret: float
 
 
 @dataclass(frozen=True)
@@ -63,6 +86,23 @@ def called(scenario: Scenario) -> list[Call]:
     return [_call(name, scene) for name in effects.KINDS]
 
 
+def prices(scenario: Scenario, out: Path) -> dict[str, Price] | None:
+    """What ``egvs accuracy`` found of each effect, from ``out / "accuracy.parquet"``; None when it was not run on this scenario."""
+    path = out / "accuracy.parquet"
+    if not path.is_file():
+        return None
+    table, about = tables.read(path, "accuracy")
+    if about["inputs"] != tables.hash_of(about_of(scenario)):
+        return None
+    rows = {row["setting"]: row for row in table.to_pylist()}
+    found, own = {}, rows[knobs.SCENARIO]["seconds"]
+    for name in effects.KINDS:
+        for beginning, sign in ((knobs.WITH, 1.0), (knobs.WITHOUT, -1.0)):
+            if (row := rows.get(f"{beginning}{name}")) is not None:
+                found[name] = Price(sign * (row["seconds"] - own), row["error"], row["tau"], row["regret"])
+    return found
+
+
 def _call(name: str, scene: effects.Scene) -> Call:
     stage, kind = effects.KINDS[name]
     if name == effects.SELF_ACTING:
@@ -83,7 +123,7 @@ def _module(name: str) -> Any:
 
 
 def _source(name: str) -> str:
-    return str(_module(name).EFFECT.SOURCE)
+    return effects.kind_of(name).SOURCE
 
 
 def _summary(name: str) -> str:

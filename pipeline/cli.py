@@ -213,11 +213,14 @@ def effects(
         show.effects(callings.catalogue())
         return
     resolved = _load(scenario, set_)
-    show.effects(callings.called(resolved))
+    folder = out or workflow.default_folder(resolved)
+    prices = callings.prices(resolved, folder)
+    show.effects(callings.called(resolved), prices)
+    if prices is None:
+        print(f"what they cost and change: egvs accuracy {scenario}, or --ablation")
     if ablation:
         if not resolved.effects:
             raise InputError("--ablation", "the scenario names no effect", "name one, e.g. --set effects.rain.rate_mm_h=20")
-        folder = out or workflow.default_folder(resolved)
         with show.Screen() as screen:
             changes = callings.ablation(resolved, folder, jobs=jobs, progress=screen.progress)
         show.ablation(changes)

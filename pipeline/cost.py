@@ -24,6 +24,8 @@ class Cost:
 
     seconds: float = 0.0
     peak_mb: float = 0.0
+    held_mb: float = 0.0
+    """What the process held when the block began; elsewhere than on Linux, the highest until then."""
 
     def to_json(self) -> dict[str, Any]:
         """Rounded to what such a measurement is worth."""
@@ -34,12 +36,13 @@ class Cost:
 def measured() -> Iterator[Cost]:
     """Measure the block; the yielded cost is filled at its end."""
     cost, resettable = Cost(), _reset()
+    cost.held_mb = _status_mb("VmRSS:") if resettable else _peak_so_far_mb()
     start = time.perf_counter()
     try:
         yield cost
     finally:
         cost.seconds = time.perf_counter() - start
-        cost.peak_mb = _high_water_mb() if resettable else _peak_so_far_mb()
+        cost.peak_mb = _status_mb("VmHWM:") if resettable else _peak_so_far_mb()
 
 
 def _reset() -> bool:
@@ -50,8 +53,8 @@ def _reset() -> bool:
     return True
 
 
-def _high_water_mb() -> float:
-    line = next(line for line in _STATUS.read_text().splitlines() if line.startswith("VmHWM:"))
+def _status_mb(name: str) -> float:
+    line = next(line for line in _STATUS.read_text().splitlines() if line.startswith(name))
     return int(line.split()[1]) / 1024
 
 

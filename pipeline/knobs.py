@@ -3,7 +3,8 @@ r"""Which settings does the accuracy study try?
 One knob at a time around the scenario's own setting, and a small full grid of those that cost most. Two kinds, which are never
 mixed: a setting that *approximates* the scenario's number more or less well (how long and how finely traffic is watched, how
 coarsely SUMO steps, beams thinned and weighted up, the quality of an effect), and one that *measures* something else (voxel, gamma,
-without an effect).
+without an effect that is named, with one that is not). Effects that are not named are tried where they need no number of the
+user's (a rate of rain, a sensor's rated range) and change something in this scene.
 
 Every setting is a list of ``--set`` overrides, so that what the study recommends can be typed. Thinned beams need no code of their
 own: with every f-th beam a voxel has hits n, weighted up f n, and :math:`\min(\gamma, f n) = f \min(\gamma / f, n)`; so gamma is
@@ -16,13 +17,17 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from pipeline import effects, sites
+import numpy as np
+
+from pipeline import effects, sites, statics
 from pipeline.errors import InputError
 from pipeline.grid import Grid
 from pipeline.scenario import Scenario
 from pipeline.sensors import Sensor, resolve
 
 APPROXIMATES, MEASURES, REFERENCE, SCENARIO = "approximates", "measures", "reference", "scenario"
+WITHOUT, WITH = "without ", "with "
+"""How the names of settings begin that leave out an effect, or switch one on."""
 
 FRAMES = (250, 500, 1000, 2500)
 LONGER = (2, 4, 8)
@@ -196,7 +201,33 @@ def _measures(scenario: Scenario) -> Iterator[Setting]:
         if cap != gamma:
             yield Setting(f"gamma {cap:g}", MEASURES, "gamma", (f"score.gamma={cap}",))
     for name in scenario.effects:
-        yield Setting(f"without {name}", MEASURES, "effect", (), without=name)
+        yield Setting(f"{WITHOUT}{name}", MEASURES, "effect", (), without=name)
+    for name in _others(scenario):
+        yield Setting(f"{WITH}{name}", MEASURES, "effect", (f"effects.{name}={{}}",))
+
+
+def _others(scenario: Scenario) -> Iterator[str]:
+    """Effects that are not named, need no parameter, and would act."""
+    place, scene = f"{scenario.file}: effects", None
+    for name in effects.KINDS:
+        if name in scenario.effects or name == effects.SELF_ACTING or effects.needs(name):
+            continue
+        scene = scene or effects.Scene(scenario, statics.build(scenario, statics.Tally.empty()), sites.of(scenario))
+        effect = effects.make(name, {}, place)
+        if effect.idle(scene) is None and _is_complete(effect, scene):
+            yield name
+
+
+def _is_complete(effect: effects.Effect, scene: effects.Scene) -> bool:
+    """Whether the sensors say what the effect asks of them."""
+    if not isinstance(effect, effects.Detect):
+        return True
+    try:
+        for name in {site.sensor for site in scene.sites}:
+            effect.detect(np.ones(1), resolve(name, scene.scenario.sensors, f"{scene.scenario.file}: sensors"))
+    except InputError:
+        return False
+    return True
 
 
 def _fits(scenario: Scenario, voxel_m: float) -> bool:

@@ -52,7 +52,8 @@ def run(
     Returns
     -------
     dict
-        ``sites``, ``beams`` (cast), ``returns``, ``settled_in_float64`` (beams that float32 alone left in doubt).
+        ``sites``, ``beams`` (cast), ``returns``, ``settled_in_float64`` (beams that float32 alone left in doubt), ``clouds``
+        (files with points).
     """
     world, _ = read_ply(out / "statics.ply")
     surveyed = Survey(scenario, world)
@@ -60,12 +61,11 @@ def run(
     for name in points:
         if name not in known:
             raise InputError(f"--points {name}", "no such site", f"one of {', '.join(known)}")
+    clouds: list[str] = []
     if not scenario.scan.keep:
         (out / ARTEFACTS[0]).unlink(missing_ok=True)
-        for site in surveyed.sites:
-            if site.site in points:
-                _write_cloud(out, surveyed.scan(site), cloud)
-        return {"sites": len(known), "kept": False, **_skipped(surveyed)}
+        clouds += (_write_cloud(out, surveyed.scan(site), cloud) for site in surveyed.sites if site.site in points)
+        return {"sites": len(known), "kept": False, "clouds": clouds, **_skipped(surveyed)}
     about: list[dict[str, Any]] = []
     doubtful = 0
     with tables.writer(out / ARTEFACTS[0], "scans", surveyed.columns) as file:
@@ -74,7 +74,7 @@ def run(
             about.append(done.about)
             doubtful += done.scan.doubtful
             if done.site.site in points:
-                _write_cloud(out, done, cloud)
+                clouds.append(_write_cloud(out, done, cloud))
             progress("sites", len(about), len(known))
         file.describe(metadata(scenario, inputs(scenario, out), sites=about))
     return {
@@ -83,6 +83,7 @@ def run(
         "beams": sum(a["beams_in_roi"] for a in about),
         "returns": sum(a["returns"] for a in about),
         "settled_in_float64": doubtful,
+        "clouds": clouds,
         **_skipped(surveyed),
     }
 
@@ -106,8 +107,10 @@ def _columns(done: SiteScan) -> dict[str, Any]:
     return columns | {"weight": done.scan.weight}
 
 
-def _write_cloud(out: Path, done: SiteScan, suffix: str) -> None:
+def _write_cloud(out: Path, done: SiteScan, suffix: str) -> str:
+    """Write a site's points; the file's name."""
     from pipeline import clouds
 
-    ends = done.scan.ends_m[done.scan.returned]
-    clouds.write_points(out / f"scan_{done.site.site}.{suffix}", ends + np.asarray(done.site.position_m))
+    name, ends = f"scan_{done.site.site}.{suffix}", done.scan.ends_m[done.scan.returned]
+    clouds.write_points(out / name, ends + np.asarray(done.site.position_m))
+    return name

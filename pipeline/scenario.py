@@ -17,7 +17,7 @@ import os
 import tomllib
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import (
     BaseModel,
@@ -45,6 +45,9 @@ NotNegative = Annotated[float, Field(ge=0)]
 Point2 = tuple[Coordinate, Coordinate]
 Point3 = tuple[Coordinate, Coordinate, Coordinate]
 Name = Annotated[str, Field(min_length=1, pattern=r"^[^\s/\\:*?\"<>|]+$")]
+
+
+_M = TypeVar("_M", bound=BaseModel)
 
 
 class _Model(BaseModel):
@@ -422,12 +425,17 @@ def from_values(values: dict[str, Any], folder: Path, place: str) -> Scenario:
     """Check a scenario that is at hand as nested values (as ``run.json`` holds it)."""
     values.setdefault("name", folder.resolve().name)
     try:
-        scenario = Scenario.model_validate(values)
+        scenario = strictly(Scenario, values)
     except ValidationError as error:
         raise _explain(error, place) from None
     scenario._folders = tuple(_bases(folder, scenario.extends, place))
     Grid.over(scenario.roi.box, scenario.roi.voxel_m, f"{place}: roi")
     return scenario
+
+
+def strictly(model: type[_M], values: dict[str, Any]) -> _M:
+    """Check values as they come from TOML. No text or truth value passes for a number; lists pass for tuples, as in JSON."""
+    return model.model_validate_json(json.dumps(values, default=str), strict=True)
 
 
 def json_schema() -> str:

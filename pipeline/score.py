@@ -55,7 +55,13 @@ def inputs(scenario: Scenario, out: Path) -> dict[str, Any]:
 
 
 def run(
-    scenario: Scenario, out: Path, *, jobs: int | None = None, progress: Progress = silent, audit: bool = False
+    scenario: Scenario,
+    out: Path,
+    *,
+    jobs: int | None = None,
+    progress: Progress = silent,
+    audit: bool = False,
+    left_out: list[list[float]] | None = None,
 ) -> dict[str, Any]:
     """Score and rank all sites; write ``scores.parquet``, and ``visibility.parquet`` where sites are to be kept.
 
@@ -63,6 +69,8 @@ def run(
     ----------
     audit
         Check for every beam that the chords of its voxels add up to the clipped segment and that no voxel comes twice.
+    left_out
+        Where standard errors are asked for, filled with :meth:`pipeline.uncertainty.LeaveOut.scores` of each site.
 
     Returns
     -------
@@ -82,6 +90,8 @@ def run(
         if scored.visible is not None:
             visible.append(scored.visible)
         progress("sites", len(done), 0)
+    if left_out is not None:
+        left_out += (d.left_out.tolist() for d in done if d.left_out is not None)
     limit = field.limit(gamma)
     read = inputs(scenario, out)
     about = metadata(scenario, read, gamma=gamma, grid=tpog.grid.to_json(), frames=tpog.frames, sites=[d.about for d in done])

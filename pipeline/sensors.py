@@ -42,7 +42,7 @@ class Sensor:
     source
         Where the table is from.
     wavelength_nm, divergence_mrad
-        Of the laser; the full angle across and along the elevation, in milliradians. Only effects ask for them.
+        Of the laser; the full angle at 1/e^2, across and along the elevation, in milliradians. Only effects ask for them.
     rated_range_m, rated_reflectivity
         A target of this reflectivity (0 to 1), met squarely, is still noticed at this range. Only effects ask for them.
     """
@@ -73,7 +73,7 @@ class Sensor:
         steps = np.arange(self.azimuths) * (360.0 / self.azimuths)
         upright = pitch_deg == 0.0 and roll_deg == 0.0
         offsets = np.asarray(self.azimuth_offsets_deg) + (yaw_deg if upright else 0.0)
-        azimuth = np.mod(np.round(steps[:, None] + offsets[None, :], 6), 360.0)
+        azimuth = np.mod(np.round(np.mod(steps[:, None] + offsets[None, :], 360.0), 6), 360.0)
         elevation = np.asarray(self.elevations_deg)[None, :]
         flat = cosdg(elevation)
         x, y = flat * cosdg(azimuth), flat * sindg(azimuth)
@@ -123,9 +123,10 @@ _VELODYNE: dict[str, Any] = {"wavelength_nm": 903.0, "divergence_mrad": (3.0, 1.
 _XT_32: dict[str, Any] = {"wavelength_nm": 905.0, "rated_range_m": 80.0, "rated_reflectivity": 0.1}
 
 # Ouster OS1 datasheet, revision 6: 865 nm; at 1024 columns and 10 Hz, 10 % reflectivity and 100 klx, 55 m at a chance above 50 %
-# (45 m above 90 %). At 80 % it says 120 m (100 m); the power law says 156 m. The divergence here is 0.35 deg = 6.11 mrad, a full
-# width at half maximum that is quoted for the OS0; for the OS1, 0.18 deg = 3.14 mrad is quoted.
-_OS1: dict[str, Any] = {"wavelength_nm": 865.0, "divergence_mrad": (6.11, 6.11), "rated_range_m": 55.0, "rated_reflectivity": 0.1}
+# (45 m above 90 %). At 80 % it says 120 m (100 m); the power law says 156 m. Divergence: 0.18 deg at half maximum (an earlier
+# datasheet, of the field of view of 45 deg), which is 1.70 times as wide at 1/e^2: 5.34 mrad. Left out: the beams' azimuth
+# offsets, about 1.4 and 4.2 deg to either side.
+_OS1: dict[str, Any] = {"wavelength_nm": 865.0, "divergence_mrad": (5.34, 5.34), "rated_range_m": 55.0, "rated_reflectivity": 0.1}
 
 CATALOGUE: Mapping[str, Sensor] = {
     s.name: s

@@ -6,7 +6,7 @@ A progress bar on a terminal, plain lines elsewhere; then tables. Standard outpu
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -20,7 +20,7 @@ from pipeline.sensors import Sensor
 
 if TYPE_CHECKING:
     from pipeline.accuracy import Row, Seeds, Study
-    from pipeline.callings import Call, Change
+    from pipeline.callings import Call, Change, Price
 
 
 class Screen:
@@ -94,7 +94,8 @@ class Screen:
 
             self._out.print(ranking(read_scores(folder / "scores.parquet").to_pylist()))
             self._audit(record)
-        for name in record["stages"][stage]["artefacts"]:
+        done = record["stages"][stage]
+        for name in (*done["artefacts"], *done["said"].get("clouds", ())):
             self._out.print(str(folder / name), markup=False)
 
     def verdict(self, folder: Path, wrong: list[str]) -> None:
@@ -155,14 +156,22 @@ def catalogue(sensors: Iterable[Sensor]) -> None:
     Console(width=None if sys.stdout.isatty() else 160, highlight=False).print(table)
 
 
-def effects(calls: Sequence[Call]) -> None:
-    """Effects, whether they are on, and why."""
+def effects(calls: Sequence[Call], prices: Mapping[str, Price] | None = None) -> None:
+    """Effects, whether they are on, and why; what each costs and changes, where a study says so."""
     table = Table(box=None, pad_edge=False)
-    for name in ("effect", "acts in", "kind", "state", "why", "source"):
-        table.add_column(name, overflow="fold")
+    for name in ("effect", "acts in", "kind", "state", "why", *(("costs", "changes") if prices is not None else ()), "source"):
+        table.add_column(name, overflow="fold", no_wrap=name in ("costs", "state"))
     for call in calls:
-        table.add_row(call.name, call.stage, call.kind, call.state, call.why, call.source)
+        price = _price(prices.get(call.name)) if prices is not None else ()
+        table.add_row(call.name, call.stage, call.kind, call.state, call.why, *price, call.source)
     Console(width=None if sys.stdout.isatty() else 160, highlight=False).print(table)
+
+
+def _price(price: Price | None) -> tuple[str, str]:
+    if price is None:
+        return "", ""
+    best = "the same best site" if price.regret == 0 else f"another best site, regret {price.regret:.2%}"
+    return f"{price.seconds:+.2f} s", f"scores by up to {price.change:.1%}; {best}; tau {price.tau:.2f}"
 
 
 def ablation(changes: Sequence[Change]) -> None:
@@ -205,8 +214,10 @@ def accuracy(study: Study, scenario: str) -> None:
     console.print(f"reference: {long}. * on the front of time and error, = recommended\n", markup=False)
     if other:
         console.print(_settings("settings that measure something else, against the scenario on the same traffic", other, False))
-    for name, why in study.skipped.items():
-        console.print(f"skipped: {name}: {why}", markup=False)
+    reasons = list(dict.fromkeys(study.skipped.values()))
+    for why in reasons:
+        names = [name for name, its in study.skipped.items() if its == why]
+        console.print(f"skipped, {why}: {'; '.join(names)}", markup=False)
     if study.seeds is not None:
         _seeds(console, study.seeds)
     for better, worse, chance, frames in study.neighbours[:3]:
@@ -218,7 +229,7 @@ def accuracy(study: Study, scenario: str) -> None:
 
 def _settings(title: str, rows: Sequence[Row], errors: bool) -> Table:
     table = Table(box=None, pad_edge=False, title=title, title_justify="left")
-    names = ["", "setting", "seconds", "+-", "busy", "traffic", "tpog", "scan", "score", "peak MB", "MB"]
+    names = ["", "setting", "seconds", "+-", "busy", "traffic", "tpog", "scan", "score", "memory MB", "disk MB"]
     names += ["error", "std error", "own change"] if errors else []
     for name in (*names, "tau", "rho", "kept", "regret"):
         table.add_column(name, justify="left" if name in ("", "setting") else "right", no_wrap=name != "setting")

@@ -5,11 +5,14 @@ settings that share traffic, static world or scans share the work. A stage can b
 write the same bytes.
 
     out/accuracy/<hash of the setting>.json     its scores, so that a study goes on where it was interrupted
-    out/accuracy/stages/<stage>-<hash>/         artefacts of a stage, and cost.json: seconds of each repeat, peak memory
+    out/accuracy/stages/<stage>-<hash>/         artefacts of a stage; cost.json: seconds of each repeat, memory; of the score stage
+                                                also left_out.json: scores with each group of blocks left out
 """
 
 from __future__ import annotations
 
+import ctypes
+import gc
 import importlib
 import json
 import math
@@ -25,6 +28,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
 from pipeline import __version__, sites, tables
 from pipeline.cost import measured
@@ -39,6 +43,10 @@ from pipeline.visibility import Hits, Visibility
 
 STAGES = ("statics", "scan", "traffic", "tpog", "score")
 """What a ranking takes; the report is left out."""
+
+_COST, _LEFT_OUT = "cost.json", "left_out.json"
+_NOTES = (_COST, _LEFT_OUT)
+"""Files beside a stage's artefacts."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +88,11 @@ class Trial:
 
 @dataclass(frozen=True)
 class Spent:
-    """What one stage cost: seconds of each repeat (of the clock, and of all processors), peak memory, bytes of its artefacts."""
+    """What one stage cost so far.
+
+    Seconds of each repeat (of the clock, and of all processors), peak of memory above what the program held before it, bytes of
+    its artefacts.
+    """
 
     seconds: tuple[float, ...]
     busy: tuple[float, ...]
@@ -109,7 +121,7 @@ class Bench:
         if not path.is_file():
             return None
         trial = Trial(**json.loads(path.read_text(encoding="utf-8"))["trial"])
-        return trial if all((self._folder(s, k) / "cost.json").is_file() for s, k in trial.stages.items()) else None
+        return trial if all((self._folder(s, k) / _COST).is_file() for s, k in trial.stages.items()) else None
 
     def run(self, setting: Setting) -> Trial:
         """Run every stage that is not known yet, and score."""
@@ -121,12 +133,14 @@ class Bench:
             for name in STAGES:
                 stage = _module(name)
                 keys[name] = tables.hash_of({"egvs": __version__, **stage.inputs(scenario, work)})
-                if not (self._folder(name, keys[name]) / "cost.json").is_file():
+                if not (self._folder(name, keys[name]) / _COST).is_file():
                     self._measure(name, keys[name], scenario, work)
                 _link(self._folder(name, keys[name]), work)
-            trial = _trial(scenario, work, keys, setting.weight)
-        kept = {"setting": setting.name, "overrides": setting.overrides, "trial": trial.__dict__}
-        tables.write_text(self._result(setting), json.dumps(kept, indent=1) + "\n")
+            left_out = self._folder("score", keys["score"]) / _LEFT_OUT
+            kept = json.loads(left_out.read_text(encoding="utf-8")) if left_out.is_file() else None
+            trial = _trial(scenario, work, keys, setting.weight, kept)
+        about = {"setting": setting.name, "overrides": setting.overrides, "trial": trial.__dict__}
+        tables.write_text(self._result(setting), json.dumps(about, indent=1) + "\n")
         return trial
 
     def again(self, name: str, setting: Setting, trial: Trial) -> None:
@@ -146,8 +160,8 @@ class Bench:
     def spent(self, name: str, key: str) -> Spent:
         """What one stage cost so far."""
         folder = self._folder(name, key)
-        cost = json.loads((folder / "cost.json").read_text(encoding="utf-8"))
-        size = sum(path.stat().st_size for path in folder.iterdir() if path.name != "cost.json")
+        cost = json.loads((folder / _COST).read_text(encoding="utf-8"))
+        size = sum(path.stat().st_size for path in folder.iterdir() if path.name not in _NOTES)
         return Spent(tuple(cost["seconds"]), tuple(cost["busy"]), cost["peak_mb"], size)
 
     def artefact(self, trial: Trial, stage: str, name: str) -> Path:
@@ -175,14 +189,16 @@ class Bench:
 
     def _measure(self, name: str, key: str, scenario: Scenario, work: Path) -> None:
         began = _busy_s()
+        left_out: list[list[float]] = []
+        extra = {"left_out": left_out} if name == "score" else {}
         with measured() as cost:
-            _module(name).run(scenario, work, jobs=self._jobs, progress=self._progress)
+            _module(name).run(scenario, work, jobs=self._jobs, progress=self._progress, **extra)
         busy_s = _busy_s() - began
         written = [work / artefact for artefact in _module(name).ARTEFACTS if (work / artefact).exists()]
         digests = {path.name: tables.sha256_of(path) for path in written}
         folder = self._folder(name, key)
         folder.mkdir(parents=True, exist_ok=True)
-        file = folder / "cost.json"
+        file = folder / _COST
         before: dict[str, Any] = {"seconds": [], "busy": [], "peak_mb": 0.0, "sha256": digests}
         if file.is_file():
             before = json.loads(file.read_text(encoding="utf-8"))
@@ -191,10 +207,12 @@ class Bench:
         for path in written:
             if not (folder / path.name).exists():
                 _same(path, folder / path.name)
+        if left_out:
+            tables.write_text(folder / _LEFT_OUT, json.dumps(left_out) + "\n")
         now = {
             "seconds": [*before["seconds"], round(cost.seconds, 4)],
             "busy": [*before["busy"], round(busy_s, 4)],
-            "peak_mb": max(before["peak_mb"], round(cost.peak_mb, 1)),
+            "peak_mb": max(before["peak_mb"], round(cost.peak_mb - cost.held_mb, 1)),
             "sha256": digests,
         }
         tables.write_text(file, json.dumps(now) + "\n")
@@ -221,6 +239,15 @@ class Bench:
             yield Path(folder)
 
 
+def _let_go() -> None:
+    """Give back memory that is kept for later, so that the next stage's peak above it is its own."""
+    gc.collect()
+    pa.default_memory_pool().release_unused()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc's
+    if trim is not None:
+        trim(0)
+
+
 def _busy_s() -> float:
     """Seconds that processors worked for this process and those that it waited for (SUMO): other people's work is not in it."""
     return sum(os.times()[:4])
@@ -233,7 +260,7 @@ def _module(name: str) -> ModuleType:
 def _link(folder: Path, work: Path) -> None:
     """Lay a stage's kept artefacts into a folder."""
     for path in folder.iterdir():
-        if path.name != "cost.json":
+        if path.name not in _NOTES:
             (work / path.name).unlink(missing_ok=True)
             _same(path, work / path.name)
 
@@ -246,7 +273,8 @@ def _same(path: Path, other: Path) -> None:
         shutil.copyfile(path, other)
 
 
-def _trial(scenario: Scenario, work: Path, keys: dict[str, str], weight: float) -> Trial:
+def _trial(scenario: Scenario, work: Path, keys: dict[str, str], weight: float, left_out: list[list[float]] | None) -> Trial:
+    """What came of all stages in ``work``; ``left_out`` as the score stage found it, None where the scenario wants no errors."""
     table = tables.read(work / "scores.parquet", "scores")[0].to_pydict()
     tpog, gamma = read_tpog(work / "tpog.parquet"), scenario.score.gamma
     names, scores = table["site"], np.array(table["egvs"])
@@ -257,8 +285,10 @@ def _trial(scenario: Scenario, work: Path, keys: dict[str, str], weight: float) 
     if leave_out is None:
         unknown = [math.nan] * len(names)
         return Trial(names, shares.tolist(), unknown, tpog.frames, scores.tolist(), unknown, unknown, math.nan, [], keys)
-    visibility = Visibility(scenario, work, tpog.grid)
-    left = np.array([leave_out.scores(visibility.hits(beams), gamma, visibility.unit) for beams in visibility.beams()])
+    if left_out is None:
+        visibility = Visibility(scenario, work, tpog.grid)
+        left_out = [leave_out.scores(visibility.hits(b), gamma, visibility.unit).tolist() for b in visibility.beams()]
+    left = np.array(left_out)
     limits = leave_out.limits(unit)
     raw = Estimate.of(left, leave_out.frames)
     normal = Estimate.of(left / np.where(limits > 0, limits, 1.0), leave_out.frames)

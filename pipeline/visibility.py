@@ -35,6 +35,10 @@ UNIT = 2**32
 """What a whole beam adds to a voxel where beams are weighted: weights are rounded to whole multiples of 2**-32."""
 
 
+MOST_CROSSINGS = 2**31
+"""More whole beams times voxels might add up to more than 64 bits hold, in units of 2**-32."""
+
+
 @dataclass(frozen=True)
 class Beams:
     """One site's empty scan, as the march needs it.
@@ -102,7 +106,11 @@ class Visibility:
         from pipeline.effects import Detect, TransmitScore
         from pipeline.kernels.crossings import accumulate
 
-        sensor = sensors.resolve(beams.site["sensor"], self._scenario.sensors, f"site {beams.site['site']}")
+        place = f"site {beams.site['site']}"
+        sensor = sensors.resolve(beams.site["sensor"], self._scenario.sensors, place)
+        whole = float(len(beams.ends_m) if beams.weight is None else beams.weight.sum())
+        if whole * (sum(self._grid.shape) + 3) >= MOST_CROSSINGS:  # no sum over voxels may leave 64 bits
+            raise InputError(place, f"{whole:g} beams with effects", f"fewer than {MOST_CROSSINGS / (sum(self._grid.shape) + 3):g}")
         for found in crossings.listed(beams.site, beams.ends_m, self._grid):
             share = np.ones(len(found.cells)) if beams.weight is None else beams.weight[found.rows][found.piece]
             for effect in self._effects:

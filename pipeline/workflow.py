@@ -68,7 +68,7 @@ def run(
         What ``run.json`` holds.
     """
     folder = Path(out) if out is not None else default_folder(scenario)
-    with _alone(folder):
+    with alone(folder):
         record = _read_record(folder, scenario)
         for name in STAGES:
             run_stage(name, scenario, folder, record, jobs=jobs, progress=progress, told=told, **(options or {}).get(name, {}))
@@ -86,7 +86,7 @@ def run_one(
     **options: Any,
 ) -> dict[str, Any]:
     """Run a single stage, whether its inputs changed or not, and note it in ``run.json``."""
-    with _alone(out):
+    with alone(out):
         record = _read_record(out, scenario)
         record["stages"].pop(name, None)
         run_stage(name, scenario, out, record, jobs=jobs, progress=progress, told=told, **options)
@@ -247,7 +247,7 @@ def _write_record(out: Path, record: dict[str, Any]) -> None:
 
 
 @contextmanager
-def _alone(folder: Path) -> Iterator[None]:
+def alone(folder: Path) -> Iterator[None]:
     """Keep two runs out of one folder; the lock goes with the process, however it ends."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -264,4 +264,4 @@ def _alone(folder: Path) -> Iterator[None]:
         yield
 
 
-__all__ = ["RECORD", "STAGES", "default_folder", "run", "run_one", "run_stage", "verify"]
+__all__ = ["RECORD", "STAGES", "alone", "default_folder", "run", "run_one", "run_stage", "verify"]

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import pipeline
-from pipeline import accuracy, knobs, tables, trials
+from pipeline import accuracy, knobs, tables, trials, workflow
 from pipeline.accuracy import Study
 from pipeline.errors import RunError
 from pipeline.trials import Bench
@@ -150,7 +150,7 @@ def test_an_interrupted_study_goes_on(mini: Path, tmp_path: Path, few: None, mon
         accuracy.study(mini, [], tmp_path / "out")
     told: list[tuple[str, str]] = []
     rest = accuracy.study(mini, [], tmp_path / "out", told=lambda name, state, _: told.append((name, state)))
-    assert [name for name, state in told if state == "kept"] == done
+    assert {name for name, state in told if state == "kept"} == set(done)
     assert compared(rest) == compared(whole)
     assert not list((tmp_path / "out" / "accuracy").glob(".work-*"))
 
@@ -158,7 +158,8 @@ def test_an_interrupted_study_goes_on(mini: Path, tmp_path: Path, few: None, mon
 def test_a_budget_leaves_settings_out_and_names_them(mini: Path, tmp_path: Path, egvs) -> None:
     code, printed, said = egvs("accuracy", mini, "--out", tmp_path / "out", "--budget", "0.001s")
     assert code == 0, said
-    assert "skipped: voxel 1 m" in printed
+    line = next(line for line in printed.splitlines() if line.startswith("skipped, beyond the budget: "))
+    assert {"voxel 1 m", "every 2nd azimuth"} <= set(line.partition(": ")[2].split("; "))
     rows = tables.read(tmp_path / "out" / "accuracy.parquet", "accuracy")[0].to_pylist()
     assert [row["setting"] for row in rows] == ["scenario"]
 
@@ -241,6 +242,61 @@ def test_effects_have_lines_of_their_own(mini: Path, monkeypatch: pytest.MonkeyP
     bench = Bench(mini, sets, tmp_path / "out", 1, lambda *_: None)
     bare = bench.run(found["without rain"])
     assert bare.shares == pytest.approx(shares(mini, [], tmp_path / "plain"))
+
+
+def test_effects_that_are_not_named_are_tried_where_they_act(mini: Path) -> None:
+    """Divergence needs no number of the user's; rain does, articulated has nothing to act on."""
+    with_ = {s.name: s for s in knobs.settings(pipeline.load(mini)) if s.name.startswith(knobs.WITH)}
+    assert {"with divergence", "with moving_occlusion"} <= with_.keys()
+    assert not {"with rain", "with articulated", "with slope", "with range_limit"} & with_.keys()
+    rated = knobs.settings(pipeline.load(mini, ["sites.sensor=VLP-16"]))  # its range is rated, the scenario's own sensor's is not
+    assert "with range_limit" in {s.name for s in rated}
+    assert all(pipeline.load(mini, s.overrides).effects.keys() == {s.name.removeprefix(knobs.WITH)} for s in with_.values())
+    named = {s.name for s in knobs.settings(pipeline.load(mini, ["effects.divergence={}"]))}
+    assert {"without divergence", "divergence sub_beams 19"} <= named
+    assert "with divergence" not in named
+
+
+def test_effects_say_what_they_cost_and_change(mini: Path, tmp_path: Path, few: None, egvs) -> None:
+    """As a plain run with and without the effect says."""
+    sets = ["--set", "effects.rain.rate_mm_h=90"]
+    code, printed, _ = egvs("effects", mini, "--out", tmp_path / "out", *sets)
+    assert code == 0
+    assert "egvs accuracy" in printed
+    assert egvs("accuracy", mini, "--out", tmp_path / "out", *sets)[0] == 0
+    code, printed, said = egvs("effects", mini, "--out", tmp_path / "out", *sets)
+    assert code == 0, said
+    assert "egvs accuracy" not in printed
+    dry, wet = shares(mini, [], tmp_path / "dry"), shares(mini, sets[1:], tmp_path / "wet")
+    assert f"scores by up to {np.abs(dry / wet - 1).max():.1%}" in " ".join(printed.split())
+    code, printed, _ = egvs("effects", mini, "--out", tmp_path / "out", "--set", "effects.rain.rate_mm_h=91")
+    assert "egvs accuracy" in printed  # that study was of another scenario
+
+
+def test_two_studies_keep_out_of_one_folder(mini: Path, tmp_path: Path) -> None:
+    with workflow.alone(tmp_path / "out"), pytest.raises(RunError, match="another run is at work"):
+        accuracy.study(mini, [], tmp_path / "out")
+
+
+def test_memory_is_that_of_the_stage(mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a stage takes is measured above what the program holds."""
+    from pipeline import tpog
+
+    own = tpog.run
+
+    def greedy(*args: object, **options: object) -> dict[str, object]:
+        assert np.ones(50_000_000).sum() > 0  # 400 MB
+        return own(*args, **options)
+
+    bench, setting = Bench(mini, [], tmp_path, 1, lambda *_: None), knobs.Setting("scenario", "scenario", "")
+    held = np.ones(50_000_000)
+    trial = bench.run(setting)
+    plain = bench.spent("tpog", trial.stages["tpog"]).peak_mb
+    monkeypatch.setattr(tpog, "run", greedy)
+    bench.again("tpog", setting, trial)
+    assert plain < 200
+    assert bench.spent("tpog", trial.stages["tpog"]).peak_mb == pytest.approx(plain + 381, abs=60)
+    assert held[0] == 1.0
 
 
 def test_a_site_with_a_measured_scan_is_not_thinned(mini: Path) -> None:

@@ -165,7 +165,7 @@ def test_verify_of_an_unfinished_run_says_what_is_missing(done: tuple[Path, Path
 
 def test_two_runs_in_one_folder_are_kept_apart(done: tuple[Path, Path]) -> None:
     mini, out = done
-    with workflow._alone(out), pytest.raises(RunError, match="another run is at work"):
+    with workflow.alone(out), pytest.raises(RunError, match="another run is at work"):
         pipeline.run(pipeline.load(mini), out)
 
 

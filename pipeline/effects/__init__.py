@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from pipeline.errors import InputError
+from pipeline.scenario import strictly
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -122,6 +123,11 @@ class Detect(Effect):
 class Expand(Effect):
     """One beam into weighted sub-beams."""
 
+    @property
+    def copies(self) -> int:
+        """How many sub-beams a beam has."""
+        raise NotImplementedError
+
     def expand(
         self, directions: NDArray[np.float64], sensor: Sensor, site: Site
     ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
@@ -174,10 +180,9 @@ def make(name: str, parameters: dict[str, Any], place: str) -> Effect:
         near = difflib.get_close_matches(name, KINDS, 1, 0.4)
         right = f"did you mean {near[0]}?" if near else f"known are {', '.join(KINDS)}"
         raise InputError(f"{place}.{name}", "unknown effect", right)
-    module = importlib.import_module(f"pipeline.effects.{name}")
-    kind: type[Effect] = module.EFFECT
+    kind = kind_of(name)
     try:
-        return kind(kind.Model.model_validate(parameters))
+        return kind(strictly(kind.Model, parameters))
     except ValidationError as error:
         item = error.errors()[0]
         key = ".".join(str(part) for part in item["loc"])
@@ -189,6 +194,17 @@ def make(name: str, parameters: dict[str, Any], place: str) -> Effect:
         if item["type"] == "missing":
             raise InputError(f"{place}.{name}.{key}", "missing", "this key is needed") from None
         raise InputError(f"{place}.{name}.{key}".rstrip("."), f"{item['input']!r}", item["msg"]) from None
+
+
+def kind_of(name: str) -> type[Effect]:
+    """Import one effect."""
+    kind: type[Effect] = importlib.import_module(f"pipeline.effects.{name}").EFFECT
+    return kind
+
+
+def needs(name: str) -> list[str]:
+    """The parameters of an effect that have no default."""
+    return [key for key, field in kind_of(name).Model.model_fields.items() if field.is_required()]
 
 
 def of(scenario: Scenario, stage: str) -> tuple[Effect, ...]:

@@ -12,8 +12,9 @@ rule in s, :math:`s = 2`, or :math:`s = 3 \pm \sqrt 3`, with 6 and 12 sub-beams 
 
 Calls for it: poles, signs and edges at ranges where the beam is as wide as they are. Limits: a flat shadow edge falls between
 nodes, so a single beam's share comes in steps (7: twelfths, and half for the middle); a target in a voxel counts by the share
-that gets there, not by what a detector makes of it; angles are taken as their tangents (exact to 1e-5 below 10 mrad). A maker's angle is
-taken as that of 1/e^2, whatever its own definition: one at half maximum (Ouster's) is 1.70 times as wide at 1/e^2.
+that gets there, not by what a detector makes of it; angles are taken as their tangents (exact to 1e-5 below 10 mrad).
+Angles are those of 1/e^2; a full width at half maximum (as Ouster states it) is 1.70 times as wide there. Where a maker does not
+say which it means, 1/e^2 is taken.
 """
 
 from __future__ import annotations
@@ -62,6 +63,11 @@ class Divergence(Expand):
     SOURCE: ClassVar[str] = "Gaussian beam (Siegman 1986); cubature E2r2 5-1 of Stroud (1971)"
     Model: ClassVar[type[Parameters]] = Model
     QUALITY: ClassVar[dict[str, tuple[Any, ...]]] = {"sub_beams": (7, 19)}
+
+    @property
+    def copies(self) -> int:
+        """As asked for."""
+        return int(self.parameters.sub_beams)
 
     def idle(self, scene: Scene) -> str | None:
         """A single sub-beam, or a cone without width, is the plain beam."""

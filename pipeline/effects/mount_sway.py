@@ -54,6 +54,11 @@ class MountSway(Expand):
     Model: ClassVar[type[Parameters]] = Model
     QUALITY: ClassVar[dict[str, tuple[Any, ...]]] = {"samples": (4, 9, 16)}
 
+    @property
+    def copies(self) -> int:
+        """One a pose."""
+        return int(self.parameters.samples)
+
     def idle(self, scene: Scene) -> str | None:
         """A pole at rest is the plain one."""
         if self.parameters.tilt_deg == 0:

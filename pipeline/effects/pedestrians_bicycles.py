@@ -16,11 +16,11 @@ Departures are drawn uniformly over the simulated time: rate times duration of t
 
 Boxes: 0.8 x 0.6 x 1.73 m a pedestrian, 1.76 x 0.6 x 1.73 m a bicycle with its rider: the anchor boxes with which Lang et al. 2019,
 "PointPillars", CVPR (arXiv 1812.05784) look for them in the KITTI 3-D object benchmark, sizes that Yan, Mao and Li 2018, "SECOND",
-Sensors 18(10):3337, chose after the means of KITTI's training labels, so arms and strides are included. SUMO's own are smaller:
+Sensors 18(10):3337, chose after the means of KITTI's training labels, so arms and strides are included. SUMO's own are
 0.215 x 0.478 x 1.719 m and 1.6 x 0.65 x 1.7 m.
 
 Source: Erdmann and Krajzewicz 2015, "Modelling Pedestrian Dynamics in SUMO", SUMO 2015 Intermodal Simulation for Intermodal
-Transport, 103-118 (the striping model).
+Transport (the striping model).
 
 Calls for it: sites that must see people. Limits: pedestrians' boxes may overlap where SUMO lets people pass closely, and on
 crossings that they share with turning traffic; nobody walks in groups; bicycles do not use sidewalks; sizes do not vary.
