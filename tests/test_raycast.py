@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from pipeline import scenario, statics, survey
 from pipeline.errors import InputError
 from pipeline.grid import Roi
-from pipeline.raycast import Caster, standing_on
+from pipeline.kernels import rays
+from pipeline.raycast import Caster, standing_on, with_planes
 from pipeline.sensors import CATALOGUE
 from pipeline.world import World
 from tests.oracles import cast
@@ -54,6 +55,28 @@ def box_ranges(o, d, low, high):
     """How far a ray from inside a box goes: the nearest of the planes ahead."""
     with np.errstate(divide="ignore"):
         return np.where(d > 0, (high - o) / d, np.where(d < 0, (low - o) / d, np.inf)).min(axis=1)
+
+
+@pytest.mark.parametrize(
+    ("end", "range_m", "doubtful"),
+    [
+        ((40.0, 0.0), 100.0, False),  # sine 0.0125
+        ((49.0, 0.0), 100.0, False),  # sine 0.011
+        ((51.0, 0.0), 100.0, True),  # sine 0.0098
+        ((51.0, 0.0), 40.0, False),  # as shallow, but so far away that the beam has ended
+        ((1.0, 39.99999), 100.0, True),  # 1e-5 m from an edge
+        ((1.0, 39.9999), 100.0, False),
+    ],
+)
+def test_float32_is_not_trusted_near_edges_and_at_shallow_angles(end, range_m, doubtful):
+    """A large triangle on the ground, a sensor 0.5 m above it at x = 0; what a float32 caster proposed is always triangle 0."""
+    triangles, planes, _ = with_planes(np.array([[[-500.0, 40.0, 0.0], [0.0, -900.0, 0.0], [500.0, 40.0, 0.0]]]))
+    o = np.array([0.0, 0.0, 0.5])
+    d = towards(o, [[*end, 0.0]])
+    ranges, found = np.empty(1), np.empty(1, np.int64)
+    count = rays.settle(np.zeros(1, np.int64), triangles, planes, o, d, range_m, ranges, found)
+    assert ranges[0] == pytest.approx(np.linalg.norm([*end, 0.5]), abs=1e-9)
+    assert bool(count) == doubtful
 
 
 @pytest.mark.parametrize("degrees", [0.0, 37.0, 45.0, 90.0, 123.456])
