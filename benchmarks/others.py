@@ -15,7 +15,6 @@ seconds are medians, as multiples of ours; of the sites' errors the worst is sho
 
 from __future__ import annotations
 
-import importlib.util
 import statistics
 import tempfile
 import time
@@ -163,23 +162,12 @@ def by_boxes(batch: tpog.Boxes, grid: Grid, kernels: Any = boxes) -> Any:
     return np.ascontiguousarray(steps[:-1].transpose(1, 2, 0))
 
 
-class _AllBoxes:
-    """Stands in for rtree where it is not installed: the triangles whose boxes meet a box, by comparing with all."""
-
-    def __init__(self, triangles: Any) -> None:
-        self._low, self._high = triangles.min(axis=1), triangles.max(axis=1)
-        self.bounds = np.concatenate([self._low.min(axis=0), self._high.max(axis=0)])
-
-    def intersection(self, box: Any) -> Any:
-        return np.flatnonzero(((self._low <= box[3:]) & (self._high >= box[:3])).all(axis=1)).tolist()
-
-
 def by_trimesh(triangles: Any) -> Callable[[Any, Any, float], Any]:
     """Ends of beams ``(o, d, range)`` by trimesh's own ray caster; what it needs once is made before."""
     from trimesh import triangles as made
     from trimesh.ray.ray_triangle import ray_triangle_id
 
-    tree = made.bounds_tree(triangles) if importlib.util.find_spec("rtree") else _AllBoxes(triangles)
+    tree = made.bounds_tree(triangles)
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     normals /= np.sqrt((normals**2).sum(axis=1))[:, None]
 
@@ -355,14 +343,13 @@ def cast_rows(scene: Scene) -> list[Row]:
 
     step = max(1, min(len(job[2]) for job in jobs) // CAST_BEAMS)
     slow, single = by_trimesh(triangles), by_embree(triangles)
-    tree = "rtree" if importlib.util.find_spec("rtree") else "NumPy for rtree"
     seconds = medians([all_of(ours), all_of(single)])
     start = time.process_time()
     all_of(slow, step)()
     seconds.append((time.process_time() - start) * sum(len(j[2]) for j in jobs) / sum(len(j[2][::step]) for j in jobs))
     ways = (
         ("Embree's float32 ranges", single, 1),
-        (f"trimesh, {tree}; 1 beam in {step}, scaled", slow, step),
+        (f"trimesh with rtree; 1 beam in {step}, scaled", slow, step),
     )
     found = [_ours("cast", seconds[0])]
     for (name, way, every), took in zip(ways, seconds[1:], strict=True):

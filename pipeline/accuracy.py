@@ -33,7 +33,7 @@ from pipeline import effects, knobs, pareto, tables
 from pipeline.entropy import Field
 from pipeline.errors import EgvsError, InputError
 from pipeline.knobs import APPROXIMATES, MEASURES, REFERENCE, SCENARIO, Setting
-from pipeline.results import read_tpog
+from pipeline.results import read_tpog, study_inputs
 from pipeline.scenario import Scenario
 from pipeline.stage import Progress, metadata, silent
 from pipeline.trials import STAGES, Bench, Trial
@@ -80,6 +80,7 @@ class Row:
     best_kept: bool
     best_three_kept: bool
     regret: float
+    default: bool
     front: bool = False
     recommended: bool = False
 
@@ -338,6 +339,7 @@ def _row(bench: Bench, setting: Setting, trials: dict[str, Trial], lasts: bool) 
         best_kept=best(s, 1) == best(r, 1),
         best_three_kept=best(s, 3) == best(r, 3),
         regret=regret(s, r),
+        default=knobs.is_default(bench.scenario(setting), bench.scenario(Setting(SCENARIO, SCENARIO, ""))),
     )  # fmt: skip
 
 
@@ -397,19 +399,14 @@ def _beats(one: Row, other: Row) -> bool:
     )
 
 
-def _point(row: Row) -> pareto.Point:
-    return pareto.Point(row.setting, row.kind, row.knob, row.seconds, row.judged, row.tau, row.regret, row.front, row.recommended)
+def _point(r: Row) -> pareto.Point:
+    return pareto.Point(r.setting, r.kind, r.knob, r.seconds, r.judged, r.tau, r.regret, r.front, r.recommended, r.default)
 
 
 def _write(path: Path, scenario: Scenario, rows: list[Row], times: int, tolerance: float) -> None:
     columns = {f.name: [getattr(row, f.name) for row in rows] for f in fields(Row)}
-    about = metadata(scenario, about_of(scenario), reference_times=times, tolerance=tolerance)
+    about = metadata(scenario, study_inputs(scenario), reference_times=times, tolerance=tolerance)
     tables.write(path, "accuracy", columns, about)
-
-
-def about_of(scenario: Scenario) -> dict[str, Any]:
-    """What a study is of, as its metadata has it."""
-    return {"settings": scenario.model_dump(mode="json")}
 
 
 def _between_seeds(bench: Bench, scenario: Scenario, count: int, told: Told) -> Seeds:

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline import effects, knobs, sites, statics, tables, workflow
-from pipeline.accuracy import about_of
-from pipeline.results import read_scores
+from pipeline import effects, knobs, sites, statics, workflow
+from pipeline.results import read_accuracy, read_scores
 from pipeline.scenario import Scenario
 from pipeline.stage import Progress, silent
 
@@ -88,13 +87,10 @@ def called(scenario: Scenario) -> list[Call]:
 
 def prices(scenario: Scenario, out: Path) -> dict[str, Price] | None:
     """What ``egvs accuracy`` found of each effect, from ``out / "accuracy.parquet"``; None when it was not run on this scenario."""
-    path = out / "accuracy.parquet"
-    if not path.is_file():
+    study = read_accuracy(out / "accuracy.parquet", scenario)
+    if study is None:
         return None
-    table, about = tables.read(path, "accuracy")
-    if about["inputs"] != tables.hash_of(about_of(scenario)):
-        return None
-    rows = {row["setting"]: row for row in table.to_pylist()}
+    rows = {row["setting"]: row for row in study[0]}
     found, own = {}, rows[knobs.SCENARIO]["seconds"]
     for name in effects.KINDS:
         for beginning, sign in ((knobs.WITH, 1.0), (knobs.WITHOUT, -1.0)):

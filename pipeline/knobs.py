@@ -22,7 +22,7 @@ import numpy as np
 from pipeline import effects, sites, statics
 from pipeline.errors import InputError
 from pipeline.grid import Grid
-from pipeline.scenario import Scenario
+from pipeline.scenario import Scenario, TrafficModel
 from pipeline.sensors import Sensor, resolve
 
 APPROXIMATES, MEASURES, REFERENCE, SCENARIO = "approximates", "measures", "reference", "scenario"
@@ -77,6 +77,12 @@ def reference(scenario: Scenario, times: int) -> Setting:
     """The scenario with its traffic watched for ``times`` as long."""
     frames = scenario.traffic.frames * times
     return Setting(REFERENCE, REFERENCE, "frames", (f"traffic.frames={frames}",) if times > 1 else ())
+
+
+def is_default(scenario: Scenario, own: Scenario) -> bool:
+    """Whether traffic is watched as a scenario that says nothing about it has it, and all else is as in ``own``."""
+    defaults = {key: TrafficModel.model_fields[key].default for key in ("frames", "frame_period_s", "step_s")}
+    return own.traffic.fcd is None and scenario == own.model_copy(update={"traffic": own.traffic.model_copy(update=defaults)})
 
 
 def settings(scenario: Scenario) -> list[Setting]:

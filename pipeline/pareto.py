@@ -34,6 +34,7 @@ class Point:
     regret: float
     front: bool
     recommended: bool
+    default: bool
 
 
 def draw(points: Sequence[Point], tolerance: float, title: str, path: Path) -> None:
@@ -75,8 +76,8 @@ def _approximations(axes: Any, points: Sequence[Point], tolerance: float) -> Non
             axes.scatter([p.seconds], [_percent(p)], s=230, facecolors="none", edgecolors="black", linewidths=1.6, zorder=4)
     slow = max((p.seconds for p in points), default=1.0) / 4
     for p in points:
-        if (p.front or p.recommended) and p.kind != "scenario":
-            text = f"recommended: {p.name}" if p.recommended else p.name
+        if (p.front or p.recommended or p.default) and p.kind != "scenario":
+            text = "recommended: " * p.recommended + "the program's default: " * p.default + p.name
             _name(axes, p, text, "right" if p.seconds > slow else "left")
     axes.margins(x=0.08, y=0.12)
     axes.legend(fontsize=8, loc="upper right", framealpha=0.9, title="knob", title_fontsize=8)

@@ -25,15 +25,15 @@ from pipeline import __version__, figures, tables, visibility
 from pipeline.entropy import Field
 from pipeline.errors import InputError
 from pipeline.figures import Spot
-from pipeline.results import SEPARABLE, Tpog, read_scores, read_tpog
+from pipeline.results import SEPARABLE, Tpog, read_accuracy, read_scores, read_tpog
 from pipeline.scenario import Scenario
 from pipeline.stage import Progress, silent
 from pipeline.world import read_ply
 
 NAME = "report"
 ARTEFACTS = ("report.html",)
-ACCURACY = "accuracy.png"
-"""Shown where the accuracy study was made in the run's folder."""
+ACCURACY = ("accuracy.parquet", "accuracy.png")
+"""Shown where an accuracy study of this scenario was made in the run's folder."""
 
 LISTED, FIRST, LAST = 40, 30, 5
 """More than ``LISTED`` sites are shown as the first and the last of them."""
@@ -73,16 +73,34 @@ def inputs(scenario: Scenario, out: Path) -> dict[str, Any]:
     return {
         "settings": {"shown": _shown(scenario), "keep": scenario.scan.keep, **more},
         "costs": _costs(record),
-        "files": {name: tables.sha256_of(out / name) for name in (*read, ACCURACY) if (out / name).is_file()},
+        "files": {name: tables.sha256_of(out / name) for name in (*read, *ACCURACY) if (out / name).is_file()},
         "said": {name: _said(record, name) for name in _STAGES},
         "effects": record.get("effects", []),
     }
 
 
-def _accuracy(out: Path) -> str:
-    """The figure of ``egvs accuracy`` in base 64, where the study was made in this folder."""
-    figure = out / ACCURACY
-    return base64.b64encode(figure.read_bytes()).decode("ascii") if figure.is_file() else ""
+@dataclass(frozen=True)
+class Study:
+    """What ``egvs accuracy`` found: rows of ``accuracy.parquet`` that the page shows, and the figure in base 64."""
+
+    rows: list[Row]
+    tolerance: float
+    figure: str
+
+    @property
+    def best(self) -> Row | None:
+        """The recommended setting."""
+        return next((row for row in self.rows if row["recommended"]), None)
+
+
+def _accuracy(scenario: Scenario, out: Path) -> Study | None:
+    """The study of this scenario, where one was made in this folder: its own setting, the reference, the front, the default."""
+    table, figure = (out / name for name in ACCURACY)
+    found = read_accuracy(table, scenario) if figure.is_file() else None
+    if found is None:
+        return None
+    rows = [r for r in found[0] if r["kind"] in ("scenario", "reference") or r["front"] or r["recommended"] or r["default"]]
+    return Study(rows, found[1], base64.b64encode(figure.read_bytes()).decode("ascii"))
 
 
 def _shown(scenario: Scenario) -> dict[str, Any]:
@@ -112,7 +130,7 @@ def run(scenario: Scenario, out: Path, *, jobs: int | None = None, progress: Pro
     progress("artefacts read", 1, 3)
     drawn = _figures(scenario, out, ranking, tpog)
     progress("figures drawn", 2, 3)
-    page = _page(scenario, ranking, tpog, drawn, _record(out), _accuracy(out))
+    page = _page(scenario, ranking, tpog, drawn, _record(out), _accuracy(scenario, out))
     tables.write_text(out / ARTEFACTS[0], page)
     progress("page written", 3, 3)
     return {
@@ -264,7 +282,7 @@ def _columns(field: Field, which: NDArray[np.bool_]) -> NDArray[np.float64]:
 # ---- the page
 
 
-def _page(scenario: Scenario, ranking: Ranking, tpog: Tpog, drawn: Drawn, record: dict[str, Any], accuracy: str) -> str:
+def _page(scenario: Scenario, ranking: Ranking, tpog: Tpog, drawn: Drawn, record: dict[str, Any], study: Study | None) -> str:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 
@@ -279,7 +297,7 @@ def _page(scenario: Scenario, ranking: Ranking, tpog: Tpog, drawn: Drawn, record
     rows, effects = ranking.rows, _effects(scenario, record)
     shortened = len(rows) > LISTED
     return environment.get_template("report.html.j2").render(
-        accuracy=accuracy,
+        study=study,
         unsure="egvs_se" in rows[0],
         separable=SEPARABLE,
         scenario=scenario,

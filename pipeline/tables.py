@@ -171,6 +171,7 @@ _PROMISED: dict[str, tuple[str, ...]] = {
     "tpog": ("grid", "frames", "block_frames"),
     "scans": ("sites",),
     "visibility": ("grid", "sites"),
+    "accuracy": ("inputs", "tolerance"),
 }
 """What the metadata of an artefact must hold for those who read it."""
 
@@ -202,6 +203,10 @@ def _is_sound(key: str, value: Any) -> bool:
         return grid.voxel_m > 0 and min(grid.shape) > 0 and math.prod(grid.shape) <= MAX_VOXELS
     if key == "sites":
         return isinstance(value, list) and all(isinstance(s, dict) and all(k in s for k in _SITE) for s in value)
+    if key == "inputs":
+        return isinstance(value, str)
+    if key == "tolerance":
+        return isinstance(value, float) and value > 0
     return isinstance(value, int) and not isinstance(value, bool) and value > 0
 
 

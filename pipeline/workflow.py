@@ -96,6 +96,18 @@ def run_one(
         return record
 
 
+def refresh_report(scenario: Scenario, out: Path) -> bool:
+    """Draw the report anew where a whole run of this scenario has one and something else that it shows changed; whether it has."""
+    with alone(out):
+        record = _read_record(out, scenario)
+        if not all(name in record["stages"] for name in STAGES):
+            return False
+        if not all(_is_of(name, scenario, out, record) for name in STAGES if name != "report"):
+            return False
+        run_stage("report", scenario, out, record, jobs=None, progress=silent, told=_mute)
+        return True
+
+
 def _is_of(name: str, scenario: Scenario, out: Path, record: dict[str, Any]) -> bool:
     """Whether a stage's last run is what this scenario, and the artefacts as they are now, would give."""
     try:
@@ -174,10 +186,12 @@ def verify(
         for name in STAGES:
             if (
                 name == "report"
-            ):  # it shows what the stages cost, which is part of the record, and an accuracy study if there is one
-                for study in folder.glob("accuracy.png"):
-                    shutil.copy(study, temporary)
+            ):  # it shows what the stages cost, which is part of the record, and an accuracy study if there was one
                 again["stages"] |= {n: {**again["stages"][n], "cost": record["stages"][n]["cost"]} for n in again["stages"]}
+                _write_record(Path(temporary), again)
+                if not _is_of(name, scenario, Path(temporary), record):
+                    for study in folder.glob("accuracy.p*"):
+                        shutil.copy(study, temporary)
             run_stage(name, scenario, Path(temporary), again, jobs=jobs, progress=progress, told=told)
             wrong += _differences(name, record, again)
     return wrong
@@ -264,4 +278,4 @@ def alone(folder: Path) -> Iterator[None]:
         yield
 
 
-__all__ = ["RECORD", "STAGES", "alone", "default_folder", "run", "run_one", "run_stage", "verify"]
+__all__ = ["RECORD", "STAGES", "alone", "default_folder", "refresh_report", "run", "run_one", "run_stage", "verify"]

@@ -5,6 +5,7 @@ Runs are small and go through the real stages; only the traffic is made up.
 
 import base64
 import csv
+import html
 import json
 import re
 import shutil
@@ -15,7 +16,8 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from pipeline import figures, report, results, scan, score, tables, visibility
+import pipeline
+from pipeline import accuracy, figures, knobs, report, results, scan, score, tables, visibility, workflow
 from pipeline.entropy import Field
 from pipeline.figures import Layer, Spot
 from pipeline.grid import Grid
@@ -438,11 +440,27 @@ def test_ticks_are_round(low, high, texts):
     assert [text for _, text in figures._nice(low, high, 5)] == texts
 
 
-def test_the_accuracy_study_is_shown_where_there_is_one(made, tmp_path):
-    about, out, text = made
-    assert "What accuracy costs in time" not in text
-    shutil.copytree(out, tmp_path / "out")
-    before = report.inputs(about, tmp_path / "out")
-    (tmp_path / "out" / report.ACCURACY).write_bytes(b"\x89PNG\r\n\x1a\n")
-    assert "data:image/png;base64,iVBORw0KGgo=" in page(about, tmp_path / "out")
-    assert report.inputs(about, tmp_path / "out") != before
+def test_the_accuracy_study_is_shown_where_there_is_one(mini, tmp_path, egvs, monkeypatch):
+    """Its recommendation, the front, the figure; of another scenario not; and the run is verified with it and without."""
+    monkeypatch.setattr(knobs, "VOXELS_M", (1.0,))
+    monkeypatch.setattr(knobs, "GAMMAS", (2.0,))
+    monkeypatch.setattr(accuracy, "REPEATS", 1)
+    out = tmp_path / "out"
+    assert egvs("run", mini, "--out", out)[0] == 0
+    assert "What accuracy costs" not in (out / "report.html").read_text()
+    code, printed, said = egvs("accuracy", mini, "--out", out)
+    assert code == 0, said
+    assert printed.splitlines()[-1] == str(out / "report.html")
+    text = (out / "report.html").read_text()
+    assert f"data:image/png;base64,{base64.b64encode((out / 'accuracy.png').read_bytes()).decode()}" in text
+    rows = tables.read(out / "accuracy.parquet", "accuracy")[0].to_pylist()
+    best = next(row for row in rows if row["recommended"])
+    assert f"<code>{html.escape(best['overrides'], quote=False)}</code>" in text.replace("&#39;", "'") or not best["overrides"]
+    section = text[text.index("What accuracy costs") :]
+    section = section[: section.index("</section>")]
+    assert section.count("<tr") == 1 + sum(row["front"] or row["recommended"] or row["kind"] == "scenario" for row in rows)
+    assert egvs("verify", out)[0] == 0
+    assert egvs("run", mini, "--out", out, "--set", "score.gamma=3.0")[0] == 0
+    assert "What accuracy costs" not in (out / "report.html").read_text()
+    assert egvs("verify", out)[0] == 0
+    assert not workflow.refresh_report(pipeline.load(mini), out)
