@@ -183,8 +183,8 @@ def _study(bench: Bench, out: Path, tolerance: float, clock: _Clock, seeds: int,
     own = Setting(SCENARIO, SCENARIO, "")
     scenario = bench.scenario(own)
     settings = knobs.settings(scenario)
-    if any(bench.known(setting) is None for setting in settings):
-        bench.warm_up(_shortest(settings))
+    for setting in _warm_ups([setting for setting in settings if bench.known(setting) is None]):
+        bench.warm_up(setting)
     trials = {SCENARIO: bench.run(own)}
     times = _times(bench, scenario, trials[SCENARIO], clock.budget_s)
     longest = knobs.reference(scenario, times)
@@ -201,8 +201,15 @@ def _study(bench: Bench, out: Path, tolerance: float, clock: _Clock, seeds: int,
     return Study(rows, skipped, tolerance, best, times, reference.neighbours, files, checked, repeated)
 
 
-def _shortest(settings: list[Setting]) -> Setting:
-    return next((s for s in settings if s.name.startswith(f"{knobs.FRAMES[0]} frames")), settings[0])
+def _warm_ups(settings: list[Setting]) -> list[Setting]:
+    """What compiles everything that these settings need: one on the shortest traffic, and each that switches an effect on."""
+    if not settings:
+        return []
+    shortest = next((s for s in settings if s.name.startswith(f"{knobs.FRAMES[0]} frames")), settings[0])
+    return [
+        shortest,
+        *(replace(s, overrides=(*shortest.overrides, *s.overrides)) for s in settings if s.name.startswith(knobs.WITH)),
+    ]
 
 
 def _times(bench: Bench, scenario: Scenario, trial: Trial, budget_s: float) -> int:

@@ -129,18 +129,18 @@ def _traffic(scenario: Scenario, knob: str, times: int, step_s: float | None, pe
     simulated = own.fcd is None
     if frames == 0 or (simulated and not (_divides(step, period) and _divides(step, own.warmup_s))):
         return
-    named, overrides = [f"{frames} frames"], []
+    name, overrides = f"{frames} frames", []
     if frames != own.frames:
         overrides.append(f"traffic.frames={frames}")
     if period != own.frame_period_s:
-        named.append(f"of {period:g} s")
+        name += f" every {period:g} s"
         overrides.append(f"traffic.frame_period_s={float(f'{period:.6g}')}")
     if step != own.step_s:
-        named.append(f"steps of {step:g} s")
+        name += f", step {step:g} s"
         overrides.append(f"traffic.step_s={step}")
     if overrides:
         steps = (own.warmup_s + frames * period) / step
-        yield Setting(", ".join(named), APPROXIMATES, knob, tuple(overrides), steps=steps)
+        yield Setting(name, APPROXIMATES, knob, tuple(overrides), steps=steps)
 
 
 def _divides(part: float, whole: float) -> bool:

@@ -203,7 +203,7 @@ def summary(folder: Path, found: dict[str, Any]) -> None:
 
 def accuracy(study: Study, scenario: str) -> None:
     """What the study found: two tables, what was left out, the recommendation."""
-    console = Console(width=None if sys.stdout.isatty() else 175, highlight=False, soft_wrap=True)
+    console = Console(width=None if sys.stdout.isatty() else 190, highlight=False, soft_wrap=True)
     same = [row for row in study.rows if row.kind != "measures"]
     other = [row for row in study.rows if row.kind == "measures"]
     long = "the scenario itself: nothing longer is to be had, or not within the budget"
@@ -230,9 +230,9 @@ def accuracy(study: Study, scenario: str) -> None:
 def _settings(title: str, rows: Sequence[Row], errors: bool) -> Table:
     table = Table(box=None, pad_edge=False, title=title, title_justify="left")
     names = ["", "setting", "seconds", "+-", "busy", "traffic", "tpog", "scan", "score", "memory MB", "disk MB"]
-    names += ["error", "std error", "own change"] if errors else []
+    names += ["error", "std error", "vs own"] if errors else []
     for name in (*names, "tau", "rho", "kept", "regret"):
-        table.add_column(name, justify="left" if name in ("", "setting") else "right", no_wrap=name != "setting")
+        table.add_column(name, justify="left" if name in ("", "setting") else "right", no_wrap=True)
     for r in rows:
         parts = [f"{r.error:.2%}", f"{r.error_se:.2%}", f"{r.own_change:.2%}"] if errors else []
         kept = ", ".join(["best"] * r.best_kept + ["three"] * r.best_three_kept) or "-"

@@ -36,7 +36,7 @@ from pipeline.entropy import Field
 from pipeline.errors import RunError
 from pipeline.knobs import Setting
 from pipeline.results import read_tpog
-from pipeline.scenario import Scenario, load
+from pipeline.scenario import Scenario, SiteGrid, load
 from pipeline.stage import Progress
 from pipeline.uncertainty import Estimate, LeaveOut, order
 from pipeline.visibility import Hits, Visibility
@@ -151,8 +151,8 @@ class Bench:
             self._measure(name, trial.stages[name], self.scenario(setting), work)
 
     def warm_up(self, setting: Setting) -> None:
-        """Run all stages once, and forget it: what is compiled or loaded first is compiled and loaded then."""
-        scenario = self.scenario(setting)
+        """Run all stages once, with a single site, and forget it: what is compiled or loaded first is compiled and loaded then."""
+        scenario = _with_one_site(self.scenario(setting))
         with self._workshop() as work:
             for name in STAGES:
                 _module(name).run(scenario, work, jobs=self._jobs)
@@ -237,6 +237,15 @@ class Bench:
     def _workshop(self) -> Iterator[Path]:
         with tempfile.TemporaryDirectory(prefix=".work-", dir=self._kept) as folder:
             yield Path(folder)
+
+
+def _with_one_site(scenario: Scenario) -> Scenario:
+    """The scenario with the first of its sites alone."""
+    site = sites.of(scenario)[0]
+    here = SiteGrid(low_m=(site.x_m, site.y_m), high_m=(site.x_m, site.y_m), spacing_m=1.0, heights_m=(max(site.z_m, 0.1),))
+    alone = {"file": None, "along": (), "points": None, "grid": here, "sensor": site.sensor}
+    nothing_kept = scenario.score.model_copy(update={"keep_visibility": ()})
+    return scenario.model_copy(update={"sites": scenario.sites.model_copy(update=alone), "score": nothing_kept})
 
 
 def _let_go() -> None:

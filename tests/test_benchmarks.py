@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from benchmarks import others, scaling
+from benchmarks import others, scaling, steps
 from pipeline import tpog
 from pipeline.grid import Grid
 
@@ -93,3 +94,14 @@ def test_a_synthetic_junction_is_as_large_as_asked(tmp_path) -> None:
     assert sensors.resolve("own", scenario.sensors, "").beams == pytest.approx(960, rel=0.1)
     assert len(statics.build(scenario, statics.Tally.empty()).faces) == pytest.approx(600, abs=10)
     assert len((scenario.folder / "fcd.csv").read_text().splitlines()) == 1 + 10 * 3
+
+
+def test_a_bias_is_told_from_scatter() -> None:
+    """One site that is 10 % lower, one that only scatters; t is that of two independent means."""
+    rng = np.random.default_rng(2)
+    against, shares = (rng.normal([0.4, 0.2], [0.004, 0.02], size=(16, 2)) for _ in range(2))
+    part, t = steps.change(shares * [0.9, 1.0], against)
+    assert part[0] == pytest.approx(-0.1, abs=0.01)
+    assert t[0] == pytest.approx(stats.ttest_ind(shares[:, 0] * 0.9, against[:, 0]).statistic)
+    assert abs(t[1]) < 3
+    assert steps.change(against, against)[1].tolist() == [0.0, 0.0]

@@ -1,0 +1,71 @@
+"""Does the length of SUMO's step bias the scores?
+
+``python -m benchmarks.steps [SEEDS]`` runs the shipped junction with as many seeds (16) for each step, 5000 frames 1 s apart, and
+compares the means of each site's share of the limit with those at 0.25 s. Independent runs: t is the difference over its standard
+error. Seconds are of the traffic stage, as shares of those at 0.25 s. About half an hour on two cores.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.knobs import Setting
+from pipeline.stage import silent, threads
+from pipeline.trials import Bench
+
+SCENARIO = Path(__file__).resolve().parent.parent / "scenarios" / "nishishinjuku"
+WATCHED = ("traffic.frames=5000", "traffic.frame_period_s=1.0")
+STEPS_S, AGAINST_S, FIRST_SEED, SEEDS = (0.1, 0.25, 0.5, 1.0), 0.25, 100, 16
+
+
+def trial(step_s: float, seed: int) -> tuple[list[str], list[float], float]:
+    """Sites, their shares of the limit, and seconds of the traffic stage, of one run."""
+    with tempfile.TemporaryDirectory() as folder:
+        bench = Bench(SCENARIO, WATCHED, Path(folder), 1, silent)
+        found = bench.run(Setting("run", "seed", "seed", (f"seed={seed}", f"traffic.step_s={step_s}")))
+        return found.sites, found.shares, bench.spent("traffic", found.stages["traffic"]).seconds[0]
+
+
+def change(shares: Any, against: Any) -> tuple[Any, Any]:
+    """Relative change of the mean over runs, and t, of each site: shares are (runs, sites)."""
+    mean = against.mean(axis=0)
+    error = np.sqrt((shares.var(axis=0, ddof=1) + against.var(axis=0, ddof=1)) / len(shares)) / mean
+    part = shares.mean(axis=0) / mean - 1.0
+    return part, np.divide(part, error, out=np.zeros_like(part), where=error > 0)
+
+
+def main() -> None:
+    """Run, and print a table."""
+    seeds = range(FIRST_SEED, FIRST_SEED + int(sys.argv[1] if len(sys.argv) > 1 else SEEDS))
+    with ProcessPoolExecutor(threads(None), mp_context=get_context("spawn")) as pool:
+        futures = {(step, seed): pool.submit(trial, step, seed) for seed in seeds for step in STEPS_S}
+        found = {key: future.result() for key, future in futures.items()}
+    sites = found[STEPS_S[0], FIRST_SEED][0]
+    shares = {step: np.array([found[step, seed][1] for seed in seeds]) for step in STEPS_S}
+    seconds = {step: float(np.median([found[step, seed][2] for seed in seeds])) for step in STEPS_S}
+    print(f"{len(seeds)} seeds; standard deviation between them {_span(100 * _scatter(shares[AGAINST_S]))} %")
+    print("step s | seconds of 0.25 s' | largest change % | its site | its t | mean change %")
+    for step in STEPS_S:
+        part, t = change(shares[step], shares[AGAINST_S])
+        worst = int(np.abs(part).argmax())
+        ratio = seconds[step] / seconds[AGAINST_S]
+        print(f"{step} | {ratio:.2f} | {100 * part[worst]:+.1f} | {sites[worst]} | {t[worst]:+.1f} | {100 * part.mean():+.1f}")
+
+
+def _scatter(shares: Any) -> Any:
+    return shares.std(axis=0, ddof=1) / shares.mean(axis=0)
+
+
+def _span(values: Any) -> str:
+    return f"{values.min():.1f} to {values.max():.1f}"
+
+
+if __name__ == "__main__":
+    main()
