@@ -12,7 +12,6 @@ longer hides it; 1 is linear. Written are ``docs/images/scaling.png`` and the ta
 
 from __future__ import annotations
 
-import gc
 import json
 import math
 import multiprocessing
@@ -32,6 +31,7 @@ from pyarrow import csv
 
 import pipeline
 from pipeline import workflow
+from pipeline.cost import let_go
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE, FIGURE = ROOT / "docs" / "scaling.md", ROOT / "docs" / "images" / "scaling.png"
@@ -168,8 +168,7 @@ def _traffic(size: Size, long: float, wide: float, path: Path) -> None:
 
 
 def _held_mb() -> float:
-    gc.collect()
-    pa.default_memory_pool().release_unused()
+    let_go()
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmRSS:"))
 

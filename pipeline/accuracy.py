@@ -33,11 +33,14 @@ from pipeline import effects, knobs, pareto, tables
 from pipeline.entropy import Field
 from pipeline.errors import EgvsError, InputError
 from pipeline.knobs import APPROXIMATES, MEASURES, REFERENCE, SCENARIO, Setting
-from pipeline.results import read_tpog, study_inputs
+from pipeline.results import read_tpog
 from pipeline.scenario import Scenario
 from pipeline.stage import Progress, metadata, silent
-from pipeline.trials import STAGES, Bench, Trial
-from pipeline.workflow import alone
+from pipeline.trials import STAGES, Bench, Trial, inputs_of
+from pipeline.workflow import alone, refresh_report
+
+OWN = Setting(SCENARIO, SCENARIO, "")
+"""The scenario as it is."""
 
 REPEATS = 3
 LONGEST = 32
@@ -173,43 +176,77 @@ def study(
     seeds
         So many independent runs of the scenario's own setting, to check the standard errors.
     """
-    if not tolerance > 0:
+    if not 0 < tolerance < math.inf:
         raise InputError("--tolerance", f"{tolerance:g}", "a share above 0, for example 0.02")
     with alone(out):
-        return _study(Bench(path, sets, out, jobs, progress), out, tolerance, _Clock(budget_s), seeds, progress, told)
+        bench = Bench(path, sets, out, jobs, progress)
+        scenario = bench.scenario(OWN)
+        _check(scenario, seeds)
+        found = _study(bench, scenario, out, float(tolerance), _Clock(budget_s), progress, told)
+        report = refresh_report(out)
+        files = found.files if report is None else (*found.files, report)
+        return replace(found, files=files, seeds=_between_seeds(bench, scenario, seeds, told) if seeds else None)
 
 
-def _study(bench: Bench, out: Path, tolerance: float, clock: _Clock, seeds: int, progress: Progress, told: Told) -> Study:
-    own = Setting(SCENARIO, SCENARIO, "")
-    scenario = bench.scenario(own)
-    settings = knobs.settings(scenario)
-    for setting in _warm_ups([setting for setting in settings if bench.known(setting) is None]):
-        bench.warm_up(setting)
-    trials = {SCENARIO: bench.run(own)}
+def _check(scenario: Scenario, seeds: int) -> None:
+    if seeds and scenario.traffic.fcd is not None:
+        raise InputError("--seeds", "the traffic is a finished file, the same for each seed", "network or sumocfg in [traffic]")
+    if seeds == 1:
+        raise InputError("--seeds", "1", "at least 2")
+    if scenario.traffic.fcd is None and scenario.tpog.blocks == 1:
+        place = f"{scenario.file}: tpog.blocks"
+        raise InputError(place, "1, so that nothing tells how far a score may be off", "10, or another divisor of traffic.frames")
+
+
+def _study(bench: Bench, scenario: Scenario, out: Path, tolerance: float, clock: _Clock, progress: Progress, told: Told) -> Study:
+    settings, skipped = _sound(bench, knobs.settings(scenario), told)
+    _warm_up(bench, settings, clock)
+    trials = {SCENARIO: bench.run(OWN)}
     times = _times(bench, scenario, trials[SCENARIO], clock.budget_s)
-    longest = knobs.reference(scenario, times)
-    found, skipped = _run_all(bench, [longest, *settings] if times > 1 else settings, trials, clock, told)
+    longest = [knobs.reference(scenario, times)] if times > 1 else []
+    found, more = _run_all(bench, [*longest, *settings], trials, clock, told)
     repeated = _repeat(bench, found, trials, clock, progress)
     lasts = scenario.traffic.fcd is None
     rows = _judged([_row(bench, setting, trials, lasts) for setting in found], tolerance)
-    checked = _between_seeds(bench, scenario, seeds, told) if seeds else None
     best = next((row for row in rows if row.recommended), None)
     files = (out / "accuracy.parquet", out / "accuracy.png")
-    _write(files[0], scenario, rows, times, tolerance)
+    if REFERENCE not in trials:
+        times = 1
+    _write(files[0], scenario, rows, trials[SCENARIO], times, tolerance)
     pareto.draw([_point(row) for row in rows], tolerance, scenario.name, files[1])
-    reference = trials.get(REFERENCE, trials[SCENARIO])
-    return Study(rows, skipped, tolerance, best, times, reference.neighbours, files, checked, repeated)
+    neighbours = trials.get(REFERENCE, trials[SCENARIO]).neighbours
+    return Study(rows, skipped | more, tolerance, best, times, neighbours, files, repeated=repeated)
 
 
-def _warm_ups(settings: list[Setting]) -> list[Setting]:
-    """What compiles everything that these settings need: one on the shortest traffic, and each that switches an effect on."""
-    if not settings:
-        return []
-    shortest = next((s for s in settings if s.name.startswith(f"{knobs.FRAMES[0]} frames")), settings[0])
-    return [
-        shortest,
-        *(replace(s, overrides=(*shortest.overrides, *s.overrides)) for s in settings if s.name.startswith(knobs.WITH)),
-    ]
+def _sound(bench: Bench, settings: list[Setting], told: Told) -> tuple[list[Setting], dict[str, str]]:
+    """The settings that are scenarios, and why others are none."""
+    sound, skipped = [], {}
+    for setting in settings:
+        try:
+            bench.scenario(setting)
+        except InputError as error:
+            skipped[setting.name] = str(error)
+            told(setting.name, "skipped", {"why": str(error)})
+        else:
+            sound.append(setting)
+    return sound, skipped
+
+
+def _warm_up(bench: Bench, settings: list[Setting], clock: _Clock) -> None:
+    """Compile what the settings still to be run need: once on the shortest traffic, and with each effect that they switch on."""
+    wanted = [setting for setting in settings if bench.known(setting) is None]
+    if (base := bench.known(OWN)) is not None:
+        expected = _Expected(bench, base)
+        wanted = [setting for setting in wanted if expected.seconds(setting) <= clock.left_s]
+    if not wanted:
+        return
+    shortest = min((s for s in settings if s.kind != MEASURES), key=lambda s: _steps(bench.scenario(s)))
+    switched_on = (s for s in wanted if s.name.startswith(knobs.WITH))
+    for setting in (shortest, *(replace(s, overrides=(*shortest.overrides, *s.overrides)) for s in switched_on)):
+        try:
+            bench.warm_up(setting)
+        except EgvsError:
+            continue  # named when it is run
 
 
 def _times(bench: Bench, scenario: Scenario, trial: Trial, budget_s: float) -> int:
@@ -221,7 +258,7 @@ def _times(bench: Bench, scenario: Scenario, trial: Trial, budget_s: float) -> i
         return int(kept["times"])
     once_s = sum(min(bench.spent(name, trial.stages[name]).seconds) for name in ("traffic", "tpog"))
     times = LONGEST
-    while times > 1 and times * once_s > SHARE * budget_s:
+    while times > 1 and (times * once_s > SHARE * budget_s or _sound(bench, [knobs.reference(scenario, times)], _mute)[1]):
         times //= 2
     bench.keep_note("study", {"scenario": trial.stages, "budget_s": budget_s, "times": times})
     return times
@@ -259,7 +296,7 @@ class _Expected:
 
     def __init__(self, bench: Bench, base: Trial) -> None:
         self._bench = bench
-        self._scenario = bench.scenario(Setting(SCENARIO, SCENARIO, ""))
+        self._scenario = bench.scenario(OWN)
         self._took = _medians(bench, base)
 
     def seconds(self, setting: Setting) -> float:
@@ -346,15 +383,14 @@ def _row(bench: Bench, setting: Setting, trials: dict[str, Trial], lasts: bool) 
         best_kept=best(s, 1) == best(r, 1),
         best_three_kept=best(s, 3) == best(r, 3),
         regret=regret(s, r),
-        default=knobs.is_default(bench.scenario(setting), bench.scenario(Setting(SCENARIO, SCENARIO, ""))),
+        default=knobs.is_default(bench.scenario(setting), bench.scenario(OWN)),
     )  # fmt: skip
 
 
 def _largest_se(trial: Trial) -> float:
-    """Largest standard error over the sites, as a share of the site's score; 0 where it is not known."""
+    """Largest standard error over the sites, as a share of the site's score; not a number where the TPOG has one block."""
     shares = np.array(trial.shares)
-    parts = np.array(trial.share_ses) / np.where(shares > 0, shares, np.inf)
-    return float(np.nan_to_num(parts, nan=0.0).max(initial=0.0))
+    return float((np.array(trial.share_ses) / np.where(shares > 0, shares, np.inf)).max(initial=0.0))
 
 
 def relative(found: NDArray[np.float64], reference: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -410,20 +446,23 @@ def _point(r: Row) -> pareto.Point:
     return pareto.Point(r.setting, r.kind, r.knob, r.seconds, r.judged, r.tau, r.regret, r.front, r.recommended, r.default)
 
 
-def _write(path: Path, scenario: Scenario, rows: list[Row], times: int, tolerance: float) -> None:
+def _write(path: Path, scenario: Scenario, rows: list[Row], own: Trial, times: int, tolerance: float) -> None:
     columns = {f.name: [getattr(row, f.name) for row in rows] for f in fields(Row)}
-    about = metadata(scenario, study_inputs(scenario), reference_times=times, tolerance=tolerance)
+    about = metadata(scenario, inputs_of(scenario), reference_times=times, tolerance=tolerance, stages=own.stages)
     tables.write(path, "accuracy", columns, about)
 
 
-def _between_seeds(bench: Bench, scenario: Scenario, count: int, told: Told) -> Seeds:
-    """Independent runs: how far scores scatter, what the standard errors said, and how often the intervals held the truth."""
+def _between_seeds(bench: Bench, scenario: Scenario, count: int, told: Told) -> Seeds | None:
+    """Independent runs: how far scores scatter, what the standard errors said, and how often the intervals held the truth.
+
+    None where fewer than two of them succeed.
+    """
     trials: list[Trial] = []
     counts: list[NDArray[np.int64]] = []
     for number in range(1, count + 1):
         setting = Setting(f"seed {scenario.seed + number}", "seed", "seed", (f"seed={scenario.seed + number}",))
-        known = bench.known(setting)
         try:
+            known = bench.known(setting)
             trials.append(known or bench.run(setting))
         except EgvsError as error:
             told(setting.name, "skipped", {"why": str(error)})
@@ -432,10 +471,9 @@ def _between_seeds(bench: Bench, scenario: Scenario, count: int, told: Told) -> 
         counts = [tpog.counts + sum(counts)]
         told(setting.name, "kept" if known else "done", {"seconds": sum(_medians(bench, trials[-1]).values())})
     if len(trials) < 2:
-        raise InputError("--seeds", f"{count}, of which {len(trials)} ran", "at least 2")
+        return None
     merged = Field.of(counts[0], tpog.frames * len(trials), tpog.grid)
-    own = Setting(SCENARIO, SCENARIO, "")
-    truth = np.array([merged.score(hits, scenario.score.gamma, unit).egvs for hits, unit in bench.hits(own, trials[0])])
+    truth = np.array([merged.score(hits, scenario.score.gamma, unit).egvs for hits, unit in bench.hits(OWN, trials[0])])
     scores, ses, biases = (np.array([getattr(trial, name) for trial in trials]) for name in ("scores", "ses", "biases"))
     reach = np.array([[trial.quantile] for trial in trials]) * ses
     return Seeds(

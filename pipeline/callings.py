@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline import effects, knobs, sites, statics, workflow
+from pipeline import effects, knobs, sites, statics, tables, trials, workflow
 from pipeline.results import read_accuracy, read_scores
 from pipeline.scenario import Scenario
 from pipeline.stage import Progress, silent
@@ -87,8 +87,8 @@ def called(scenario: Scenario) -> list[Call]:
 
 def prices(scenario: Scenario, out: Path) -> dict[str, Price] | None:
     """What ``egvs accuracy`` found of each effect, from ``out / "accuracy.parquet"``; None when it was not run on this scenario."""
-    study = read_accuracy(out / "accuracy.parquet", scenario)
-    if study is None:
+    study = read_accuracy(out / "accuracy.parquet")
+    if study is None or study[1]["inputs"] != tables.hash_of(trials.inputs_of(scenario)):
         return None
     rows = {row["setting"]: row for row in study[0]}
     found, own = {}, rows[knobs.SCENARIO]["seconds"]

@@ -185,8 +185,6 @@ def accuracy(
             progress=screen.progress, told=screen.setting,
         )  # fmt: skip
     show.accuracy(found, str(scenario))
-    if workflow.refresh_report(resolved, folder):
-        print(folder / "report.html")
 
 
 @app.command()

@@ -201,8 +201,9 @@ def _measures(scenario: Scenario) -> Iterator[Setting]:
             continue
         yield Setting(f"voxel {voxel_m:g} m", MEASURES, "voxel", (f"roi.voxel_m={voxel_m}",))
         scaled = gamma * (voxel_m / own) ** 2
-        overrides = (f"roi.voxel_m={voxel_m}", f"score.gamma={scaled}")
-        yield Setting(f"voxel {voxel_m:g} m, gamma {scaled:g}", MEASURES, "voxel and gamma", overrides)
+        if scaled != gamma:
+            overrides = (f"roi.voxel_m={voxel_m}", f"score.gamma={scaled}")
+            yield Setting(f"voxel {voxel_m:g} m, gamma {scaled:g}", MEASURES, "voxel and gamma", overrides)
     for cap in GAMMAS:
         if cap != gamma:
             yield Setting(f"gamma {cap:g}", MEASURES, "gamma", (f"score.gamma={cap}",))
@@ -244,12 +245,22 @@ def _fits(scenario: Scenario, voxel_m: float) -> bool:
     return True
 
 
+def _takes(name: str, parameters: dict[str, object]) -> bool:
+    try:
+        effects.make(name, parameters, "")
+    except InputError:
+        return False
+    return True
+
+
 def _quality(scenario: Scenario) -> Iterator[Setting]:
     """Each named effect's own knobs, which its class lists from cheap to fine as ``QUALITY``: a value for each parameter."""
     for name, parameters in scenario.effects.items():
         effect = effects.make(name, dict(parameters), f"{scenario.file}: effects")
         for key, values in effect.QUALITY.items():
             own = getattr(effect.parameters, key)
+            if not _takes(name, {**parameters, key: values[0]}):  # a knob of another method
+                continue
             finest = SCENARIO if values[-1] == own else f"{name} {key} {values[-1]}"
             for value in reversed(values):
                 if value != own:

@@ -33,7 +33,7 @@ from pipeline.world import read_ply
 NAME = "report"
 ARTEFACTS = ("report.html",)
 ACCURACY = ("accuracy.parquet", "accuracy.png")
-"""Shown where an accuracy study of this scenario was made in the run's folder."""
+"""Shown where an accuracy study of the same settings and files was made in the run's folder."""
 
 LISTED, FIRST, LAST = 40, 30, 5
 """More than ``LISTED`` sites are shown as the first and the last of them."""
@@ -93,14 +93,14 @@ class Study:
         return next((row for row in self.rows if row["recommended"]), None)
 
 
-def _accuracy(scenario: Scenario, out: Path) -> Study | None:
-    """The study of this scenario, where one was made in this folder: its own setting, the reference, the front, the default."""
+def _accuracy(record: dict[str, Any], out: Path) -> Study | None:
+    """A study of what the run ran on: its own setting, the reference, the front, the default; None where there is no such study."""
     table, figure = (out / name for name in ACCURACY)
-    found = read_accuracy(table, scenario) if figure.is_file() else None
-    if found is None:
+    found = read_accuracy(table) if figure.is_file() else None
+    if found is None or any(record.get("stages", {}).get(n, {}).get("inputs") != key for n, key in found[1]["stages"].items()):
         return None
     rows = [r for r in found[0] if r["kind"] in ("scenario", "reference") or r["front"] or r["recommended"] or r["default"]]
-    return Study(rows, found[1], base64.b64encode(figure.read_bytes()).decode("ascii"))
+    return Study(rows, found[1]["tolerance"], base64.b64encode(figure.read_bytes()).decode("ascii"))
 
 
 def _shown(scenario: Scenario) -> dict[str, Any]:
@@ -130,7 +130,7 @@ def run(scenario: Scenario, out: Path, *, jobs: int | None = None, progress: Pro
     progress("artefacts read", 1, 3)
     drawn = _figures(scenario, out, ranking, tpog)
     progress("figures drawn", 2, 3)
-    page = _page(scenario, ranking, tpog, drawn, _record(out), _accuracy(scenario, out))
+    page = _page(scenario, ranking, tpog, drawn, _record(out), _accuracy(_record(out), out))
     tables.write_text(out / ARTEFACTS[0], page)
     progress("page written", 3, 3)
     return {

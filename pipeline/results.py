@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -18,9 +18,6 @@ from pipeline import tables
 from pipeline.errors import InputError
 from pipeline.grid import Grid
 from pipeline.kernels.crossings import accumulate
-
-if TYPE_CHECKING:
-    from pipeline.scenario import Scenario
 
 SEPARABLE = 0.9
 """Neighbours in rank are told apart when the chance that the better is better (``beats_next``) reaches this."""
@@ -85,18 +82,16 @@ def read_scans(path: str | Path) -> pa.Table:
     return tables.read(Path(path), "scans")[0]
 
 
-def study_inputs(scenario: Scenario) -> dict[str, Any]:
-    """What an accuracy study is of: every setting of the scenario."""
-    return {"settings": scenario.model_dump(mode="json")}
-
-
-def read_accuracy(path: str | Path, scenario: Scenario) -> tuple[list[dict[str, Any]], float] | None:
-    """Rows of ``accuracy.parquet`` and the tolerance asked for; None where there is none, or it is of another scenario."""
+def read_accuracy(path: str | Path) -> tuple[list[dict[str, Any]], dict[str, Any]] | None:
+    """Rows and metadata of ``accuracy.parquet``; None where there is none."""
     path = Path(path)
     if not path.is_file():
         return None
-    table, about = tables.read(path, "accuracy")
-    return (table.to_pylist(), about["tolerance"]) if about["inputs"] == tables.hash_of(study_inputs(scenario)) else None
+    try:
+        table, about = tables.read(path, "accuracy")
+    except InputError as error:
+        raise InputError(path, "is no accuracy study", f"remove it, or run egvs accuracy again ({error})") from None
+    return table.to_pylist(), about
 
 
 def read_visibility(path: str | Path, site: str) -> NDArray[np.float64]:

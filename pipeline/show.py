@@ -5,6 +5,7 @@ A progress bar on a terminal, plain lines elsewhere; then tables. Standard outpu
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -234,7 +235,8 @@ def _settings(title: str, rows: Sequence[Row], errors: bool) -> Table:
     for name in (*names, "tau", "rho", "kept", "regret"):
         table.add_column(name, justify="left" if name in ("", "setting") else "right", no_wrap=True)
     for r in rows:
-        parts = [f"{r.error:.2%}", f"{r.error_se:.2%}", f"{r.own_change:.2%}"] if errors else []
+        known = "-" if math.isnan(r.error_se) else f"{r.error_se:.2%}"
+        parts = [f"{r.error:.2%}", known, f"{r.own_change:.2%}"] if errors else []
         kept = ", ".join(["best"] * r.best_kept + ["three"] * r.best_three_kept) or "-"
         table.add_row(
             "*" * r.front + "=" * r.recommended, r.setting, f"{r.seconds:.2f}", f"{r.seconds_spread:.2f}", f"{r.busy_s:.2f}",
@@ -261,9 +263,10 @@ def _recommendation(study: Study, scenario: str) -> str:
         least = min((row for row in study.rows if row.kind in ("approximates", "scenario")), key=lambda row: row.judged)
         return f"no setting is within {study.tolerance:.2%}; the nearest is {least.setting!r}, with {least.judged:.2%}"
     best = study.best
+    known = "unknown" if math.isnan(best.error_se) else f"{best.error_se:.2%}"
     return (
         f"the cheapest setting within {study.tolerance:.2%}: {best.setting}, {best.seconds:.2f} s, error {best.error:.2%}, "
-        f"standard error {best.error_se:.2%}\n  egvs run {scenario} {best.overrides}".rstrip()
+        f"standard error {known}\n  egvs run {scenario} {best.overrides}".rstrip()
     )
 
 

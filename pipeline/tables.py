@@ -171,7 +171,7 @@ _PROMISED: dict[str, tuple[str, ...]] = {
     "tpog": ("grid", "frames", "block_frames"),
     "scans": ("sites",),
     "visibility": ("grid", "sites"),
-    "accuracy": ("inputs", "tolerance"),
+    "accuracy": ("inputs", "tolerance", "stages"),
 }
 """What the metadata of an artefact must hold for those who read it."""
 
@@ -205,6 +205,8 @@ def _is_sound(key: str, value: Any) -> bool:
         return isinstance(value, list) and all(isinstance(s, dict) and all(k in s for k in _SITE) for s in value)
     if key == "inputs":
         return isinstance(value, str)
+    if key == "stages":
+        return isinstance(value, dict)
     if key == "tolerance":
         return isinstance(value, float) and value > 0
     return isinstance(value, int) and not isinstance(value, bool) and value > 0

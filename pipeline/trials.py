@@ -11,8 +11,6 @@ write the same bytes.
 
 from __future__ import annotations
 
-import ctypes
-import gc
 import importlib
 import json
 import math
@@ -28,12 +26,11 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 
 from pipeline import __version__, sites, tables
-from pipeline.cost import measured
+from pipeline.cost import let_go, measured
 from pipeline.entropy import Field
-from pipeline.errors import RunError
+from pipeline.errors import InputError, RunError
 from pipeline.knobs import Setting
 from pipeline.results import read_tpog
 from pipeline.scenario import Scenario, SiteGrid, load
@@ -107,6 +104,9 @@ class Bench:
         self._path, self._sets, self._jobs, self._progress = path, tuple(sets), jobs, progress
         self._kept = out / "accuracy"
         self._kept.mkdir(parents=True, exist_ok=True)
+        for left in self._kept.glob(".work-*"):  # of a study that was killed
+            shutil.rmtree(left)
+        self._results: dict[Setting, Path] = {}
 
     def scenario(self, setting: Setting) -> Scenario:
         """The scenario as this setting has it."""
@@ -120,8 +120,9 @@ class Bench:
         path = self._result(setting)
         if not path.is_file():
             return None
-        trial = Trial(**json.loads(path.read_text(encoding="utf-8"))["trial"])
-        return trial if all((self._folder(s, k) / _COST).is_file() for s, k in trial.stages.items()) else None
+        with _as_kept(path):
+            trial = Trial(**_read(path)["trial"])
+            return trial if all(self._is_kept(name, key) for name, key in trial.stages.items()) else None
 
     def run(self, setting: Setting) -> Trial:
         """Run every stage that is not known yet, and score."""
@@ -133,11 +134,11 @@ class Bench:
             for name in STAGES:
                 stage = _module(name)
                 keys[name] = tables.hash_of({"egvs": __version__, **stage.inputs(scenario, work)})
-                if not (self._folder(name, keys[name]) / _COST).is_file():
+                if not self._is_kept(name, keys[name]):
                     self._measure(name, keys[name], scenario, work)
                 _link(self._folder(name, keys[name]), work)
             left_out = self._folder("score", keys["score"]) / _LEFT_OUT
-            kept = json.loads(left_out.read_text(encoding="utf-8")) if left_out.is_file() else None
+            kept = _read(left_out) if left_out.is_file() else None
             trial = _trial(scenario, work, keys, setting.weight, kept)
         about = {"setting": setting.name, "overrides": setting.overrides, "trial": trial.__dict__}
         tables.write_text(self._result(setting), json.dumps(about, indent=1) + "\n")
@@ -160,9 +161,10 @@ class Bench:
     def spent(self, name: str, key: str) -> Spent:
         """What one stage cost so far."""
         folder = self._folder(name, key)
-        cost = json.loads((folder / _COST).read_text(encoding="utf-8"))
         size = sum(path.stat().st_size for path in folder.iterdir() if path.name not in _NOTES)
-        return Spent(tuple(cost["seconds"]), tuple(cost["busy"]), cost["peak_mb"], size)
+        with _as_kept(folder / _COST):
+            cost = _read(folder / _COST)
+            return Spent(tuple(cost["seconds"]), tuple(cost["busy"]), cost["peak_mb"], size)
 
     def artefact(self, trial: Trial, stage: str, name: str) -> Path:
         """Where one of a trial's artefacts is kept."""
@@ -180,7 +182,7 @@ class Bench:
     def note(self, name: str) -> dict[str, Any]:
         """Something else that the study keeps."""
         path = self._kept / f"{name}.json"
-        found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+        found: dict[str, Any] = _read(path) if path.is_file() else {}
         return found
 
     def keep_note(self, name: str, value: dict[str, Any]) -> None:
@@ -188,9 +190,10 @@ class Bench:
         tables.write_text(self._kept / f"{name}.json", json.dumps(value, indent=1) + "\n")
 
     def _measure(self, name: str, key: str, scenario: Scenario, work: Path) -> None:
-        began = _busy_s()
         left_out: list[list[float]] = []
         extra = {"left_out": left_out} if name == "score" else {}
+        let_go()
+        began = _busy_s()
         with measured() as cost:
             _module(name).run(scenario, work, jobs=self._jobs, progress=self._progress, **extra)
         busy_s = _busy_s() - began
@@ -201,11 +204,12 @@ class Bench:
         file = folder / _COST
         before: dict[str, Any] = {"seconds": [], "busy": [], "peak_mb": 0.0, "sha256": digests}
         if file.is_file():
-            before = json.loads(file.read_text(encoding="utf-8"))
+            before = _read(file)
         if before["sha256"] != digests:
             raise RunError(f"{name}: a repeat wrote other bytes than the first run; kept in {folder}")
-        for path in written:
-            if not (folder / path.name).exists():
+        if not self._is_kept(name, key):
+            for path in written:
+                (folder / path.name).unlink(missing_ok=True)  # of a study that was interrupted
                 _same(path, folder / path.name)
         if left_out:
             tables.write_text(folder / _LEFT_OUT, json.dumps(left_out) + "\n")
@@ -218,17 +222,19 @@ class Bench:
         tables.write_text(file, json.dumps(now) + "\n")
 
     def _result(self, setting: Setting) -> Path:
-        scenario = self.scenario(setting)
-        where = [scenario.find(scenario.sites.file, "sites.file")] if scenario.sites.file is not None else []
-        where += [scenario.find(s.points, f"site {s.site}: points") for s in sites.of(scenario) if s.points is not None]
-        read = {
-            "egvs": __version__,
-            "scenario": scenario.model_dump(mode="json"),
-            "statics": _module("statics").inputs(scenario, self._kept),
-            "traffic": _module("traffic").inputs(scenario, self._kept),
-            "sites": [tables.sha256_of(path) for path in where],
-        }
-        return self._kept / f"{tables.hash_of(read)[:16]}.json"
+        """Where a setting's result is kept; its files are read once."""
+        if setting not in self._results:
+            read = {**inputs_of(self.scenario(setting)), "weight": setting.weight}
+            self._results[setting] = self._kept / f"{tables.hash_of(read)[:16]}.json"
+        return self._results[setting]
+
+    def _is_kept(self, name: str, key: str) -> bool:
+        """Whether a stage's costs and all of its artefacts are there."""
+        folder = self._folder(name, key)
+        if not (folder / _COST).is_file():
+            return False
+        with _as_kept(folder / _COST):
+            return all((folder / artefact).is_file() for artefact in _read(folder / _COST)["sha256"])
 
     def _folder(self, name: str, key: str) -> Path:
         return self._kept / "stages" / f"{name}-{key[:16]}"
@@ -239,6 +245,33 @@ class Bench:
             yield Path(folder)
 
 
+@contextmanager
+def _as_kept(path: Path) -> Iterator[None]:
+    """What is read from ``path`` is as the study wrote it; else InputError."""
+    try:
+        yield
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(path, f"is not as the study wrote it ({error})", "remove it, and run the study again") from None
+
+
+def _read(path: Path) -> Any:
+    with _as_kept(path):
+        return json.loads(path.read_text(encoding="utf-8"))
+
+
+def inputs_of(scenario: Scenario) -> dict[str, Any]:
+    """Everything that the scores of a scenario depend on: its settings, and its files by hash."""
+    where = [scenario.find(scenario.sites.file, "sites.file")] if scenario.sites.file is not None else []
+    where += [scenario.find(s.points, f"site {s.site}: points") for s in sites.of(scenario) if s.points is not None]
+    return {
+        "egvs": __version__,
+        "scenario": scenario.model_dump(mode="json"),
+        "statics": _module("statics").inputs(scenario, scenario.folder),
+        "traffic": _module("traffic").inputs(scenario, scenario.folder),
+        "sites": [tables.sha256_of(path) for path in where],
+    }
+
+
 def _with_one_site(scenario: Scenario) -> Scenario:
     """The scenario with the first of its sites alone."""
     site = sites.of(scenario)[0]
@@ -246,15 +279,6 @@ def _with_one_site(scenario: Scenario) -> Scenario:
     alone = {"file": None, "along": (), "points": None, "grid": here, "sensor": site.sensor}
     nothing_kept = scenario.score.model_copy(update={"keep_visibility": ()})
     return scenario.model_copy(update={"sites": scenario.sites.model_copy(update=alone), "score": nothing_kept})
-
-
-def _let_go() -> None:
-    """Give back memory that is kept for later, so that the next stage's peak above it is its own."""
-    gc.collect()
-    pa.default_memory_pool().release_unused()
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc's
-    if trim is not None:
-        trim(0)
 
 
 def _busy_s() -> float:

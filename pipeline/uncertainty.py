@@ -124,8 +124,10 @@ def group_sizes(blocks: int) -> list[int]:
 def _grouped(path: Path, cells: NDArray[np.int64], grid: Grid) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
     """Counts of each group of blocks in the voxels ``cells``, (k, n), and the frames in each group, (k,)."""
     with tables.reader(path, "tpog") as (file, about):
-        block_frames = int(about["block_frames"])
-        sizes = group_sizes(int(about["frames"]) // block_frames)
+        frames, block_frames = int(about["frames"]), int(about["block_frames"])
+        if frames % block_frames:
+            raise InputError(path, f"{frames} frames in blocks of {block_frames}", "whole blocks; make it again")
+        sizes = group_sizes(frames // block_frames)
         group_of = np.repeat(np.arange(len(sizes)), sizes)
         counts = np.zeros((len(sizes), len(cells)), dtype=np.uint32)
         for number in range(file.num_row_groups):  # one block each: memory does not grow with their number

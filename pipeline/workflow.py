@@ -96,16 +96,22 @@ def run_one(
         return record
 
 
-def refresh_report(scenario: Scenario, out: Path) -> bool:
-    """Draw the report anew where a whole run of this scenario has one and something else that it shows changed; whether it has."""
-    with alone(out):
-        record = _read_record(out, scenario)
-        if not all(name in record["stages"] for name in STAGES):
-            return False
-        if not all(_is_of(name, scenario, out, record) for name in STAGES if name != "report"):
-            return False
-        run_stage("report", scenario, out, record, jobs=None, progress=silent, told=_mute)
-        return True
+def refresh_report(out: Path) -> Path | None:
+    """Draw the report of a whole run anew where something that it shows has changed, an accuracy study say; the report's path.
+
+    None, and nothing is done, where there is no whole run. For those who hold the folder (:func:`alone`).
+    """
+    if not (out / RECORD).is_file():
+        return None
+    record = _load_record(out)
+    source = Path(os.path.normpath(out / record["scenario_folder"]))
+    if not all(name in record["stages"] for name in STAGES) or not source.is_dir():
+        return None
+    scenario = from_values(record["scenario"], source, str(out / RECORD))
+    if not all(_is_of(name, scenario, out, record) for name in STAGES if name != "report"):
+        return None
+    run_stage("report", scenario, out, record, jobs=None, progress=silent, told=_mute)
+    return out / "report.html"
 
 
 def _is_of(name: str, scenario: Scenario, out: Path, record: dict[str, Any]) -> bool:
@@ -192,6 +198,8 @@ def verify(
                 if not _is_of(name, scenario, Path(temporary), record):
                     for study in folder.glob("accuracy.p*"):
                         shutil.copy(study, temporary)
+                    if not _is_of(name, scenario, Path(temporary), record):
+                        wrong.append("report.html shows an accuracy study that was replaced since; egvs report draws it anew")
             run_stage(name, scenario, Path(temporary), again, jobs=jobs, progress=progress, told=told)
             wrong += _differences(name, record, again)
     return wrong

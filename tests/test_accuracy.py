@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import shlex
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(knobs, "VOXELS_M", (1.0,))
     monkeypatch.setattr(knobs, "GAMMAS", (2.0,))
     monkeypatch.setattr(knobs, "PERIODS_S", (1.0,))
+    monkeypatch.setattr(knobs, "_others", lambda _: iter(()))
     monkeypatch.setattr(accuracy, "REPEATS", 2)
 
 
@@ -164,7 +166,9 @@ def test_a_budget_leaves_settings_out_and_names_them(mini: Path, tmp_path: Path,
     assert [row["setting"] for row in rows] == ["scenario"]
 
 
-def test_without_a_longer_reference_simulated_traffic_is_judged_by_its_standard_error(junction: Path, tmp_path: Path) -> None:
+def test_without_a_longer_reference_simulated_traffic_is_judged_by_its_standard_error(
+    junction: Path, tmp_path: Path, few: None
+) -> None:
     study = accuracy.study(junction, [], tmp_path / "out", budget_s=0.001)
     assert [row.setting for row in study.rows] == ["scenario"]
     assert (study.times, study.best) == (1, None)
@@ -182,6 +186,51 @@ def test_a_setting_that_fails_is_named_and_the_rest_goes_on(
     study = accuracy.study(mini, [], tmp_path / "out")
     assert "80" in study.skipped["80 frames"]
     assert len(study.rows) > 5
+    again = accuracy.study(mini, [], tmp_path / "out")
+    assert (again.rows, again.skipped) == (study.rows, study.skipped)
+
+
+def test_a_setting_that_is_no_scenario_is_named_and_the_rest_goes_on(
+    mini: Path, tmp_path: Path, few: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(knobs, "GAMMAS", (-1.0, 2.0))
+    study = accuracy.study(mini, [], tmp_path / "out")
+    assert "score.gamma: -1.0" in study.skipped["gamma -1"]
+    assert "gamma 2" in {row.setting for row in study.rows}
+
+
+def test_a_reference_that_would_be_endless_is_made_shorter(
+    junction: Path, tmp_path: Path, few: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A reference that is no scenario is halved until it is one."""
+    bench = Bench(junction, [], tmp_path, 1, lambda *_: None)
+    own = bench.scenario(accuracy.OWN)
+    trial = trials.Trial([], [], [], 200, [], [], [], 1.0, [], {"traffic": "t", "tpog": "t"})
+    monkeypatch.setattr(Bench, "spent", lambda *_: trials.Spent((0.1,), (0.1,), 1.0, 1))
+    assert accuracy._times(bench, own, trial, 1e6) == accuracy.LONGEST
+    frames = {32: 0, 16: 0, 8: 0, 4: 800}
+    monkeypatch.setattr(knobs, "reference", lambda s, n: knobs.Setting("r", "reference", "", (f"traffic.frames={frames[n]}",)))
+    assert accuracy._times(bench, own, trial, 1e5) == 4
+
+
+def test_knobs_of_another_method_are_not_turned(mini: Path) -> None:
+    sets = ['effects.moving_occlusion.method="independent"']
+    names = {s.name for s in knobs.settings(pipeline.load(mini, sets))}
+    assert not {name for name in names if name.startswith("moving_occlusion")}
+    assert "without moving_occlusion" in names
+
+
+def test_a_study_goes_on_without_warming_up_for_what_it_cannot_afford(
+    mini: Path, tmp_path: Path, few: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = accuracy.study(mini, [], tmp_path / "out", budget_s=0.001)
+    assert [row.setting for row in first.rows] == ["scenario"]
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("warmed up")
+
+    monkeypatch.setattr(Bench, "warm_up", refuse)
+    assert accuracy.study(mini, [], tmp_path / "out", budget_s=1e-9).rows == first.rows
 
 
 def test_a_repeat_that_writes_other_bytes_is_an_error(mini: Path, tmp_path: Path) -> None:
@@ -271,11 +320,66 @@ def test_effects_say_what_they_cost_and_change(mini: Path, tmp_path: Path, few: 
     assert f"scores by up to {np.abs(dry / wet - 1).max():.1%}" in " ".join(printed.split())
     code, printed, _ = egvs("effects", mini, "--out", tmp_path / "out", "--set", "effects.rain.rate_mm_h=91")
     assert "egvs accuracy" in printed  # that study was of another scenario
+    (mini / "sites.csv").write_text("site,x_m,y_m,z_m\npole_a,10,12,3\n")
+    assert "egvs accuracy" in egvs("effects", mini, "--out", tmp_path / "out", *sets)[1]  # and that one of other sites
 
 
 def test_two_studies_keep_out_of_one_folder(mini: Path, tmp_path: Path) -> None:
     with workflow.alone(tmp_path / "out"), pytest.raises(RunError, match="another run is at work"):
         accuracy.study(mini, [], tmp_path / "out")
+
+
+KEPT = {
+    "the study's note": ("study.json", "{}x", "study.json: is not as the study wrote it"),
+    "a setting's result": ("[0-9a-f]*.json", '{"trial": {"sites": 3}}', "is not as the study wrote it"),
+    "a stage's cost": ("stages/tpog-*/cost.json", "", "cost.json: is not as the study wrote it"),
+    "a list for a cost": ("stages/tpog-*/cost.json", "[]", "cost.json: is not as the study wrote it"),
+}
+
+
+@pytest.mark.parametrize("case", KEPT)
+def test_what_was_kept_and_damaged_is_named(junction: Path, tmp_path: Path, few: None, egvs, case: str) -> None:
+    pattern, content, message = KEPT[case]
+    words = ("accuracy", junction, "--out", tmp_path / "out", "--budget", "0.001s")
+    assert egvs(*words)[0] == 0
+    for path in (tmp_path / "out" / "accuracy").glob(pattern):
+        path.write_text(content)
+    code, printed, said = egvs(*words)
+    assert code == 2
+    assert message in said
+    assert "Traceback" not in said + printed
+
+
+def test_what_was_kept_and_removed_is_made_again(mini: Path, tmp_path: Path, few: None) -> None:
+    study = accuracy.study(mini, [], tmp_path)
+    for path in (tmp_path / "accuracy" / "stages").glob("*/tpog.parquet"):
+        path.unlink()
+    (tmp_path / "accuracy" / ".work-left").mkdir()
+    assert compared(accuracy.study(mini, [], tmp_path)) == compared(study)
+    assert len(list((tmp_path / "accuracy" / "stages").glob("*/tpog.parquet"))) > 1
+    assert not (tmp_path / "accuracy" / ".work-left").exists()
+
+
+def test_a_weight_is_part_of_what_a_result_is_kept_under(mini: Path, tmp_path: Path) -> None:
+    """With an endless gamma, the same overrides mean half as much where beams are not weighted up."""
+    bench = Bench(mini, ["score.gamma=inf"], tmp_path, 1, lambda *_: None)
+    thin = next(s for s in knobs.settings(bench.scenario(accuracy.OWN)) if s.name == "every 2nd azimuth")
+    plain = replace(thin, weight=1.0)
+    assert np.array(bench.run(thin).shares) == pytest.approx(2 * np.array(bench.run(plain).shares))
+
+
+def test_memory_is_let_go_before_a_stage_is_measured(mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[str] = []
+    monkeypatch.setattr(trials, "let_go", lambda: done.append("let go"))
+    own = trials.measured
+
+    def noted() -> object:
+        done.append("measured")
+        return own()
+
+    monkeypatch.setattr(trials, "measured", noted)
+    Bench(mini, [], tmp_path, 1, lambda *_: None).run(accuracy.OWN)
+    assert done == ["let go", "measured"] * len(trials.STAGES)
 
 
 def test_memory_is_that_of_the_stage(mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -342,8 +446,21 @@ def test_front_holds_no_setting_that_another_beats(mini: Path, tmp_path: Path, f
         assert row.front != beaten
 
 
+def test_one_block_tells_nothing_of_errors(junction: Path, mini: Path, tmp_path: Path, few: None, egvs) -> None:
+    """Refused where SUMO could watch longer; of a finished file the errors are unknown, not 0."""
+    code, _, said = egvs("accuracy", junction, "--out", tmp_path / "out", "--set", "tpog.blocks=1")
+    assert code == 2
+    assert "tpog.blocks: 1, so that nothing tells" in said
+    code, printed, said = egvs("accuracy", mini, "--out", tmp_path / "out", "--set", "tpog.blocks=1")
+    assert code == 0, said
+    assert "standard error unknown" in printed
+    assert "nan" not in printed
+
+
 BAD = {
     ("--tolerance", "0"): "--tolerance: 0",
+    ("--tolerance", "inf"): "--tolerance: inf",
+    ("--seeds", "3"): "--seeds: the traffic is a finished file",
     ("--budget", "soon"): "--budget: 'soon'",
     ("--budget", "-3s"): "--budget: '-3s'",
     ("--budget", ""): "--budget: ''",
