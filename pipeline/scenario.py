@@ -17,11 +17,10 @@ import os
 import tomllib
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     BaseModel,
-    ConfigDict,
     Field,
     PrivateAttr,
     SerializerFunctionWrapHandler,
@@ -30,6 +29,7 @@ from pydantic import (
     model_validator,
 )
 
+from pipeline.checked import Checked
 from pipeline.errors import InputError, MissingBackendError
 from pipeline.grid import Grid, Roi
 
@@ -47,14 +47,7 @@ Point3 = tuple[Coordinate, Coordinate, Coordinate]
 Name = Annotated[str, Field(min_length=1, pattern=r"^[^\s/\\:*?\"<>|]+$")]
 
 
-_M = TypeVar("_M", bound=BaseModel)
-
-
-class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class RoiModel(_Model):
+class RoiModel(Checked):
     """The region of interest, a box in the world frame, and the voxels that it is cut into."""
 
     center_m: Point3 = Field(description="Centre of the box, world frame (x east, y north, z up)")
@@ -72,7 +65,7 @@ class RoiModel(_Model):
         return Grid.over(self.box, self.voxel_m)
 
 
-class VehicleKind(_Model):
+class VehicleKind(Checked):
     """One row of the fleet: a SUMO vType with its real size and its share of the trips."""
 
     name: Name = Field(description="Identifier of the SUMO vType; for a finished FCD file, the type that it names")
@@ -94,7 +87,7 @@ _FLEET = (
 )
 
 
-class TrafficModel(_Model):
+class TrafficModel(Checked):
     """Where vehicles come from: a network (with drawn or given demand), a SUMO configuration, or a finished FCD file."""
 
     network: str | None = Field(None, description="A .net.xml(.gz) or an OpenStreetMap file; may start with $SUMO_HOME/")
@@ -152,7 +145,7 @@ class TrafficModel(_Model):
         return "routes", self.model_fields_set & (drawn if self.routes else set())
 
 
-class MeshModel(_Model):
+class MeshModel(Checked):
     """A triangle mesh that trimesh loads (PLY, OBJ, STL, GLB), in metres, z up."""
 
     file: str
@@ -160,7 +153,7 @@ class MeshModel(_Model):
     kind: Name = Field("mesh", description="Shown in messages and in the report")
 
 
-class StaticsModel(_Model):
+class StaticsModel(Checked):
     """The static world."""
 
     footprints: tuple[str, ...] = Field(
@@ -172,7 +165,7 @@ class StaticsModel(_Model):
     ground: bool = Field(True, description="A ground plane at z = 0")
 
 
-class TpogModel(_Model):
+class TpogModel(Checked):
     """How frames are counted."""
 
     blocks: int = Field(10, ge=1, le=65535, description="Blocks of consecutive frames; divides traffic.frames")
@@ -184,7 +177,7 @@ _OPTICS = ("wavelength_nm", "divergence_mrad", "rated_range_m", "rated_reflectiv
 _MOST_BEAMS = 10_000_000
 
 
-class SensorModel(_Model):
+class SensorModel(Checked):
     """A sensor of the user's. Elevations are listed, or uniform between two when ``channels`` is given."""
 
     elevations_deg: tuple[Annotated[float, Field(ge=-90, le=90)], ...] = Field(
@@ -234,7 +227,7 @@ class SensorModel(_Model):
         return self
 
 
-class SiteGrid(_Model):
+class SiteGrid(Checked):
     """Sites on a square lattice."""
 
     low_m: Point2 = Field(description="South-west corner, where the first site stands")
@@ -243,7 +236,7 @@ class SiteGrid(_Model):
     heights_m: tuple[Positive, ...] = Field(min_length=1)
 
 
-class SiteLine(_Model):
+class SiteLine(Checked):
     """Sites along a line, the first at its start."""
 
     line_m: tuple[Point2, ...] = Field(min_length=2)
@@ -251,7 +244,7 @@ class SiteLine(_Model):
     heights_m: tuple[Positive, ...] = Field(min_length=1)
 
 
-class SitesModel(_Model):
+class SitesModel(Checked):
     """Candidate sites: a file, or a rule. Pose and sensor below hold for every site that names none of its own."""
 
     file: str | None = Field(None, description="CSV (site, x_m, y_m, z_m, ...) or GeoJSON points")
@@ -271,13 +264,13 @@ class SitesModel(_Model):
         return self
 
 
-class ScanModel(_Model):
+class ScanModel(Checked):
     """How empty scans are kept."""
 
     keep: bool = Field(True, description="false: no scans.parquet; score casts as it goes, for sweeps over thousands of sites")
 
 
-class ScoreModel(_Model):
+class ScoreModel(Checked):
     """How a site is scored."""
 
     gamma: float = Field(10.0, ge=0, allow_inf_nan=True, description="Beams in a voxel above this number count no more; may be inf")
@@ -287,7 +280,7 @@ class ScoreModel(_Model):
     standard_error: bool = Field(True, description="Say how far each score may be off because the traffic was short")
 
 
-class Scenario(_Model):
+class Scenario(Checked):
     """Everything that a run depends on. Made by :func:`load`."""
 
     name: Name = Field("", min_length=0, validate_default=False, description="Defaults to the folder's name")
@@ -425,17 +418,12 @@ def from_values(values: dict[str, Any], folder: Path, place: str) -> Scenario:
     """Check a scenario that is at hand as nested values (as ``run.json`` holds it)."""
     values.setdefault("name", folder.resolve().name)
     try:
-        scenario = strictly(Scenario, values)
+        scenario = Scenario.of(values)
     except ValidationError as error:
         raise _explain(error, place) from None
     scenario._folders = tuple(_bases(folder, scenario.extends, place))
     Grid.over(scenario.roi.box, scenario.roi.voxel_m, f"{place}: roi")
     return scenario
-
-
-def strictly(model: type[_M], values: dict[str, Any]) -> _M:
-    """Check values as they come from TOML. No text or truth value passes for a number; lists pass for tuples, as in JSON."""
-    return model.model_validate_json(json.dumps(values, default=str), strict=True)
 
 
 def json_schema() -> str:

@@ -20,7 +20,7 @@ STAGES = ("traffic", "statics", "tpog", "scan", "score", "report")
 # Lower layers may not import higher ones; modules of one layer may import each other unless they are stages.
 LAYERS = (
     ("errors",),
-    ("grid", "schemas"),
+    ("grid", "schemas", "checked"),
     ("scenario", "tables", "cost"),
     ("kernels", "safexml", "stage", "ordered"),
     (

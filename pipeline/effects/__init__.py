@@ -29,10 +29,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import ValidationError
 
+from pipeline.checked import Checked
 from pipeline.errors import InputError
-from pipeline.scenario import strictly
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -64,10 +64,8 @@ SELF_ACTING = "slope"
 """The one effect that switches itself on, when the network has relief: leaving it out would be wrong."""
 
 
-class Parameters(BaseModel):
-    """Base of an effect's parameters: frozen, unknown keys are errors."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+class Parameters(Checked):
+    """Base of an effect's parameters."""
 
 
 @dataclass(frozen=True)
@@ -182,7 +180,7 @@ def make(name: str, parameters: dict[str, Any], place: str) -> Effect:
         raise InputError(f"{place}.{name}", "unknown effect", right)
     kind = kind_of(name)
     try:
-        return kind(strictly(kind.Model, parameters))
+        return kind(kind.Model.of(parameters))
     except ValidationError as error:
         item = error.errors()[0]
         key = ".".join(str(part) for part in item["loc"])
