@@ -73,7 +73,7 @@ class Sensor:
         steps = np.arange(self.azimuths) * (360.0 / self.azimuths)
         upright = pitch_deg == 0.0 and roll_deg == 0.0
         offsets = np.asarray(self.azimuth_offsets_deg) + (yaw_deg if upright else 0.0)
-        azimuth = np.mod(np.round(np.mod(steps[:, None] + offsets[None, :], 360.0), 6), 360.0)
+        azimuth = np.round(np.mod(steps[:, None] + offsets[None, :], 360.0), 6)
         elevation = np.asarray(self.elevations_deg)[None, :]
         flat = cosdg(elevation)
         x, y = flat * cosdg(azimuth), flat * sindg(azimuth)

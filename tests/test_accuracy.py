@@ -419,6 +419,15 @@ def test_settings_are_sound_scenarios(name: str) -> None:
         assert setting.beside in {s.name for s in found}
 
 
+def test_the_default_is_what_a_scenario_has_that_says_nothing() -> None:
+    """The shipped junction names the paper's period of 0.25 s; a second apart is the program's own."""
+    folder = ROOT / "scenarios" / "nishishinjuku"
+    own = pipeline.load(folder)
+    found = [s.name for s in knobs.settings(own) if knobs.is_default(pipeline.load(folder, s.overrides), own)]
+    assert found == ["5000 frames every 1 s"]
+    assert knobs.is_default(*[pipeline.load(folder, ["traffic.frame_period_s=1.0"])] * 2)
+
+
 def test_comparisons_with_ties() -> None:
     a, b = np.array([3.0, 3.0, 1.0, 2.0]), np.array([4.0, 3.0, 1.0, 2.0])
     pairs = [(i, j) for i in range(4) for j in range(i)]

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import pipeline
-from pipeline import callings, effects, results
+from pipeline import callings, effects, results, tables, trials
 
 
 def states(mini: Path, *overrides: str) -> dict[str, tuple[str, str]]:
@@ -95,3 +95,17 @@ def test_a_scenario_may_extend_another(mini: Path, tmp_path: Path, egvs) -> None
     assert (code, "leads back to itself" in said) == (2, True)
     (wet / "scenario.toml").write_text('extends = "../nowhere"\n')
     assert egvs("run", wet, "--out", out)[0] == 2
+
+
+def test_what_an_effect_costs_is_with_less_without(mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where it is named, the scenario's seconds less those without it; where it is not, those with it less the scenario's."""
+    scenario = pipeline.load(mini, ["effects.rain.rate_mm_h=20"])
+    rows = [
+        {"setting": name, "seconds": seconds, "error": 0.1, "tau": 0.9, "regret": 0.0}
+        for name, seconds in (("scenario", 5.0), ("without rain", 4.0), ("with divergence", 12.0), ("gamma 2", 5.0))
+    ]
+    about = {"inputs": tables.hash_of(trials.inputs_of(scenario))}
+    monkeypatch.setattr(callings, "read_accuracy", lambda _: (rows, about))
+    found = callings.prices(scenario, tmp_path)
+    assert found is not None
+    assert {name: price.seconds for name, price in found.items()} == {"rain": 1.0, "divergence": 7.0}

@@ -510,3 +510,12 @@ print([name for name in sys.modules if name.startswith("pipeline.effects")])
 """
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "[]"
+
+
+def test_more_beams_than_whole_numbers_hold_are_refused(mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Weighted hits are added up in units of 2**-32, so 2**31 crossings in one class of voxels would leave 64 bits."""
+    scenario = pipeline.load(mini, ON["rain"])
+    beams = sensors.resolve("small", scenario.sensors, "").beams
+    monkeypatch.setattr(visibility, "MOST_CROSSINGS", beams)
+    with pytest.raises(InputError, match=r"site pole_a: .* beams with effects; fewer than"):
+        pipeline.run(scenario, tmp_path / "out")

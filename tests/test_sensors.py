@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from pipeline.errors import InputError
 from pipeline.scenario import SensorModel
-from pipeline.sensors import CATALOGUE, resolve, rotation
+from pipeline.sensors import CATALOGUE, Sensor, resolve, rotation
 
 BEAMS = {"VLP-16": 28_800, "VLP-32C": 57_600, "Pandar XT-32": 64_000, "OS1-64": 65_536, "OS1-128": 131_072}
 LENGTH = 1e-15
@@ -175,3 +175,11 @@ def test_senseless_sensors_are_refused(values):
 def test_unknown_sensor_names_the_nearest():
     with pytest.raises(InputError, match="did you mean VLP-32C"):
         resolve("VLP32C", {}, "site a")
+
+
+def test_a_negative_azimuth_is_the_positive_one_to_the_last_bit() -> None:
+    """-8.018 degrees and 351.982 degrees are the same direction; as float64, 360 - 8.018 is not 351.982."""
+    assert 360.0 - 8.018 != 351.982
+    below, above = (Sensor("s", (10.0,), (offset,), 1, 100.0, "") for offset in (-8.018, 351.982))
+    assert below.directions().tolist() == above.directions().tolist()
+    assert Sensor("s", (0.0,), (-1e-9,), 1, 100.0, "").directions().tolist() == [[1.0, 0.0, 0.0]]
