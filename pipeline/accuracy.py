@@ -120,6 +120,8 @@ class Study:
         See :class:`pipeline.trials.Trial`, of the longest traffic.
     files
         What was written.
+    empty
+        Whether every score is 0.
     """
 
     rows: list[Row]
@@ -131,6 +133,7 @@ class Study:
     files: tuple[Path, ...]
     seeds: Seeds | None = None
     repeated: int = 0
+    empty: bool = False
 
 
 @dataclass
@@ -176,8 +179,8 @@ def study(
     seeds
         So many independent runs of the scenario's own setting, to check the standard errors.
     """
-    if not 0 < tolerance < math.inf:
-        raise InputError("--tolerance", f"{tolerance:g}", "a share above 0, for example 0.02")
+    if not 1e-6 <= tolerance <= 1:
+        raise InputError("--tolerance", f"{tolerance:g}", "a share from 1e-6 to 1, for example 0.02")
     with alone(out):
         bench = Bench(path, sets, out, jobs, progress)
         scenario = bench.scenario(OWN)
@@ -204,6 +207,7 @@ def _study(bench: Bench, scenario: Scenario, out: Path, tolerance: float, clock:
     trials = {SCENARIO: bench.run(OWN)}
     times = _times(bench, scenario, trials[SCENARIO], clock.budget_s)
     longest = [knobs.reference(scenario, times)] if times > 1 else []
+    settings = [s for s in settings if not longest or _is_shorter(bench, s, longest[0])]
     found, more = _run_all(bench, [*longest, *settings], trials, clock, told)
     repeated = _repeat(bench, found, trials, clock, progress)
     lasts = scenario.traffic.fcd is None
@@ -215,7 +219,14 @@ def _study(bench: Bench, scenario: Scenario, out: Path, tolerance: float, clock:
     _write(files[0], scenario, rows, trials[SCENARIO], times, tolerance)
     pareto.draw([_point(row) for row in rows], tolerance, scenario.name, files[1])
     neighbours = trials.get(REFERENCE, trials[SCENARIO]).neighbours
-    return Study(rows, skipped | more, tolerance, best, times, neighbours, files, repeated=repeated)
+    empty = not any(trials[SCENARIO].shares)
+    return Study(rows, skipped | more, tolerance, best, times, neighbours, files, repeated=repeated, empty=empty)
+
+
+def _is_shorter(bench: Bench, setting: Setting, longest: Setting) -> bool:
+    """Whether a setting is worth comparing with the reference: not the same, and not watched for longer."""
+    ours_s, its_s = (traffic.frames * traffic.frame_period_s for traffic in (bench.scenario(s).traffic for s in (setting, longest)))
+    return setting.overrides != longest.overrides and ours_s <= its_s * (1 + 1e-9)
 
 
 def _sound(bench: Bench, settings: list[Setting], told: Told) -> tuple[list[Setting], dict[str, str]]:
@@ -277,7 +288,7 @@ def _run_all(
     for setting in sorted(settings, key=lambda s: (math.frexp(needs_s[s.name])[1], s.kind == MEASURES, needs_s[s.name])):
         if needs_s[setting.name] > max(clock.left_s, 0.0):
             skipped[setting.name] = BEYOND
-            told(setting.name, "skipped", {"why": f"about {needs_s[setting.name]:.0f} s, {BEYOND}"})
+            told(setting.name, "skipped", {"why": f"about {needs_s[setting.name]:.0f} s, {BEYOND}", "beyond": True})
             continue
         try:
             trial = known[setting.name] or bench.run(setting)
@@ -375,7 +386,7 @@ def _row(bench: Bench, setting: Setting, trials: dict[str, Trial], lasts: bool) 
         bytes=sum(cost.bytes for cost in spent.values()),
         error=error,
         error_se=error_se,
-        error_rms=float(np.sqrt(np.mean(changes**2))) if len(changes) else 0.0,
+        error_rms=error * float(np.sqrt(np.mean((changes / error) ** 2))) if 0 < error < math.inf else error,
         own_change=float(relative(s, np.array(beside.shares)).max(initial=0.0)),
         judged=max(error, error_se) if lasts else error,
         tau=agreement(s, r, "tau"),

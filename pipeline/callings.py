@@ -21,7 +21,7 @@ from pipeline.stage import Progress, silent
 
 @dataclass(frozen=True)
 class Call:
-    """One effect, before one scene: "on", "off" or "skipped", and why."""
+    """One effect, before one scene: "on", "off", "skipped", or "refused" because something is missing; and why."""
 
     name: str
     stage: str
@@ -80,7 +80,7 @@ def catalogue() -> list[Call]:
 
 
 def called(scenario: Scenario) -> list[Call]:
-    """Every effect before ``scenario``: on, off, or skipped because it provably changes nothing, and why."""
+    """Every effect before ``scenario``: on, off, skipped because it provably changes nothing, or refused; and why."""
     scene = effects.Scene(scenario, statics.build(scenario, statics.Tally.empty()), sites.of(scenario))
     return [_call(name, scene) for name in effects.KINDS]
 
@@ -110,6 +110,9 @@ def _call(name: str, scene: effects.Scene) -> Call:
     reason = effect.idle(scene)
     if reason is not None:
         return Call(name, stage, kind, "skipped", f"named, but {reason}: the result is the same without it", effect.SOURCE)
+    lacking = effect.lacks(scene)
+    if lacking is not None:
+        return Call(name, stage, kind, "refused", str(lacking), effect.SOURCE)
     set_ = ", ".join(f"{key} = {value}" for key, value in effect.parameters.model_dump(mode="json").items())
     return Call(name, stage, kind, "on", f"named, with {set_}" if set_ else "named", effect.SOURCE)
 

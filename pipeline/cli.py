@@ -5,6 +5,8 @@ Heavy modules are imported by the verb that needs them, so that ``egvs --help`` 
 
 from __future__ import annotations
 
+import re
+import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -25,6 +27,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+_INTERRUPTED = 130
+"""Exit code after Ctrl-C."""
+
 ScenarioPath = Annotated[Path, typer.Argument(metavar="SCENARIO", help="A folder with a scenario.toml, or the file.")]
 Out = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="The run's folder; runs/<scenario name> by default.")]
 Set = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override one value, e.g. traffic.frames=500.")]
@@ -40,8 +45,10 @@ def main() -> None:
         _fail(str(error), error.exit_code)
     except OSError as error:
         _fail(f"{error.filename or 'system'}: {error.strerror or error}", 1)
-    except KeyboardInterrupt:
-        _fail("interrupted; run the same command again to go on from the last whole stage", 130)
+    except SystemExit as end:  # typer's own way to end, of an interrupt too
+        if end.code == _INTERRUPTED:
+            _fail("interrupted; run the same command again to go on from the last whole stage", _INTERRUPTED)
+        raise
 
 
 def _fail(message: str, code: int) -> None:
@@ -167,7 +174,7 @@ def accuracy(
     out: Out = None,
     set_: Set = None,
     jobs: Jobs = None,
-    tolerance: Annotated[float, typer.Option(help="Largest error that the recommended setting may have.")] = 0.02,
+    tolerance: Annotated[float, typer.Option(help="Largest error of the recommended setting, a share: 0.02 is 2 %.")] = 0.02,
     budget: Annotated[str, typer.Option(metavar="TIME", help="How long the study may take, e.g. 60s or 10m.")] = "10m",
     seeds: Annotated[
         int, typer.Option(min=0, help="Also check the standard errors by so many independent runs, at least 2; takes its own time.")
@@ -179,12 +186,12 @@ def accuracy(
 
     resolved = _load(scenario, set_)
     folder = out or workflow.default_folder(resolved)
-    with show.Screen() as screen:
+    with show.Screen("accuracy") as screen:
         found = what_it_costs.study(
             scenario, set_ or (), folder, tolerance=tolerance, budget_s=_seconds(budget), seeds=seeds, jobs=jobs,
             progress=screen.progress, told=screen.setting,
         )  # fmt: skip
-    show.accuracy(found, str(scenario))
+    show.accuracy(found, _again("run", scenario, set_))
 
 
 @app.command()
@@ -214,10 +221,14 @@ def effects(
         return
     resolved = _load(scenario, set_)
     folder = out or workflow.default_folder(resolved)
-    prices = callings.prices(resolved, folder)
-    show.effects(callings.called(resolved), prices)
-    if prices is None:
-        print(f"what they cost and change: egvs accuracy {scenario}, or --ablation")
+    prices, calls = callings.prices(resolved, folder), callings.called(resolved)
+    show.effects(calls, prices)
+    untold = [
+        call.name for call in calls if call.state == "on" and call.name in resolved.effects and call.name not in (prices or {})
+    ]
+    if prices is None or untold:
+        what = "they" if prices is None else ", ".join(untold)
+        print(f"what {what} cost and change: {_again('accuracy', scenario, set_, out)}, or --ablation")
     if ablation:
         if not resolved.effects:
             raise InputError("--ablation", "the scenario names no effect", "name one, e.g. --set effects.rain.rate_mm_h=20")
@@ -248,15 +259,18 @@ def _load(path: Path, set_: list[str] | None) -> Scenario:
     return load(path, set_ or ())
 
 
+def _again(verb: str, scenario: Path, set_: list[str] | None, out: Path | None = None) -> str:
+    """A command that can be typed."""
+    words = ["egvs", verb, str(scenario), *(word for one in set_ or () for word in ("--set", one))]
+    return shlex.join([*words, "--out", str(out)] if out is not None else words)
+
+
 def _seconds(text: str) -> float:
-    units = {"s": 1.0, "m": 60.0, "h": 3600.0}
-    number, unit = (text[:-1], units[text[-1]]) if text[-1:] in units else (text, 1.0)
-    try:
-        seconds = float(number) * unit
-    except ValueError:
-        seconds = -1.0
+    units = {"s": 1.0, "m": 60.0, "h": 3600.0, "": 1.0}
+    found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)([smh]?)", text)
+    seconds = float(found[1]) * units[found[2]] if found else 0.0
     if not 0 < seconds < float("inf"):
-        raise InputError("--budget", repr(text), "a time above 0, for example 60s or 10m")
+        raise InputError("--budget", repr(text), "a time above 0 with one unit, for example 90s, 10m or 1.5h")
     return seconds
 
 

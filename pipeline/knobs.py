@@ -17,8 +17,6 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import numpy as np
-
 from pipeline import effects, sites, statics
 from pipeline.errors import InputError
 from pipeline.grid import Grid
@@ -221,20 +219,8 @@ def _others(scenario: Scenario) -> Iterator[str]:
             continue
         scene = scene or effects.Scene(scenario, statics.build(scenario, statics.Tally.empty()), sites.of(scenario))
         effect = effects.make(name, {}, place)
-        if effect.idle(scene) is None and _is_complete(effect, scene):
+        if effect.idle(scene) is None and effect.lacks(scene) is None:
             yield name
-
-
-def _is_complete(effect: effects.Effect, scene: effects.Scene) -> bool:
-    """Whether the sensors say what the effect asks of them."""
-    if not isinstance(effect, effects.Detect):
-        return True
-    try:
-        for name in {site.sensor for site in scene.sites}:
-            effect.detect(np.ones(1), resolve(name, scene.scenario.sensors, f"{scene.scenario.file}: sensors"))
-    except InputError:
-        return False
-    return True
 
 
 def _fits(scenario: Scenario, voxel_m: float) -> bool:

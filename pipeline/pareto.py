@@ -46,9 +46,12 @@ def draw(points: Sequence[Point], tolerance: float, title: str, path: Path) -> N
     figure = Figure(figsize=(13.0, max(5.6, 1.6 + 0.24 * len(others))), layout="constrained")
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
-    _approximations(left, [p for p in points if p.kind in ("approximates", "scenario")], tolerance)
+    same = [p for p in points if p.kind in ("approximates", "scenario")]
+    _approximations(left, same, tolerance)
     _others(right, others)
     figure.suptitle(f"What accuracy costs in time: {title}", fontsize=12)
+    figure.draw_without_rendering()  # places the panels, so that names can be placed in them
+    _names(left, same)
     with tables.aside(path) as partial:
         figure.savefig(partial, dpi=150, format="png", metadata={"Software": None})
 
@@ -74,11 +77,6 @@ def _approximations(axes: Any, points: Sequence[Point], tolerance: float) -> Non
     for p in points:
         if p.recommended:
             axes.scatter([p.seconds], [_percent(p)], s=230, facecolors="none", edgecolors="black", linewidths=1.6, zorder=4)
-    slow = max((p.seconds for p in points), default=1.0) / 4
-    for p in points:
-        if (p.front or p.recommended or p.default) and p.kind != "scenario":
-            text = "recommended: " * p.recommended + "the program's default: " * p.default + p.name
-            _name(axes, p, text, "right" if p.seconds > slow else "left")
     axes.margins(x=0.08, y=0.12)
     axes.legend(fontsize=8, loc="upper right", framealpha=0.9, title="knob", title_fontsize=8)
 
@@ -108,8 +106,12 @@ def _scatter(axes: Any, points: Sequence[Point]) -> None:
 
 def _others(axes: Any, points: Sequence[Point]) -> None:
     """One line a setting: the agreement of its ranking, its regret and its seconds."""
-    axes.set(xlabel="Kendall's tau with the scenario's ranking (1: the same)")
     axes.set_title("Settings that measure something else", fontsize=10)
+    if not points:
+        axes.set_axis_off()
+        axes.text(0.5, 0.5, "none was tried", ha="center", color="0.4", transform=axes.transAxes)
+        return
+    axes.set(xlabel="Kendall's tau with the scenario's ranking (1: the same)")
     styles = _styles(points)
     for line, p in enumerate(points):
         colour, shape = styles[p.knob]
@@ -129,9 +131,22 @@ def _percent(point: Point) -> float:
     return 100 * max(point.error, _LEAST)
 
 
-def _name(axes: Any, point: Point, text: str, align: str) -> None:
-    offset = (6 if align == "left" else -9, -11)
-    axes.annotate(
-        text, (point.seconds, _percent(point)), xytext=offset, textcoords="offset points", fontsize=7.5, ha=align, zorder=2,
-        bbox={"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.75},
-    )  # fmt: skip
+def _names(axes: Any, points: Sequence[Point]) -> None:
+    """Name the recommended setting, the program's default and the front, each where it covers no other name and no point."""
+    renderer = axes.figure.canvas.get_renderer()
+    taken = [axes.get_legend().get_window_extent(renderer)]
+    spots = axes.transData.transform([(p.seconds, _percent(p)) for p in points])
+    named = [p for p in points if (p.front or p.recommended or p.default) and p.kind != "scenario"]
+    for p in sorted(named, key=lambda p: (not p.recommended, not p.default, p.seconds)):
+        text = "recommended: " * p.recommended + "the program's default: " * p.default + p.name
+        for align, x, y in (("left", 6, -11), ("right", -8, -11), ("left", 6, 6), ("right", -8, 6)):
+            name = axes.annotate(
+                text, (p.seconds, _percent(p)), xytext=(x, y), textcoords="offset points", fontsize=7.5, ha=align, zorder=2,
+                bbox={"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.75},
+            )  # fmt: skip
+            box = name.get_window_extent(renderer)
+            free = not any(box.overlaps(other) for other in taken) and not any(box.contains(*spot) for spot in spots)
+            if free and axes.bbox.containsx(box.x0) and axes.bbox.containsx(box.x1):
+                taken.append(box)
+                break
+            name.remove()

@@ -76,7 +76,7 @@ def run(
             if done.site.site in points:
                 clouds.append(_write_cloud(out, done, cloud))
             progress("sites", len(about), len(known))
-        file.describe(metadata(scenario, inputs(scenario, out), sites=about))
+        file.describe(metadata(scenario, inputs(scenario, out), seed=None, sites=about))
     return {
         "sites": len(known),
         "kept": True,

@@ -14,6 +14,7 @@ import importlib
 import importlib.util
 import json
 import os
+import re
 import tomllib
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -416,7 +417,7 @@ def _bases(folder: Path, extends: str, place: str) -> Iterator[Path]:
 
 def from_values(values: dict[str, Any], folder: Path, place: str) -> Scenario:
     """Check a scenario that is at hand as nested values (as ``run.json`` holds it)."""
-    values.setdefault("name", folder.resolve().name)
+    values.setdefault("name", re.sub(r'[\s/\\:*?"<>|]+', "_", folder.resolve().name) or "scenario")
     try:
         scenario = Scenario.of(values)
     except ValidationError as error:

@@ -24,17 +24,18 @@ if TYPE_CHECKING:
     from pipeline.callings import Call, Change, Price
 
 
+NARROW, WIDE = 110, 190
+"""Terminals below ``NARROW`` columns get fewer columns of tables; ``WIDE`` is the width of what goes to a file."""
+
+
 class Screen:
     """Shows a run as it goes on, and what came of it."""
 
-    def __init__(self) -> None:
+    def __init__(self, verb: str = "") -> None:
         self._out = Console(width=None if sys.stdout.isatty() else 150, highlight=False, soft_wrap=True)
         self._err = Console(stderr=True, highlight=False, soft_wrap=True)
-        self._stage, self._ran = "", False
-        self._bar = Progress(
-            TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"), TimeElapsedColumn(),
-            console=self._err, transient=True,
-        )  # fmt: skip
+        self._stage, self._ran = verb, False
+        self._bar = Progress(TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=self._err, transient=True)
         self._task = self._bar.add_task("", total=None, visible=False)
         self._lively = sys.stderr.isatty()
 
@@ -50,7 +51,9 @@ class Screen:
     def progress(self, what: str, done: int, total: int) -> None:
         """A :data:`pipeline.stage.Progress`."""
         if self._lively:
-            self._bar.update(self._task, description=f"{self._stage}: {what}", completed=done, total=total or None, visible=True)
+            count = f"{done}/{total}" if total else str(done)
+            self._bar.update(self._task, description=f"{self._stage}: {what} {count}", completed=done, visible=True)
+            self._bar.tasks[0].total = total or None  # update() takes None for "as it was"
 
     def told(self, stage: str, state: str, record: dict[str, Any]) -> None:
         """A :data:`pipeline.workflow.Told`."""
@@ -58,7 +61,8 @@ class Screen:
         if state == "runs":
             self._ran = True
             if self._lively:
-                self._bar.update(self._task, description=stage, completed=0, total=None, visible=True)
+                self._bar.update(self._task, description=stage, completed=0, visible=True)
+                self._bar.tasks[0].total = None
             return
         if self._lively:
             self._bar.update(self._task, visible=False)
@@ -68,8 +72,9 @@ class Screen:
         )
 
     def setting(self, name: str, state: str, said: dict[str, Any]) -> None:
-        """A :data:`pipeline.accuracy.Told`."""
-        self._stage = "accuracy"
+        """A :data:`pipeline.accuracy.Told`. What the budget leaves out is told at the end."""
+        if said.get("beyond"):
+            return
         took = f"{said['seconds']:.2f} s" if "seconds" in said else state
         self._err.print(f"{took:>10}   {name}{' (kept)' if state == 'kept' else ''} {said.get('why', '')}", markup=False)
 
@@ -77,7 +82,7 @@ class Screen:
         """The ranking, the artefacts, and what each stage cost."""
         from pipeline.results import read_scores
 
-        self._out.print(ranking(read_scores(folder / "scores.parquet").to_pylist()))
+        self._out.print(ranking(read_scores(folder / "scores.parquet").to_pylist(), self._out.width))
         self._audit(record)
         table = Table("stage", "artefact", "seconds", "peak MB", box=None, pad_edge=False)
         for stage, done in record["stages"].items():
@@ -93,7 +98,7 @@ class Screen:
         if stage == "score":
             from pipeline.results import read_scores
 
-            self._out.print(ranking(read_scores(folder / "scores.parquet").to_pylist()))
+            self._out.print(ranking(read_scores(folder / "scores.parquet").to_pylist(), self._out.width))
             self._audit(record)
         done = record["stages"][stage]
         for name in (*done["artefacts"], *done["said"].get("clouds", ())):
@@ -116,26 +121,28 @@ class Screen:
             )
 
 
-def ranking(rows: list[dict[str, Any]]) -> Table:
-    """Sites by rank, as a table."""
-    table = Table(box=None, pad_edge=False, caption_justify="left")
-    columns = ["rank", "site", "x m", "y m", "z m", "sensor", "EGVS bit", "of best", "entropy seen", "beams in ROI"]
+def ranking(rows: list[dict[str, Any]], width: int = WIDE) -> Table:
+    """Sites by rank, as a table; without poses and sensors where the terminal is narrow."""
+    table = Table(box=None, pad_edge=False)
+    pose = ["x m", "y m", "z m", "sensor"] if width >= NARROW else []
     unsure = "egvs_se" in rows[0] if rows else False
-    if unsure:
-        columns[7:7] = ["std error", "beats next"]
-        if any(row["beats_next"] < SEPARABLE for row in rows):
-            table.caption = f"~ not separable from the next site: the chance that it truly scores higher is below {SEPARABLE:.0%}"
-    for name in columns:
-        table.add_column(name, justify="left" if name in ("site", "sensor") else "right")
+    doubts = ["std error", "beats next"] if unsure else []
+    if unsure and any(row["beats_next"] < SEPARABLE for row in rows):
+        table.caption = f"~ not separable from the next site: the chance that it truly scores higher is below {SEPARABLE:.0%}"
+    beams = ["beams in ROI"] if width >= NARROW else []
+    for name in ("rank", "site", *pose, "EGVS bit", *doubts, "of best", "entropy seen", *beams):
+        left = name in ("site", "sensor")
+        table.add_column(name, justify="left" if left else "right", no_wrap=name != "site", overflow="fold")
     best = max((row["egvs"] for row in rows), default=0.0)
     ordered = sorted(rows, key=lambda row: row["rank"])
     for row in ordered:
         share = f"{row['egvs'] / best:.1%}" if best > 0 else "-"
         doubt = _doubt(row, row is ordered[-1]) if unsure else ()
+        where = (f"{row['x_m']:.2f}", f"{row['y_m']:.2f}", f"{row['z_m']:.2f}", row["sensor"]) if pose else ()
+        crossing = (str(row["beams_in_roi"]),) if beams else ()
         table.add_row(
-            str(row["rank"]), row["site"], f"{row['x_m']:.2f}", f"{row['y_m']:.2f}", f"{row['z_m']:.2f}", row["sensor"],
-            f"{row['egvs']:.1f}", *doubt, share, f"{row['entropy_seen']:.1%}", str(row["beams_in_roi"]),
-        )  # fmt: skip
+            str(row["rank"]), row["site"], *where, f"{row['egvs']:.1f}", *doubt, share, f"{row['entropy_seen']:.1%}", *crossing
+        )
     return table
 
 
@@ -159,13 +166,16 @@ def catalogue(sensors: Iterable[Sensor]) -> None:
 
 def effects(calls: Sequence[Call], prices: Mapping[str, Price] | None = None) -> None:
     """Effects, whether they are on, and why; what each costs and changes, where a study says so."""
-    table = Table(box=None, pad_edge=False)
-    for name in ("effect", "acts in", "kind", "state", "why", *(("costs", "changes") if prices is not None else ()), "source"):
+    console = Console(width=None if sys.stdout.isatty() else 160, highlight=False)
+    table, wide = Table(box=None, pad_edge=False), console.width >= NARROW
+    costs = ("costs", "changes") if prices is not None else ()
+    for name in ("effect", *(("acts in", "kind") if wide else ()), "state", "why", *costs, *(("source",) if wide else ())):
         table.add_column(name, overflow="fold", no_wrap=name in ("costs", "state"))
     for call in calls:
         price = _price(prices.get(call.name)) if prices is not None else ()
-        table.add_row(call.name, call.stage, call.kind, call.state, call.why, *price, call.source)
-    Console(width=None if sys.stdout.isatty() else 160, highlight=False).print(table)
+        kind, source = ((call.stage, call.kind), (call.source,)) if wide else ((), ())
+        table.add_row(call.name, *kind, call.state, call.why, *price, *source)
+    console.print(table)
 
 
 def _price(price: Price | None) -> tuple[str, str]:
@@ -202,47 +212,57 @@ def summary(folder: Path, found: dict[str, Any]) -> None:
     console.print(f"next: egvs run {folder}", markup=False)
 
 
-def accuracy(study: Study, scenario: str) -> None:
-    """What the study found: two tables, what was left out, the recommendation."""
-    console = Console(width=None if sys.stdout.isatty() else 190, highlight=False, soft_wrap=True)
+def accuracy(study: Study, command: str) -> None:
+    """What the study found: two tables, what was left out, the recommendation (``command`` and what it takes)."""
+    console = Console(width=None if sys.stdout.isatty() else WIDE, highlight=False, soft_wrap=True)
+    wide = console.width >= WIDE - 10
     same = [row for row in study.rows if row.kind != "measures"]
     other = [row for row in study.rows if row.kind == "measures"]
     long = "the scenario itself: nothing longer is to be had, or not within the budget"
     for row in same:
         if row.kind == "reference":
             long = f"traffic {study.times} times as long, itself known to {row.error_se:.2%} (its largest standard error)"
-    console.print(_settings("settings that approximate the same number, against the reference", same, True))
+    console.print(_settings("settings that approximate the same number, against the reference", same, True, wide))
     console.print(f"reference: {long}. * on the front of time and error, = recommended\n", markup=False)
     if other:
-        console.print(_settings("settings that measure something else, against the scenario on the same traffic", other, False))
-    reasons = list(dict.fromkeys(study.skipped.values()))
-    for why in reasons:
+        title = "settings that measure something else, against the scenario on the same traffic"
+        console.print(_settings(title, other, False, wide))
+    if not wide:
+        console.print("stages, memory and disk: in a wider window, or in accuracy.parquet", markup=False)
+    for why in dict.fromkeys(study.skipped.values()):
         names = [name for name, its in study.skipped.items() if its == why]
         console.print(f"skipped, {why}: {'; '.join(names)}", markup=False)
     if study.seeds is not None:
         _seeds(console, study.seeds)
     for better, worse, chance, frames in study.neighbours[:3]:
-        console.print(f"{better} above {worse}: chance {chance:.0%}; about {frames:,.0f} frames tell them apart", markup=False)
-    console.print(_recommendation(study, scenario), markup=False)
+        enough = f"about {frames:,.0f} frames tell them apart" if math.isfinite(frames) else "no traffic would tell them apart"
+        console.print(f"{better} above {worse}: chance {chance:.0%}; {enough}", markup=False)
+    console.print(_recommendation(study, command), markup=False)
     for path in study.files:
         console.print(str(path), markup=False)
 
 
-def _settings(title: str, rows: Sequence[Row], errors: bool) -> Table:
+def _settings(title: str, rows: Sequence[Row], errors: bool, wide: bool) -> Table:
     table = Table(box=None, pad_edge=False, title=title, title_justify="left")
-    names = ["", "setting", "seconds", "+-", "busy", "traffic", "tpog", "scan", "score", "memory MB", "disk MB"]
-    names += ["error", "std error", "vs own"] if errors else []
-    for name in (*names, "tau", "rho", "kept", "regret"):
-        table.add_column(name, justify="left" if name in ("", "setting") else "right", no_wrap=True)
+    names = ["", "setting", "seconds"]
+    names += ["+-", "busy", "traffic", "tpog", "scan", "score", "memory MB", "disk MB"] if wide else []
+    names += ["error", "std error"] if errors else []
+    names += ["vs own"] if errors and wide else []
+    names += ["tau", "rho", "kept", "regret"] if wide else ["tau", "kept", "regret"]
+    for name in names:
+        left = name in ("", "setting")
+        table.add_column(name, justify="left" if left else "right", no_wrap=wide or name != "setting", overflow="fold")
     for r in rows:
         known = "-" if math.isnan(r.error_se) else f"{r.error_se:.2%}"
-        parts = [f"{r.error:.2%}", known, f"{r.own_change:.2%}"] if errors else []
-        kept = ", ".join(["best"] * r.best_kept + ["three"] * r.best_three_kept) or "-"
-        table.add_row(
-            "*" * r.front + "=" * r.recommended, r.setting, f"{r.seconds:.2f}", f"{r.seconds_spread:.2f}", f"{r.busy_s:.2f}",
-            f"{r.traffic_s:.2f}", f"{r.tpog_s:.2f}", f"{r.scan_s:.2f}", f"{r.score_s:.2f}", f"{r.peak_mb:.0f}",
-            f"{r.bytes / 1e6:.1f}", *parts, f"{r.tau:.3f}", f"{r.rho:.3f}", kept, f"{r.regret:.2%}",
-        )  # fmt: skip
+        cells = {
+            "": "*" * r.front + "=" * r.recommended, "setting": r.setting, "seconds": f"{r.seconds:.2f}",
+            "+-": f"{r.seconds_spread:.2f}", "busy": f"{r.busy_s:.2f}", "traffic": f"{r.traffic_s:.2f}", "tpog": f"{r.tpog_s:.2f}",
+            "scan": f"{r.scan_s:.2f}", "score": f"{r.score_s:.2f}", "memory MB": f"{r.peak_mb:.0f}",
+            "disk MB": f"{r.bytes / 1e6:.1f}", "error": f"{r.error:.2%}", "std error": known, "vs own": f"{r.own_change:.2%}",
+            "tau": f"{r.tau:.3f}", "rho": f"{r.rho:.3f}", "regret": f"{r.regret:.2%}",
+            "kept": ", ".join(["best"] * r.best_kept + ["three"] * r.best_three_kept) or "-",
+        }  # fmt: skip
+        table.add_row(*(cells[name] for name in names))
     return table
 
 
@@ -258,15 +278,20 @@ def _seeds(console: Console, seeds: Seeds) -> None:
     console.print(f"90 % intervals hold the score of all runs together in {seeds.covered:.1%} of cases")
 
 
-def _recommendation(study: Study, scenario: str) -> str:
+def _recommendation(study: Study, command: str) -> str:
+    if study.empty:
+        return "every score is 0, so that there is nothing to choose by: look where the region of interest and the traffic are"
+    rivals = [row for row in study.rows if row.kind in ("approximates", "scenario")]
+    if study.best is None and len(rivals) == 1:
+        return f"the budget left no time for any other setting than the scenario's own, with {rivals[0].judged:.2%}; give it more"
     if study.best is None:
-        least = min((row for row in study.rows if row.kind in ("approximates", "scenario")), key=lambda row: row.judged)
+        least = min(rivals, key=lambda row: row.judged)
         return f"no setting is within {study.tolerance:.2%}; the nearest is {least.setting!r}, with {least.judged:.2%}"
     best = study.best
     known = "unknown" if math.isnan(best.error_se) else f"{best.error_se:.2%}"
     return (
         f"the cheapest setting within {study.tolerance:.2%}: {best.setting}, {best.seconds:.2f} s, error {best.error:.2%}, "
-        f"standard error {known}\n  egvs run {scenario} {best.overrides}".rstrip()
+        f"standard error {known}\n  {command} {best.overrides}".rstrip()
     )
 
 

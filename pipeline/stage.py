@@ -40,7 +40,7 @@ def metadata(scenario: Scenario, inputs: dict[str, Any], **more: Any) -> dict[st
     """The metadata that every artefact carries.
 
     ``scenario.hash`` covers the settings that this artefact depends on, ``inputs`` also the files: a setting that the stage
-    does not read changes no byte.
+    does not read changes no byte. So those in which nothing is random pass ``seed=None``.
     """
     return {
         "schema": schemas.VERSION,

@@ -93,7 +93,7 @@ def run(scenario: Scenario, out: Path, *, jobs: int | None = None, progress: Pro
     read = inputs(scenario, out)
     tally = Tally.empty()
     world = build(scenario, tally, progress)
-    write_ply(out / ARTEFACTS[0], world, metadata(scenario, read))
+    write_ply(out / ARTEFACTS[0], world, metadata(scenario, read, seed=None))
     notes = {"notes": ["slope: on, the ground follows the network's roads"]} if "surface" in read["files"] else {}
     return {
         "triangles": len(world.faces),

@@ -232,9 +232,8 @@ def _recording(
 ) -> AbstractContextManager[Recording]:
     if scenario.traffic.fcd is not None and traci is not None:
         raise InputError("--traci", "the scenario names a finished FCD file", "network or sumocfg in [traffic]")
-    if scenario.traffic.fcd is not None and crowd is not None:
-        place = f"{scenario.file}: effects.{crowd.NAME}"
-        raise InputError(place, "the scenario names a finished FCD file, so nobody can be added", "network or sumocfg in [traffic]")
+    if crowd is not None and (refusal := crowd.refusal(scenario)) is not None:
+        raise refusal
     if scenario.traffic.fcd is not None:
         return _finished(scenario)
     if traci is not None:

@@ -26,6 +26,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline import __version__, sites, tables
 from pipeline.cost import let_go, measured
@@ -103,9 +104,12 @@ class Bench:
     def __init__(self, path: Path, sets: Sequence[str], out: Path, jobs: int | None, progress: Progress) -> None:
         self._path, self._sets, self._jobs, self._progress = path, tuple(sets), jobs, progress
         self._kept = out / "accuracy"
-        self._kept.mkdir(parents=True, exist_ok=True)
-        for left in self._kept.glob(".work-*"):  # of a study that was killed
-            shutil.rmtree(left)
+        try:
+            (self._kept / "stages").mkdir(parents=True, exist_ok=True)
+            for left in self._kept.glob(".work-*"):  # of a study that was killed
+                shutil.rmtree(left)
+        except OSError as error:
+            raise InputError(self._kept, f"is no folder to work in ({error.strerror})", "remove it") from None
         self._results: dict[Setting, Path] = {}
 
     def scenario(self, setting: Setting) -> Scenario:
@@ -121,7 +125,7 @@ class Bench:
         if not path.is_file():
             return None
         with _as_kept(path):
-            trial = Trial(**_read(path)["trial"])
+            trial = _sound(Trial(**_read(path)["trial"]))
             return trial if all(self._is_kept(name, key) for name, key in trial.stages.items()) else None
 
     def run(self, setting: Setting) -> Trial:
@@ -138,8 +142,9 @@ class Bench:
                     self._measure(name, keys[name], scenario, work)
                 _link(self._folder(name, keys[name]), work)
             left_out = self._folder("score", keys["score"]) / _LEFT_OUT
-            kept = _read(left_out) if left_out.is_file() else None
-            trial = _trial(scenario, work, keys, setting.weight, kept)
+            with _as_kept(left_out):
+                kept = np.array(_read(left_out), dtype=np.float64) if left_out.is_file() else None
+                trial = _trial(scenario, work, keys, setting.weight, kept)
         about = {"setting": setting.name, "overrides": setting.overrides, "trial": trial.__dict__}
         tables.write_text(self._result(setting), json.dumps(about, indent=1) + "\n")
         return trial
@@ -164,7 +169,10 @@ class Bench:
         size = sum(path.stat().st_size for path in folder.iterdir() if path.name not in _NOTES)
         with _as_kept(folder / _COST):
             cost = _read(folder / _COST)
-            return Spent(tuple(cost["seconds"]), tuple(cost["busy"]), cost["peak_mb"], size)
+            seconds, busy = (tuple(float(value) for value in cost[key]) for key in ("seconds", "busy"))
+            if not len(seconds) == len(busy) > 0:
+                raise ValueError("no times")
+            return Spent(seconds, busy, float(cost["peak_mb"]), size)
 
     def artefact(self, trial: Trial, stage: str, name: str) -> Path:
         """Where one of a trial's artefacts is kept."""
@@ -182,8 +190,8 @@ class Bench:
     def note(self, name: str) -> dict[str, Any]:
         """Something else that the study keeps."""
         path = self._kept / f"{name}.json"
-        found: dict[str, Any] = _read(path) if path.is_file() else {}
-        return found
+        with _as_kept(path):
+            return dict(_read(path)) if path.is_file() else {}
 
     def keep_note(self, name: str, value: dict[str, Any]) -> None:
         """Keep it."""
@@ -242,7 +250,12 @@ class Bench:
     @contextmanager
     def _workshop(self) -> Iterator[Path]:
         with tempfile.TemporaryDirectory(prefix=".work-", dir=self._kept) as folder:
-            yield Path(folder)
+            try:
+                yield Path(folder)
+            except InputError as error:
+                if folder not in str(error):
+                    raise
+                raise InputError(self._kept, f"holds a damaged artefact ({error})", "remove it, and run the study again") from None
 
 
 @contextmanager
@@ -257,6 +270,14 @@ def _as_kept(path: Path) -> Iterator[None]:
 def _read(path: Path) -> Any:
     with _as_kept(path):
         return json.loads(path.read_text(encoding="utf-8"))
+
+
+def _sound(trial: Trial) -> Trial:
+    """The trial, if it has a number for each site; else ValueError."""
+    for name in ("shares", "share_ses", "scores", "ses", "biases"):
+        if np.array(getattr(trial, name), dtype=np.float64).shape != (len(trial.sites),):
+            raise ValueError(f"{name} of {len(trial.sites)} sites")
+    return trial
 
 
 def inputs_of(scenario: Scenario) -> dict[str, Any]:
@@ -306,7 +327,7 @@ def _same(path: Path, other: Path) -> None:
         shutil.copyfile(path, other)
 
 
-def _trial(scenario: Scenario, work: Path, keys: dict[str, str], weight: float, left_out: list[list[float]] | None) -> Trial:
+def _trial(scenario: Scenario, work: Path, keys: dict[str, str], weight: float, left_out: NDArray[np.float64] | None) -> Trial:
     """What came of all stages in ``work``; ``left_out`` as the score stage found it, None where the scenario wants no errors."""
     table = tables.read(work / "scores.parquet", "scores")[0].to_pydict()
     tpog, gamma = read_tpog(work / "tpog.parquet"), scenario.score.gamma
@@ -320,11 +341,12 @@ def _trial(scenario: Scenario, work: Path, keys: dict[str, str], weight: float, 
         return Trial(names, shares.tolist(), unknown, tpog.frames, scores.tolist(), unknown, unknown, math.nan, [], keys)
     if left_out is None:
         visibility = Visibility(scenario, work, tpog.grid)
-        left_out = [leave_out.scores(visibility.hits(b), gamma, visibility.unit).tolist() for b in visibility.beams()]
-    left = np.array(left_out)
+        left_out = np.array([leave_out.scores(visibility.hits(b), gamma, visibility.unit) for b in visibility.beams()])
+    if left_out.shape != (len(names), 1 + len(leave_out.frames)):
+        raise ValueError(f"{left_out.shape} numbers")
     limits = leave_out.limits(unit)
-    raw = Estimate.of(left, leave_out.frames)
-    normal = Estimate.of(left / np.where(limits > 0, limits, 1.0), leave_out.frames)
+    raw = Estimate.of(left_out, leave_out.frames)
+    normal = Estimate.of(left_out / np.where(limits > 0, limits, 1.0), leave_out.frames)
     return Trial(
         names, shares.tolist(), normal.se.tolist(), tpog.frames, scores.tolist(), raw.se.tolist(), raw.bias.tolist(),
         raw.quantile(), _neighbours(raw, names, tpog.frames), keys,

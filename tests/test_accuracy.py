@@ -6,16 +6,19 @@ Evidence: settings that are run again by themselves, from the ``--set`` line tha
 
 from __future__ import annotations
 
+import re
 import shlex
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 import pipeline
-from pipeline import accuracy, knobs, tables, trials, workflow
+from pipeline import accuracy, knobs, show, tables, trials, workflow
 from pipeline.accuracy import Study
 from pipeline.errors import RunError
 from pipeline.trials import Bench
@@ -334,7 +337,14 @@ KEPT = {
     "a setting's result": ("[0-9a-f]*.json", '{"trial": {"sites": 3}}', "is not as the study wrote it"),
     "a stage's cost": ("stages/tpog-*/cost.json", "", "cost.json: is not as the study wrote it"),
     "a list for a cost": ("stages/tpog-*/cost.json", "[]", "cost.json: is not as the study wrote it"),
-}
+    "a list for the note": ("study.json", "[1]", "study.json: is not as the study wrote it"),
+    "no times": (
+        "stages/tpog-*/cost.json", '{"seconds": [], "busy": [], "peak_mb": 1, "sha256": {}}', "is not as the study wrote it",
+    ),
+    "words for times": (
+        "stages/tpog-*/cost.json", '{"seconds": ["x"], "busy": [1], "peak_mb": 1, "sha256": {}}', "is not as the study wrote it",
+    ),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", KEPT)
@@ -348,6 +358,88 @@ def test_what_was_kept_and_damaged_is_named(junction: Path, tmp_path: Path, few:
     assert code == 2
     assert message in said
     assert "Traceback" not in said + printed
+
+
+def shares_are(text: str) -> Callable[[str], str]:
+    return lambda kept: re.sub(r'"shares": \[[^\]]*\]', f'"shares": {text}', kept)
+
+
+SHARED = {
+    "too few shares": ("[0-9a-f]*.json", shares_are("[0.5]"), "is not as the study wrote it"),
+    "words for shares": ("[0-9a-f]*.json", shares_are('["a", null]'), "is not as the study wrote it"),
+    "too few scores left out": ("stages/score-*/left_out.json", lambda _: "[[1], [2]]", "left_out.json: is not as the study"),
+    "ragged scores left out": ("stages/score-*/left_out.json", lambda _: "[[1], [2, 3]]", "left_out.json: is not as the study"),
+    "a number for scores left out": ("stages/score-*/left_out.json", lambda _: "5", "left_out.json: is not as the study"),
+    "a stage's artefact": ("stages/tpog-*/tpog.parquet", lambda _: "bad", "accuracy: holds a damaged artefact"),
+}
+
+
+@pytest.mark.parametrize("case", SHARED)
+def test_what_was_kept_and_has_another_shape_is_named(mini: Path, tmp_path: Path, few: None, egvs, case: str) -> None:
+    pattern, change, message = SHARED[case]
+    words = ("accuracy", mini, "--out", tmp_path / "out", "--budget", "0.001s")
+    assert egvs(*words)[0] == 0
+    kept = tmp_path / "out" / "accuracy"
+    if pattern.startswith("stages"):
+        for path in kept.glob("[0-9a-f]*.json"):
+            path.unlink()  # else what it says is taken as it is
+    for path in kept.glob(pattern):
+        path.write_text(change(path.read_text(errors="replace")))
+    code, printed, said = egvs(*words)
+    assert code == 2
+    assert message in said
+    assert ".work-" not in said.split("holds a damaged artefact")[0]
+    assert "Traceback" not in said + printed
+
+
+def test_a_study_of_another_seed_goes_on_in_the_same_folder(mini: Path, tmp_path: Path, few: None) -> None:
+    accuracy.study(mini, ["seed=9"], tmp_path, budget_s=0.5)
+    assert accuracy.study(mini, ["seed=10"], tmp_path).repeated > 0
+
+
+def test_what_is_recommended_can_be_typed(mini: Path, tmp_path: Path, few: None, egvs) -> None:
+    """With the user's own ``--set``, and quoted."""
+    folder = tmp_path / "a place with späce"
+    shutil.copytree(mini, folder)
+    sets = ("--set", "traffic.frames=20", "--set", "description=it's")
+    code, printed, said = egvs("accuracy", folder, "--out", tmp_path / "out", *sets)
+    assert code == 0, said
+    line = next(line.strip() for line in printed.splitlines() if line.strip().startswith("egvs run"))
+    words = shlex.split(line)
+    assert words[:7] == ["egvs", "run", str(folder), *sets]
+    assert egvs(*words[1:], "--out", tmp_path / "again")[0] == 0
+
+
+def test_nothing_that_is_as_long_as_the_reference_is_compared_with_it(junction: Path, tmp_path: Path) -> None:
+    bench = Bench(junction, [], tmp_path, 1, lambda *_: None)
+    found = knobs.settings(bench.scenario(accuracy.OWN))
+    longest = knobs.reference(bench.scenario(accuracy.OWN), 4)
+    kept = {s.name for s in found if accuracy._is_shorter(bench, s, longest)}
+    assert {"400 frames", "200 frames every 1 s", "scenario"} <= kept
+    assert not {"800 frames", "1600 frames", "400 frames every 1 s"} & kept
+
+
+@pytest.mark.parametrize("width", [80, 120, 190])
+def test_tables_fit_the_terminal(mini: Path, tmp_path: Path, few: None, width: int, capsys, monkeypatch) -> None:
+    study = accuracy.study(mini, [], tmp_path / "out")
+    monkeypatch.setattr(show, "WIDE", width)
+    if width < 190:
+        monkeypatch.setattr(show, "Console", lambda **k: Console(**(k | {"width": width, "soft_wrap": False})))
+        monkeypatch.setattr(show, "WIDE", 190)
+    show.accuracy(study, "egvs run mini")
+    table = capsys.readouterr().out.partition("reference: ")[0]
+    assert "…" not in table
+    assert all(len(line) <= width for line in table.splitlines())
+    assert "* " in table and "*= " in table
+    assert all(f"{row.seconds:.2f}" in table for row in study.rows if row.kind != "measures")
+
+
+def test_where_every_score_is_0_nothing_is_recommended(mini: Path, tmp_path: Path, few: None, egvs) -> None:
+    far = ("--set", "roi.center_m=[5000, 5000, 2.5]", "--set", "sensors.small.range_m=20000")
+    code, printed, said = egvs("accuracy", mini, "--out", tmp_path / "out", *far)
+    assert code == 0, said
+    assert "every score is 0" in printed
+    assert "inf frames" not in printed
 
 
 def test_what_was_kept_and_removed_is_made_again(mini: Path, tmp_path: Path, few: None) -> None:
@@ -469,6 +561,8 @@ def test_one_block_tells_nothing_of_errors(junction: Path, mini: Path, tmp_path:
 BAD = {
     ("--tolerance", "0"): "--tolerance: 0",
     ("--tolerance", "inf"): "--tolerance: inf",
+    ("--tolerance", "1e-300"): "--tolerance: 1e-300",
+    ("--budget", "1_0s"): "--budget: '1_0s'",
     ("--seeds", "3"): "--seeds: the traffic is a finished file",
     ("--budget", "soon"): "--budget: 'soon'",
     ("--budget", "-3s"): "--budget: '-3s'",

@@ -109,3 +109,19 @@ def test_what_an_effect_costs_is_with_less_without(mini: Path, tmp_path: Path, m
     found = callings.prices(scenario, tmp_path)
     assert found is not None
     assert {name: price.seconds for name, price in found.items()} == {"rain": 1.0, "divergence": 7.0}
+
+
+def test_an_effect_that_lacks_something_is_refused(mini: Path) -> None:
+    found = states(mini, "effects.range_limit={}", "effects.pedestrians_bicycles.pedestrians_per_h=100")
+    assert found["range_limit"][0] == "refused"
+    assert "no rated_range_m" in found["range_limit"][1]
+    assert found["pedestrians_bicycles"][0] == "refused"
+    assert "finished FCD file" in found["pedestrians_bicycles"][1]
+
+
+def test_effects_that_a_study_left_out_are_named(mini: Path, tmp_path: Path, egvs) -> None:
+    words = ("--out", tmp_path / "out", "--set", "effects.rain.rate_mm_h=20")
+    assert egvs("accuracy", mini, "--budget", "0.001s", *words)[0] == 0
+    code, printed, _ = egvs("effects", mini, *words)
+    assert code == 0
+    assert "what rain cost and change: egvs accuracy" in printed

@@ -5,6 +5,7 @@ The kill test ends real ``egvs run`` processes at random moments and looks at th
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import random
@@ -13,6 +14,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -261,3 +263,55 @@ def test_editor_schema_is_not_stale() -> None:
     from pipeline.scenario import json_schema
 
     assert (ROOT / "data_schemas" / "scenario.schema.json").read_text(encoding="utf-8") == json_schema(), "run: make schema"
+
+
+def test_another_seed_in_the_same_folder_changes_no_byte_of_what_is_not_random(mini: Path, tmp_path: Path, egvs) -> None:
+    out = tmp_path / "out"
+    assert egvs("run", mini, "--out", out, "--set", "seed=5")[0] == 0
+    before = {name: (out / name).read_bytes() for name in ("statics.ply", "scans.parquet")}
+    code, _, said = egvs("run", mini, "--out", out, "--set", "seed=6")
+    assert code == 0
+    assert re.search(r"scan +unchanged", said)
+    assert {name: (out / name).read_bytes() for name in before} == before
+    assert egvs("verify", out)[0] == 0
+
+
+@pytest.mark.parametrize("width", [80, 120, 190])
+def test_a_ranking_fits_the_terminal(mini: Path, tmp_path: Path, width: int) -> None:
+    """No number is cut, on the narrowest terminal too."""
+    from rich.console import Console
+
+    from pipeline import show
+
+    pipeline.run(pipeline.load(mini), tmp_path)
+    rows = pipeline.read_scores(tmp_path / "scores.parquet").to_pylist()
+    console = Console(width=width, record=True, file=io.StringIO())
+    console.print(show.ranking(rows, width))
+    text = console.export_text()
+    assert "…" not in text
+    assert all(len(line) <= width for line in text.splitlines())
+    assert all(f"{row['egvs']:.1f}" in text for row in rows)
+
+
+@pytest.mark.parametrize("words", [("run",), ("accuracy", "--budget", "20s")])
+def test_an_interrupt_is_answered_in_words(tmp_path: Path, words: tuple[str, ...]) -> None:
+    scenario = Path(__file__).resolve().parent.parent / "scenarios" / "nishishinjuku"
+    command = [
+        sys.executable,
+        "-c",
+        "from pipeline.cli import main; main()",
+        words[0],
+        str(scenario),
+        "--out",
+        str(tmp_path / "out"),
+        *words[1:],
+    ]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        while not (tmp_path / "out").exists():
+            time.sleep(0.05)
+        time.sleep(0.5)
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "egvs: interrupted; run the same command again" in said
+    assert "Traceback" not in said

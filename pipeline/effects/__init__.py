@@ -100,6 +100,11 @@ class Effect:
         del scene
         return None
 
+    def lacks(self, scene: Scene) -> InputError | None:
+        """What a run of this scene would be refused for; None when nothing is missing."""
+        del scene
+        return None
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -112,6 +117,17 @@ class Scene:
 
 class Detect(Effect):
     """The chance that a return is noticed."""
+
+    def lacks(self, scene: Scene) -> InputError | None:
+        """Something that a sensor does not say."""
+        from pipeline import sensors
+
+        try:
+            for name in dict.fromkeys(site.sensor for site in scene.sites):
+                self.detect(np.ones(1), sensors.resolve(name, scene.scenario.sensors, f"{scene.scenario.file}: sensors"))
+        except InputError as error:
+            return error
+        return None
 
     def detect(self, range_m: NDArray[np.float64], sensor: Sensor) -> NDArray[np.float64]:
         """Chance (n,), 0 to 1, for targets at ``range_m`` (n,) metres from the sensor."""

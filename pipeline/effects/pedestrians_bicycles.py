@@ -100,6 +100,17 @@ class PedestriansBicycles(Traffic):
         """Rates of 0 bring nobody."""
         return self.changes_nothing(scene.scenario)
 
+    def lacks(self, scene: Scene) -> InputError | None:
+        """A network to walk in."""
+        return self.refusal(scene.scenario)
+
+    def refusal(self, scenario: Scenario) -> InputError | None:
+        """Nobody can be added to a finished file."""
+        if scenario.traffic.fcd is None or self.changes_nothing(scenario) is not None:
+            return None
+        found = "the scenario names a finished FCD file, so nobody can be added"
+        return InputError(f"{scenario.file}: effects.{self.NAME}", found, "network or sumocfg in [traffic]")
+
     def changes_nothing(self, scenario: Scenario) -> str | None:
         """Why nobody comes; None when somebody may."""
         del scenario
