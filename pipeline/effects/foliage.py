@@ -60,7 +60,7 @@ class Model(Parameters):
         Field(description="Or the share of the summer's optical depth, 0 to 1"),
     ] = "summer"
     projection: Annotated[float, Field(gt=0, le=1, description="G, mean projection of a unit of leaf area")] = 0.5
-    step_m: Annotated[float, Field(ge=0.01, le=100, description="Longest step in which a crown is cut")] = 0.5
+    step_m: Annotated[float, Field(ge=0.01, le=100, description="Longest step in which a crown is cut")] = 2.0
 
 
 class Foliage(TransmitScan):

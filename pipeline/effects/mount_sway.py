@@ -43,7 +43,7 @@ class Model(Parameters):
     """Parameters of ``[effects.mount_sway]``."""
 
     tilt_deg: Annotated[float, Field(ge=0, le=10, description="Standard deviation of the tilt about each horizontal axis")]
-    samples: Annotated[Literal[1, 4, 9, 16], Field(description="Poses that are averaged; 1 is the pole at rest")] = 9
+    samples: Annotated[Literal[1, 4, 9, 16], Field(description="Poses that are averaged; 1 is the pole at rest")] = 4
 
 
 class MountSway(Expand):
