@@ -32,7 +32,7 @@ pictures: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.pictures
 
 schema: $(VENV)/.installed
-	$(BIN)/python -c "from pipeline.scenario import json_schema; print(json_schema(), end='')" > data_schemas/scenario.schema.json
+	$(BIN)/python -c "from pipeline.scenario.loading import json_schema; print(json_schema(), end='')" > data_schemas/scenario.schema.json
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	@$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11) and 'egvs needs Python 3.11 or newer; name one with: make PYTHON=...')"

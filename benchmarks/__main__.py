@@ -1,8 +1,8 @@
 """How fast is it, measured against what it must reach?
 
-``make bench`` runs everything here on the shipped junction and prints ratios from this one run: machines differ and are noisy,
-ratios less so. Kernels are compiled before anything is timed; repeats of what is compared are interleaved; medians are shown.
-"""
+``make bench`` runs everything here on the shipped junction and prints ratios from this one run: machines differ and are
+noisy, ratios less so. Kernels are compiled before anything is timed; repeats of what is compared are interleaved;
+medians are shown."""
 
 from __future__ import annotations
 
@@ -23,14 +23,15 @@ from rich.table import Table
 
 import pipeline
 from benchmarks import casting, others, savings, stability
-from pipeline import survey, tpog
-from pipeline.entropy import Field
+from pipeline.artefacts.readers import read_tpog
+from pipeline.core.parallel import in_order
 from pipeline.kernels import march
-from pipeline.ordered import in_order
-from pipeline.results import read_tpog
-from pipeline.sites import Site
-from pipeline.visibility import Beams, Visibility, in_voxels
-from pipeline.world import read_ply
+from pipeline.scoring.egvs import EntropyField
+from pipeline.scoring.visibility import Beams, Visibility, in_voxels
+from pipeline.sensing import scanner as survey
+from pipeline.sensing.sites import Site
+from pipeline.stages import tpog
+from pipeline.world.mesh import read_ply
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENARIO = ROOT / "scenarios" / "nishishinjuku"
@@ -58,25 +59,41 @@ def once(work: Callable[[], Any]) -> float:
 def egvs(*arguments: str) -> tuple[float, float]:
     """Wall seconds and peak memory in MB of the command line in a process of its own."""
     code = (
-        "import resource, sys; from pipeline.cli import main\n"
+        "import resource, sys; from pipeline.cli.app import main\n"
         "try: main()\n"
         "finally: print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024, file=sys.stderr)"
     )
     start = time.perf_counter()
-    done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True, cwd=ROOT)
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True, cwd=ROOT
+    )
     return time.perf_counter() - start, float(done.stderr.split()[-1])
 
 
 def whole_run(folder: Path) -> tuple[list[tuple[str, str, str, bool]], float]:
     """The main job from nothing, and the yardstick: SUMO's own seconds."""
-    egvs("run", str(SCENARIO), "--out", str(folder / "warm"), "--set", "traffic.frames=50", "--set", "traffic.warmup_s=50")
+    egvs(
+        "run",
+        str(SCENARIO),
+        "--out",
+        str(folder / "warm"),
+        "--set",
+        "traffic.frames=50",
+        "--set",
+        "traffic.warmup_s=50",
+    )
     took, peak = egvs("run", str(SCENARIO), "--out", str(folder / "run"))
     record = json.loads((folder / "run" / "run.json").read_text())
     sumo = record["stages"]["traffic"]["said"]["sumo_seconds"]
     helped = statistics.median(egvs("--help")[0] for _ in range(5))
     allowed = 2 * sumo + 3
     return [
-        ("egvs run nishishinjuku, everything", f"{took:.2f} s = {took / allowed:.2f} x (2 x SUMO + 3 s)", "1 x", took <= allowed),
+        (
+            "egvs run nishishinjuku, everything",
+            f"{took:.2f} s = {took / allowed:.2f} x (2 x SUMO + 3 s)",
+            "1 x",
+            took <= allowed,
+        ),
         ("  SUMO alone", f"{sumo:.2f} s", "", True),
         ("  peak memory of egvs", f"{peak:.0f} MB", "1024 MB", peak < 1024),
         ("egvs --help", f"{helped:.3f} s", "0.3 s", helped < 0.3),
@@ -96,7 +113,7 @@ def sites(folder: Path) -> list[tuple[str, str, str, bool]]:
     scenario, run = pipeline.load(SCENARIO), folder / "run"
     world, _ = read_ply(run / "statics.ply")
     counted = read_tpog(run / "tpog.parquet")
-    field = Field.of(counted.counts, counted.frames, counted.grid)
+    field = EntropyField.of(counted.counts, counted.frames, counted.grid)
     surveyed = survey.Survey(scenario, world)
     visibility = Visibility(scenario, run, counted.grid)
     beams = {site: Beams(scan.about, scan.scan.ends_m) for site in surveyed.sites for scan in [surveyed.scan(site)]}
@@ -116,7 +133,9 @@ def sites(folder: Path) -> list[tuple[str, str, str, bool]]:
     times: dict[str, list[float]] = {"1": [], "2": [], "bare": [], "plain": []}
     for _ in range(REPEATS):
         for threads in (1, 2):
-            times[str(threads)].append(once(lambda threads=threads: list(in_order(score_one, surveyed.sites * 4, threads))))
+            times[str(threads)].append(
+                once(lambda threads=threads: list(in_order(score_one, surveyed.sites * 4, threads)))
+            )
         times["bare"].append(once(lambda: [march_one(site) for site in surveyed.sites]))
         times["plain"].append(once(lambda: [visibility.hits(beams[site]) for site in surveyed.sites]))
     gain = statistics.median(a / b for a, b in zip(times["1"], times["2"], strict=True))
@@ -132,7 +151,12 @@ def sites(folder: Path) -> list[tuple[str, str, str, bool]]:
 def main() -> None:
     """Measure all, print one table."""
     table = Table(
-        "what", "measured", "must reach", "reached", title=f"egvs {pipeline.__version__}, {os.cpu_count()} cores", box=None
+        "what",
+        "measured",
+        "must reach",
+        "reached",
+        title=f"egvs {pipeline.__version__}, {os.cpu_count()} cores",
+        box=None,
     )
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
@@ -150,7 +174,9 @@ def main() -> None:
     ):
         console.print(f"\n{title}")
         for row in measure():
-            console.print("  " + "   ".join(f"{value:.3f}" if isinstance(value, float) else str(value) for value in row))
+            console.print(
+                "  " + "   ".join(f"{value:.3f}" if isinstance(value, float) else str(value) for value in row)
+            )
 
 
 if __name__ == "__main__":

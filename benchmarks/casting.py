@@ -1,10 +1,9 @@
 """What do hits that float64 decides cost, against Embree alone?
 
-For all sites of a shipped scenario, in interleaved runs: Embree alone on the bare triangles; Embree on the triangles with their
-rims and fins; placing the hits in float64 (``settle``); searching the doubtful beams (``search``); and the whole cast, with the
-choice of the beams that can meet the region of interest. Ratios are medians over the rounds, each against Embree alone in the
-same round.
-"""
+For all sites of a shipped scenario, in interleaved runs: Embree alone on the bare triangles; Embree on the triangles
+with their rims and fins; placing the hits in float64 (``settle``); searching the doubtful beams (``search``); and the
+whole cast, with the choice of the beams that can meet the region of interest. Ratios are medians over the rounds, each
+against Embree alone in the same round."""
 
 from __future__ import annotations
 
@@ -17,9 +16,10 @@ from typing import Any
 import numpy as np
 
 import pipeline
-from pipeline import sensors, sites, statics
 from pipeline.kernels import rays
-from pipeline.raycast import Caster
+from pipeline.sensing import sensors, sites
+from pipeline.stages import statics
+from pipeline.world.casting import Caster
 
 _SCENARIOS = Path(__file__).resolve().parent.parent / "scenarios"
 _ROUNDS = 21
@@ -44,9 +44,23 @@ def _work(name: str) -> tuple[dict[str, Callable[[], Any]], int, int]:
         start, single = np.tile((position - origin).astype(np.float32), (len(d), 1)), d.astype(np.float32)
         proposed = caster._owner[caster._scene.run(start, single)]
         ranges, doubtful = np.empty(len(d)), np.empty(len(d), dtype=np.int64)
-        count = rays.settle(proposed, caster._triangles, caster._planes, position - origin, d, sensor.range_m, ranges, doubtful)
+        count = rays.settle(
+            proposed, caster._triangles, caster._planes, position - origin, d, sensor.range_m, ranges, doubtful
+        )
         jobs.append(
-            (site.position_m, directions, sensor.range_m, position - origin, d, start, single, proposed, ranges, doubtful, count)
+            (
+                site.position_m,
+                directions,
+                sensor.range_m,
+                position - origin,
+                d,
+                start,
+                single,
+                proposed,
+                ranges,
+                doubtful,
+                count,
+            )
         )
 
     def settle() -> None:
@@ -55,7 +69,9 @@ def _work(name: str) -> tuple[dict[str, Callable[[], Any]], int, int]:
 
     def search() -> None:
         for *_, o, d, _start, _single, _proposed, ranges, doubtful, count in jobs:
-            rays.search(doubtful[:count], caster._triangles, caster._planes, caster._boxes, caster._starts, o, d, ranges)
+            rays.search(
+                doubtful[:count], caster._triangles, caster._planes, caster._boxes, caster._starts, o, d, ranges
+            )
 
     work: dict[str, Callable[[], Any]] = {
         "Embree alone": lambda: [bare.run(job[5], job[6]) for job in jobs],

@@ -1,8 +1,8 @@
 """What does moving occlusion cost and change, and how far off is the model of independent voxels?
 
-``python -m benchmarks.occlusion SCENARIO RUN`` compares, on the artefacts of a finished run, the score of each site without moving
-occlusion, with recorded frames replayed, and with voxels taken as independent. Other effects that the scenario names stay on.
-"""
+``python -m benchmarks.occlusion SCENARIO RUN`` compares, on the artefacts of a finished run, the score of each site
+without moving occlusion, with recorded frames replayed, and with voxels taken as independent. Other effects that the
+scenario names stay on."""
 
 from __future__ import annotations
 
@@ -19,20 +19,21 @@ from rich.table import Table
 from scipy.stats import kendalltau
 
 import pipeline
-from pipeline.effects.moving_occlusion import Replay
-from pipeline.entropy import Field
-from pipeline.grid import Grid
-from pipeline.results import read_tpog
-from pipeline.scenario import Scenario
-from pipeline.score import ranks
-from pipeline.visibility import Visibility
+from pipeline.artefacts.readers import read_tpog
+from pipeline.core.grid import Grid
+from pipeline.effects.score.moving_occlusion import Replay
+from pipeline.scenario.models import Scenario
+from pipeline.scoring.egvs import EntropyField
+from pipeline.scoring.visibility import Visibility
+from pipeline.stages.score import ranks
 
 Compared = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One way to score: scores (sites,), seconds a site on one thread, and for a replay the boxes ignored at each site."""
+    """One way to score: scores (sites,), seconds a site on one thread, and for a replay the boxes ignored at each
+    site."""
 
     sites: list[str]
     egvs: NDArray[np.float64]
@@ -52,10 +53,10 @@ def compare(scenario: Scenario, out: Path, *, frames: int = 500) -> Compared:
     -------
     dict
         ``rows``: a dict a site with ``site``, ``plain``, ``frames``, ``independent`` (scores, bits), ``rank_plain``,
-        ``rank_frames``, ``rank_independent``, ``error`` (of ``independent`` against ``frames``, relative; None where only
-        ``frames`` is 0), ``ignored`` (boxes that hold the sensor).
-        ``tau``: Kendall's tau of the rankings, for ``plain`` and ``independent`` against ``frames`` and against each other;
-        None where a ranking is all ties. ``seconds``: a site, for each way.
+        ``rank_frames``, ``rank_independent``, ``error`` (of ``independent`` against ``frames``, relative; None where
+        only ``frames`` is 0), ``ignored`` (boxes that hold the sensor). ``tau``: Kendall's tau of the rankings, for
+        ``plain`` and ``independent`` against ``frames`` and against each other; None where a ranking is all ties.
+        ``seconds``: a site, for each way.
     """
     ways = {
         "plain": scored(scenario, out, None),
@@ -74,11 +75,14 @@ def compare(scenario: Scenario, out: Path, *, frames: int = 500) -> Compared:
 
 
 def scored(scenario: Scenario, out: Path, parameters: dict[str, Any] | None) -> Setting:
-    """Scores of all sites with ``[effects.moving_occlusion]`` as given (None: without); kernels are compiled beforehand."""
+    """Scores of all sites with ``[effects.moving_occlusion]`` as given (None: without); kernels are compiled
+    beforehand."""
     others = {name: given for name, given in scenario.effects.items() if name != "moving_occlusion"}
-    changed = scenario.model_copy(update={"effects": others | ({} if parameters is None else {"moving_occlusion": parameters})})
+    changed = scenario.model_copy(
+        update={"effects": others | ({} if parameters is None else {"moving_occlusion": parameters})}
+    )
     tpog = read_tpog(out / "tpog.parquet")
-    field = Field.of(tpog.counts, tpog.frames, tpog.grid)
+    field = EntropyField.of(tpog.counts, tpog.frames, tpog.grid)
     visibility = Visibility(changed, out, tpog.grid)
     beams = list(visibility.beams())
     visibility.hits(beams[0])
@@ -110,7 +114,16 @@ def _tau(a: NDArray[np.float64], b: NDArray[np.float64]) -> float | None:
 
 def show(compared: Compared, console: Console) -> None:
     """Print what :func:`compare` returns."""
-    table = Table("site", "plain", "frames", "frames/plain", "independent", "error", "ranks: plain, frames, independent", "ignored")
+    table = Table(
+        "site",
+        "plain",
+        "frames",
+        "frames/plain",
+        "independent",
+        "error",
+        "ranks: plain, frames, independent",
+        "ignored",
+    )
     for row in compared["rows"]:
         plain, frames, independent = (f"{row[name]:.1f}" for name in ("plain", "frames", "independent"))
         kept = row["frames"] / row["plain"] if row["plain"] else 1.0
@@ -118,7 +131,9 @@ def show(compared: Compared, console: Console) -> None:
         order = f"{row['rank_plain']}, {row['rank_frames']}, {row['rank_independent']}"
         table.add_row(row["site"], plain, frames, f"{kept:.3f}", independent, error, order, str(row["ignored"]))
     console.print(table)
-    console.print("Kendall's tau: " + "; ".join(f"{pair} {tau:.3f}" for pair, tau in compared["tau"].items() if tau is not None))
+    console.print(
+        "Kendall's tau: " + "; ".join(f"{pair} {tau:.3f}" for pair, tau in compared["tau"].items() if tau is not None)
+    )
     console.print("seconds a site: " + "; ".join(f"{name} {took:.3f}" for name, took in compared["seconds"].items()))
 
 

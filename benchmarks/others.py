@@ -1,24 +1,22 @@
 """What do other ways to count beams and boxes cost, and how wrong are they?
 
-The same job on the shipped junction - from a site's beams to the beams in each voxel, and on to the score - by what papers and
-packages do instead:
+The same job on the shipped junction - from a site's beams to the beams in each voxel, and on to the score - by what
+papers and packages do instead:
 
-- the march: samples at a fixed step (NumPy); integer Bresenham between voxel indices (numba), as published occupancy metrics do;
-  Amanatides and Woo with t accumulated (numba);
+- the march: samples at a fixed step (NumPy); integer Bresenham between voxel indices (numba), as published occupancy
+  metrics do; Amanatides and Woo with t accumulated (numba);
 - occupancy: a voxel is occupied when its centre lies in a box (numba); when a box touches it (ours, not shrunk);
 - the cast: trimesh without Embree, on every nth beam; Embree's own float32 range (``tfar``) on the bare triangles.
 
-Ours is the reference: that it is right is shown by ``make numerics``. Wrong are beams (frames, for occupancy) that a voxel misses
-or has too many; where one voxel gains what it loses, both cancel, so these are lower bounds. Repeats are interleaved; processor
-seconds are medians, as multiples of ours; of the sites' errors the worst is shown.
-"""
+Ours is the reference: that it is right is shown by ``make numerics``. Wrong are beams (frames, for occupancy) that a
+voxel misses or has too many; where one voxel gains what it loses, both cancel, so these are lower bounds. Repeats are
+interleaved; processor seconds are medians, as multiples of ours; of the sites' errors the worst is shown."""
 
 from __future__ import annotations
 
-import statistics
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,18 +25,18 @@ import numba
 import numpy as np
 
 import pipeline
-from benchmarks.stability import textbook, touching
-from pipeline import statics, survey, tpog, traffic
-from pipeline.entropy import Field
-from pipeline.grid import Grid
+from benchmarks.stability import medians, textbook, touching
+from pipeline.core.grid import Grid
 from pipeline.kernels import boxes, march
-from pipeline.survey import Survey
-from pipeline.world import World
+from pipeline.scoring.egvs import EntropyField
+from pipeline.sensing import scanner as survey
+from pipeline.sensing.scanner import Survey
+from pipeline.stages import statics, tpog, traffic
+from pipeline.world.mesh import World
 
 SCENARIO = Path(__file__).resolve().parent.parent / "scenarios" / "nishishinjuku"
 SITES = ("c08", "c10")
 FRAMES = 400
-REPEATS = 7
 CAST_BEAMS = 400
 """trimesh casts about so many beams a site; its seconds are scaled up."""
 
@@ -125,7 +123,8 @@ MARCHES: dict[str, March] = {
     "Bresenham between indices": bresenham,
     "march that accumulates t": accumulated,
 }
-"""Each adds the beams (n, 3) of a sensor to the counters of the voxels: ``(o, d, shape, voxel_m, hits)``, in voxel units."""
+"""Each adds the beams (n, 3) of a sensor to the counters of the voxels: ``(o, d, shape, voxel_m, hits)``, in voxel
+units."""
 
 
 @_kernel
@@ -219,7 +218,9 @@ class Scene:
         frame, values = np.concatenate([b.frame for b in read]), np.concatenate([b.values for b in read])
         near = tpog._in_reach(values, grid)
         batch = tpog.Boxes(frame[near], values[near])
-        return cls(grid, scenario.score.gamma, world, survey.Survey(scenario, world), batch, tpog.static_voxels(world, grid))
+        return cls(
+            grid, scenario.score.gamma, world, survey.Survey(scenario, world), batch, tpog.static_voxels(world, grid)
+        )
 
     @property
     def sites(self) -> list[Any]:
@@ -241,28 +242,20 @@ class Scene:
         way(self.start(site), np.ascontiguousarray(ends_m / self.grid.voxel_m), self.shape, self.grid.voxel_m, found)
         return found
 
-    def field(self, counts: Any) -> Field:
+    def field(self, counts: Any) -> EntropyField:
         """The entropy of counted frames."""
-        return Field.of(np.where(self.static, 0, counts).astype(np.int64), FRAMES, self.grid)
-
-
-def medians(works: Sequence[Callable[[], object]]) -> list[float]:
-    """Processor seconds of each, measured in turns after one call that is not counted."""
-    times: list[list[float]] = [[] for _ in works]
-    for turn in range(REPEATS + 1):
-        for work, taken in zip(works, times, strict=True):
-            begin = time.process_time()
-            work()
-            if turn:
-                taken.append(time.process_time() - begin)
-    return [statistics.median(taken) for taken in times]
+        return EntropyField.of(np.where(self.static, 0, counts).astype(np.int64), FRAMES, self.grid)
 
 
 def wrong(found: Any, true: Any) -> tuple[float, float, float]:
     """Shares of voxels with a wrong count, of what is missed and of what is invented."""
     off = found.astype(np.int64) - true.astype(np.int64)
     total = max(int(true.sum()), 1)
-    return int((off != 0).sum()) / max(int((true > 0).sum()), 1), -int(off[off < 0].sum()) / total, int(off[off > 0].sum()) / total
+    return (
+        int((off != 0).sum()) / max(int((true > 0).sum()), 1),
+        -int(off[off < 0].sum()) / total,
+        int(off[off > 0].sum()) / total,
+    )
 
 
 def _ours(what: str, seconds: float) -> Row:
@@ -297,7 +290,10 @@ def march_rows(scene: Scene) -> list[Row]:
     for (name, way), took in list(zip(MARCHES.items(), seconds, strict=True))[1:]:
         theirs = [scene.hits(site, ends, way) for site, ends in scans]
         errors = [wrong(a, b) for a, b in zip(theirs, true, strict=True)]
-        scores = [(field.score(a, scene.gamma).egvs, field.score(b, scene.gamma).egvs) for a, b in zip(theirs, true, strict=True)]
+        scores = [
+            (field.score(a, scene.gamma).egvs, field.score(b, scene.gamma).egvs)
+            for a, b in zip(theirs, true, strict=True)
+        ]
         found.append(_row(f"march: {name}", took / seconds[0], errors, scores))
     return found
 

@@ -1,8 +1,8 @@
 """Where do the pictures in README and docs come from?
 
-``make pictures`` runs the shipped scenarios and draws: the map of the README, taken from the report, and for each effect what the
-score (or, where an effect changes traffic, the occupancy) looks like from above before and after, on one colour scale.
-"""
+``make pictures`` runs the shipped scenarios and draws: the map of the README, taken from the report, and for each
+effect what the score (or, where an effect changes traffic, the occupancy) looks like from above before and after, on
+one colour scale."""
 
 from __future__ import annotations
 
@@ -16,12 +16,14 @@ from typing import Any
 import numpy as np
 
 import pipeline
-from pipeline import effects, figures, workflow
-from pipeline.entropy import Field
-from pipeline.results import read_scores, read_tpog, read_trajectories
-from pipeline.scenario import Scenario
-from pipeline.visibility import hits_of
-from pipeline.world import read_ply
+from pipeline.artefacts.readers import read_scores, read_tpog, read_trajectories
+from pipeline.effects import registry as effects
+from pipeline.report import plan as figures
+from pipeline.runs import workflow
+from pipeline.scenario.models import Scenario
+from pipeline.scoring.egvs import EntropyField
+from pipeline.scoring.visibility import hits_of
+from pipeline.world.mesh import read_ply
 
 ROOT = Path(__file__).resolve().parent.parent
 IMAGES = ROOT / "docs" / "images"
@@ -48,11 +50,12 @@ def figure(page: str, label: str) -> str:
 
 
 def seen(scenario: Scenario, out: Path, site: str) -> tuple[np.ndarray, np.ndarray]:
-    """Score of each column, bits (nx, ny), or its mean occupied voxels where no site is named; the voxels that beams cross."""
+    """Score of each column, bits (nx, ny), or its mean occupied voxels where no site is named; the voxels that beams
+    cross."""
     tpog = read_tpog(out / "tpog.parquet")
     if not site:
         return tpog.p.sum(axis=2), np.ones(tpog.grid.shape, dtype=np.bool_)
-    field = Field.of(tpog.counts, tpog.frames, tpog.grid)
+    field = EntropyField.of(tpog.counts, tpog.frames, tpog.grid)
     _, hits = next(hits_of(scenario, out, tpog.grid, [site]))
     worth = field.per_cell_bit * np.minimum(hits.ravel()[field.cells], scenario.score.gamma)
     nx, ny, nz = tpog.grid.shape
@@ -66,7 +69,10 @@ def before_and_after(name: str, folder: Path) -> Iterator[tuple[str, str]]:
     own = dict(base.effects.get(name, {})) | parameters
     found = []
     for word, named in (("before", {}), ("after", {name: own})):
-        scenario, out = base.with_effects(named), folder / where / (word if named else "plain") / (name if named else "")
+        scenario, out = (
+            base.with_effects(named),
+            folder / where / (word if named else "plain") / (name if named else ""),
+        )
         workflow.run(scenario, out)
         found.append((word, *seen(scenario, out, site)))
     tpog = read_tpog(out / "tpog.parquet")
@@ -80,11 +86,15 @@ def before_and_after(name: str, folder: Path) -> Iterator[tuple[str, str]]:
         stand = figures.Stand(spot, crossed, layers, box)
         what = f"score of site {site} by column" if site else "mean occupied voxels by column"
         alt = f"{name}, {word}: {what}, from above, 0 to {peak:.3g}"
-        yield f"{name}-{word}.svg", figures.standalone(figures.view(tpog.grid, field, peak, stand, f"{name}-{word}", alt))
+        yield (
+            f"{name}-{word}.svg",
+            figures.standalone(figures.view(tpog.grid, field, peak, stand, f"{name}-{word}", alt)),
+        )
 
 
 def side_view(out: Path, pitched: bool) -> str:
-    """Boxes of one frame on the hill's main road, seen from the south, heights five times enlarged; flat when not pitched."""
+    """Boxes of one frame on the hill's main road, seen from the south, heights five times enlarged; flat when not
+    pitched."""
     rows = read_trajectories(out / "trajectories.parquet").to_pylist()
     busiest = max((sum(r["frame"] == f for r in rows if abs(r["y_m"]) < 9), -f) for f in range(0, 2000, 100))
     shapes = []
@@ -92,7 +102,9 @@ def side_view(out: Path, pitched: bool) -> str:
         tilt = row["pitch_rad"] * math.copysign(1.0, math.cos(row["yaw_rad"])) if pitched else 0.0
         z = row["z_m"] if pitched else row["height_m"] / 2
         corners = [(a * row["length_m"] / 2, b * row["height_m"] / 2) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-        turned = [(a * math.cos(tilt) - b * math.sin(tilt), a * math.sin(tilt) + b * math.cos(tilt)) for a, b in corners]
+        turned = [
+            (a * math.cos(tilt) - b * math.sin(tilt), a * math.sin(tilt) + b * math.cos(tilt)) for a, b in corners
+        ]
         points = " ".join(f"{2 * (row['x_m'] + a) + 310:.1f},{170 - 10 * (z + b):.1f}" for a, b in turned)
         shapes.append(f'<polygon points="{points}" fill="#3b528b" fill-opacity="0.75"/>')
     words = "after: boxes on the grade" if pitched else "before: everything on z = 0"

@@ -1,8 +1,7 @@
 """What does leaving out what no beam can meet save?
 
-The static world of the shipped junction, and a city of nine of them, held whole and held only as far as a beam can meet it; and no
-static geometry at all. All ways are timed in turn, and the bytes of their scans are compared.
-"""
+The static world of the shipped junction, and a city of nine of them, held whole and held only as far as a beam can meet
+it; and no static geometry at all. All ways are timed in turn, and the bytes of their scans are compared."""
 
 from __future__ import annotations
 
@@ -15,9 +14,10 @@ from typing import Any
 import numpy as np
 
 import pipeline
-from pipeline import statics, survey, tpog
-from pipeline.raycast import Caster
-from pipeline.world import World
+from pipeline.sensing import scanner as survey
+from pipeline.stages import statics, tpog
+from pipeline.world.casting import Caster
+from pipeline.world.mesh import World
 
 SCENARIO = Path(__file__).resolve().parent.parent / "scenarios" / "nishishinjuku"
 REPEATS = 7
@@ -62,7 +62,9 @@ def _beams() -> list[tuple[str, str, str, bool]]:
         ranges = np.minimum(caster.first_hits(start, directions, range_m)[0], range_m)
         same &= (directions * ranges[:, None])[scan.beam].tobytes() == scan.ends_m.tobytes()
     took = in_turn(
-        lambda: [caster.first_hits(start, directions[scan.beam], range_m) for start, scan in zip(starts, scans, strict=True)],
+        lambda: [
+            caster.first_hits(start, directions[scan.beam], range_m) for start, scan in zip(starts, scans, strict=True)
+        ],
         lambda: [caster.first_hits(start, directions, range_m) for start in starts],
     )
     part = sum(len(scan.beam) for scan in scans) / (len(directions) * len(scans))
@@ -82,7 +84,14 @@ def _flat() -> list[tuple[str, str, str, bool]]:
     tipped = tpog.Boxes(flat.frame, flat.values + np.array([0, 0, 0, 0, 1e-15, 0, 0, 0]))
     same = np.array_equal(tpog.count(flat, grid, n // 20), tpog.count(tipped, grid, n // 20))
     took = in_turn(lambda: tpog.count(flat, grid, n // 20), lambda: tpog.count(tipped, grid, n // 20))
-    return [("flat boxes: flat path / separating axes", f"{took[0] / took[1]:.3f}", "1, same counts", same and took[0] <= took[1])]
+    return [
+        (
+            "flat boxes: flat path / separating axes",
+            f"{took[0] / took[1]:.3f}",
+            "1, same counts",
+            same and took[0] <= took[1],
+        )
+    ]
 
 
 def _pair(name: str, grown: Callable[[World], World]) -> list[tuple[str, str, str, bool]]:
@@ -100,15 +109,27 @@ def _pair(name: str, grown: Callable[[World], World]) -> list[tuple[str, str, st
         return [scan.ends_m.tobytes() + scan.returned.tobytes() for scan in scans]
 
     same = cast(held) == cast(whole)
-    build = in_turn(lambda: Caster(world, roi, sites, range_m), lambda: Caster(world, roi), lambda: Caster(nothing, roi))
+    build = in_turn(
+        lambda: Caster(world, roi, sites, range_m), lambda: Caster(world, roi), lambda: Caster(nothing, roi)
+    )
     casting = in_turn(lambda: cast(held), lambda: cast(whole), lambda: cast(empty))
     part = len(held._triangles) / len(whole._triangles)
     return [
         (f"{name}: triangles that a beam can meet", f"{part:.0%} of {len(whole._triangles)}", "same bytes", same),
         ("  building, with / without leaving out", f"{build[0] / build[1]:.2f}", "1.1", build[0] <= 1.1 * build[1]),
-        ("  casting 13 sites, with / without leaving out", f"{casting[0] / casting[1]:.2f}", "1.1", casting[0] <= 1.1 * casting[1]),
+        (
+            "  casting 13 sites, with / without leaving out",
+            f"{casting[0] / casting[1]:.2f}",
+            "1.1",
+            casting[0] <= 1.1 * casting[1],
+        ),
         ("  no geometry, building / with geometry", f"{build[2] / build[1]:.3f}", "0.1", build[2] <= 0.1 * build[1]),
-        ("  no geometry, casting / with geometry", f"{casting[2] / casting[1]:.2f}", "0.6", casting[2] <= 0.6 * casting[1]),
+        (
+            "  no geometry, casting / with geometry",
+            f"{casting[2] / casting[1]:.2f}",
+            "0.6",
+            casting[2] <= 0.6 * casting[1],
+        ),
     ]
 
 

@@ -1,14 +1,15 @@
 """How do time and memory grow with the size of the job?
 
-``python -m benchmarks.scaling`` (``make scaling``) takes a synthetic junction - boxes for buildings, cars that drive straight, no
-SUMO - and makes one thing larger at a time: sites, frames, vehicles, the region of interest, beams, triangles. Each size is a whole
-``egvs run`` from a finished FCD file with ``scan.keep = false``, in a process of its own, after a small run that compiles the
-kernels; small sizes are run three times and the median is taken. Seconds are the processor's, of all threads: they do not depend
-on what else the machine does. Memory is a stage's peak above what the process held before.
+``python -m benchmarks.scaling`` (``make scaling``) takes a synthetic junction - boxes for buildings, cars that drive
+straight, no SUMO - and makes one thing larger at a time: sites, frames, vehicles, the region of interest, beams,
+triangles. Each size is a whole ``egvs run`` from a finished FCD file with ``scan.keep = false``, in a process of its
+own, after a small run that compiles the kernels; small sizes are run three times and the median is taken. Seconds are
+the processor's, of all threads: they do not depend on what else the machine does. Memory is a stage's peak above what
+the process held before.
 
-A slope is fitted on log-log axes by least squares over the larger half of the sizes (three at least), where what every run costs no
-longer hides it; 1 is linear. Written are ``docs/images/scaling.png`` and the tables of ``docs/scaling.md``.
-"""
+A slope is fitted on log-log axes by least squares over the larger half of the sizes (three at least), where what every
+run costs no longer hides it; 1 is linear. Written are ``docs/images/scaling.png`` and the tables of
+``docs/scaling.md``."""
 
 from __future__ import annotations
 
@@ -30,8 +31,8 @@ import pyarrow as pa
 from pyarrow import csv
 
 import pipeline
-from pipeline import workflow
-from pipeline.cost import let_go
+from pipeline.core.cost import let_go
+from pipeline.runs import workflow
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE, FIGURE = ROOT / "docs" / "scaling.md", ROOT / "docs" / "images" / "scaling.png"
@@ -76,7 +77,9 @@ AXES = (
     Axis("vehicles", "vehicles a frame", (10, 30, 100, 250, 500), ("traffic", "tpog", "score"), Size(hectares=2)),
     Axis("hectares", "region of interest, ha at 0.25 m", (0.5, 1, 2, 5, 10), ("tpog", "score", "report")),
     Axis("beams", "beams a sensor", (1_000, 10_000, 100_000, 300_000, 1_000_000), ("score", "report")),
-    Axis("triangles", "triangles", (1_000, 10_000, 100_000, 300_000, 1_000_000), ("statics", "tpog", "score", "report")),
+    Axis(
+        "triangles", "triangles", (1_000, 10_000, 100_000, 300_000, 1_000_000), ("statics", "tpog", "score", "report")
+    ),
 )
 
 Points = dict[str, dict[float, tuple[float, float]]]
@@ -97,7 +100,8 @@ def prepare(size: Size, folder: Path) -> Path:
         "scan": {"keep": False},
     }
     lines = [
-        f"[{table}]\n" + "".join(f"{key} = {json.dumps(value)}\n" for key, value in keys.items()) for table, keys in values.items()
+        f"[{table}]\n" + "".join(f"{key} = {json.dumps(value)}\n" for key, value in keys.items())
+        for table, keys in values.items()
     ]
     lines.append(
         f"[sensors.own]\nelevations_deg = [-25, 5]\nchannels = {channels}\n"
@@ -105,7 +109,9 @@ def prepare(size: Size, folder: Path) -> Path:
     )
     lines.append(f'[[traffic.kinds]]\nname = "car"\nlength_m = {_CAR_M}\nwidth_m = 1.75\nheight_m = 1.5\n')
     (folder / "scenario.toml").write_text("\n".join(lines), encoding="utf-8")
-    rows = [f"s{i},{long * (i % spots + 0.5) / spots!r},{wide * (i // spots + 0.5) / spots!r},4" for i in range(size.sites)]
+    rows = [
+        f"s{i},{long * (i % spots + 0.5) / spots!r},{wide * (i // spots + 0.5) / spots!r},4" for i in range(size.sites)
+    ]
     (folder / "sites.csv").write_text("\n".join(["site,x_m,y_m,z_m", *rows]) + "\n", encoding="utf-8")
     (folder / "city.geojson").write_text(_city(max(1, size.triangles // 12), long, wide), encoding="utf-8")
     _traffic(size, long, wide, folder / "fcd.csv")
@@ -132,13 +138,16 @@ def _city(buildings: int, long: float, wide: float) -> str:
         for x, y in spots[: buildings - len(features)]:
             corners = [[x - 3, y - 3], [x + 3, y - 3], [x + 3, y + 3], [x - 3, y + 3], [x - 3, y - 3]]
             about = {"name": f"b{len(features)}", "kind": "building", "height_m": 8 + len(features) % 13}
-            features.append({"type": "Feature", "geometry": {"type": "Polygon", "coordinates": [corners]}, "properties": about})
+            features.append(
+                {"type": "Feature", "geometry": {"type": "Polygon", "coordinates": [corners]}, "properties": about}
+            )
         ring += 1
     return json.dumps({"type": "FeatureCollection", "features": features})
 
 
 def _traffic(size: Size, long: float, wide: float, path: Path) -> None:
-    """Cars on lanes along x, a lane's at equal distances and one speed, that come in again at the other end: SUMO's FCD as CSV."""
+    """Cars on lanes along x, a lane's at equal distances and one speed, that come in again at the other end: SUMO's FCD
+    as CSV."""
     rng = np.random.default_rng(1)
     lanes, round_m = max(1, int(wide / _LANE_M)), long + 10.0
     lane, place = np.arange(size.vehicles) % lanes, np.arange(size.vehicles) // lanes
@@ -254,7 +263,9 @@ def table(found: dict[str, Points]) -> str:
             ends = [f"{points[n][0]:.3g} s, {points[n][1]:.0f} MB" for n in (low, high)]
             slopes = [slope(list(points), [cost[i] for cost in points.values()]) for i in (0, 1)]
             told = [f"**{s:.2f}**" if s > LINEAR else f"{s:.2f}" for s in slopes]
-            lines.append(f"| {axis.label}: {low:g} to {high:,g} | {stage} | {ends[0]} | {ends[1]} | {told[0]} | {told[1]} |")
+            lines.append(
+                f"| {axis.label}: {low:g} to {high:,g} | {stage} | {ends[0]} | {ends[1]} | {told[0]} | {told[1]} |"
+            )
     return "\n".join(lines)
 
 
@@ -284,7 +295,9 @@ def draw(found: dict[str, Points], path: Path) -> None:
                 points = found[axis.name][stage]
                 costs = [cost[row] for cost in points.values()]
                 told = f"{stage} {slope(list(points), costs):.2f}"
-                panel.loglog(list(points), costs, color=colour, marker=marker, linestyle=dashes, markersize=5, label=told)
+                panel.loglog(
+                    list(points), costs, color=colour, marker=marker, linestyle=dashes, markersize=5, label=told
+                )
             panel.grid(True, which="major", color="0.88")
             panel.legend(fontsize=8, title="slope", title_fontsize=8, loc="upper left", framealpha=0.85)
         panels[1, column].set_xlabel(axis.label)

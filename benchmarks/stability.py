@@ -1,11 +1,12 @@
 """What do stable decisions cost?
 
-Time of our kernels over the time of the textbook's, and how many voxels the textbook gets wrong, on the shipped junction:
+Time of our kernels over the time of the textbook's, and how many voxels the textbook gets wrong, on the shipped
+junction:
 
-- march against Amanatides and Woo (1987): t accumulated, every visited voxel counted. Wrong are voxels whose hits exact arithmetic
-  has otherwise, summed over the sites;
-- occupancy by boxes shrunk by 0.1 mm against boxes that may touch, on the shipped traffic. Wrong are voxels whose count changes
-  when every box moves by 1e-9 m.
+- march against Amanatides and Woo (1987): t accumulated, every visited voxel counted. Wrong are voxels whose hits exact
+  arithmetic has otherwise, summed over the sites;
+- occupancy by boxes shrunk by 0.1 mm against boxes that may touch, on the shipped traffic. Wrong are voxels whose count
+  changes when every box moves by 1e-9 m.
 
 Repeats are interleaved; medians are compared. Machines differ, ratios less so.
 """
@@ -16,7 +17,7 @@ import re
 import statistics
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -26,8 +27,8 @@ import numpy as np
 
 import pipeline
 from benchmarks.numerics.march import beams_of, check
-from pipeline import tpog, traffic
 from pipeline.kernels import boxes, march
+from pipeline.stages import tpog, traffic
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENE = "nishishinjuku"
@@ -49,7 +50,8 @@ def _start(o, d, n, t):
 
 @_kernel
 def textbook(o, d, shape, hits):
-    """Amanatides and Woo (1987), "A Fast Voxel Traversal Algorithm for Ray Tracing": add each beam to the voxels it visits."""
+    """Amanatides and Woo (1987), "A Fast Voxel Traversal Algorithm for Ray Tracing": add each beam to the voxels it
+    visits."""
     nx, ny, nz = shape[0], shape[1], shape[2]
     for beam in range(d.shape[0]):
         t, t_last = 0.0, 1.0
@@ -100,15 +102,15 @@ def touching() -> Any:
     return SimpleNamespace(**namespace)
 
 
-def medians(works: list[Callable[[], object]]) -> list[float]:
-    """Seconds of each, measured in turns after one call that is not counted."""
+def medians(works: Sequence[Callable[[], object]]) -> list[float]:
+    """Processor seconds of each, measured in turns after one call that is not counted."""
     times: list[list[float]] = [[] for _ in works]
     for turn in range(REPEATS + 1):
         for work, taken in zip(works, times, strict=True):
-            begin = time.perf_counter()
+            begin = time.process_time()
             work()
             if turn:
-                taken.append(time.perf_counter() - begin)
+                taken.append(time.process_time() - begin)
     return [statistics.median(taken) for taken in times]
 
 

@@ -1,10 +1,9 @@
 """Does the length of SUMO's step bias the scores?
 
-``python -m benchmarks.steps [SEEDS]`` runs the shipped junction with as many seeds (16) for each step, 5000 frames 1 s apart, and
-compares the means of each site's share of the limit with those at 0.25 s. Independent runs: t is the difference over its standard
-error. Seconds are of the traffic stage, as shares of those at 0.25 s. About ten minutes on two
-cores.
-"""
+``python -m benchmarks.steps [SEEDS]`` runs the shipped junction with as many seeds (16) for each step, 5000 frames 1 s
+apart, and compares the means of each site's share of the limit with those at 0.25 s. Independent runs: t is the
+difference over its standard error. Seconds are of the traffic stage, as shares of those at 0.25 s. About ten minutes on
+two cores."""
 
 from __future__ import annotations
 
@@ -17,9 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.knobs import Setting
-from pipeline.stage import silent, threads
-from pipeline.trials import Bench
+from pipeline.core.parallel import threads
+from pipeline.core.progress import silent
+from pipeline.studies.settings import Setting
+from pipeline.studies.trials import Bench
 
 SCENARIO = Path(__file__).resolve().parent.parent / "scenarios" / "nishishinjuku"
 WATCHED = ("traffic.frames=5000", "traffic.frame_period_s=1.0")
@@ -57,7 +57,9 @@ def main() -> None:
         part, t = change(shares[step], shares[AGAINST_S])
         worst = int(np.abs(part).argmax())
         ratio = seconds[step] / seconds[AGAINST_S]
-        print(f"{step} | {ratio:.2f} | {100 * part[worst]:+.1f} | {sites[worst]} | {t[worst]:+.1f} | {100 * part.mean():+.1f}")
+        print(
+            f"{step} | {ratio:.2f} | {100 * part[worst]:+.1f} | {sites[worst]} | {t[worst]:+.1f} | {100 * part.mean():+.1f}"
+        )
 
 
 def _scatter(shares: Any) -> Any:

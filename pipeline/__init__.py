@@ -1,10 +1,10 @@
 """egvs: which pole, what height, how many roadside LiDARs?
 
-How data flows, stage by stage (each a module, a verb of the command line, and an artefact)::
+How data flows, stage by stage (each a module of :mod:`pipeline.stages`, a verb of the command line, and an artefact)::
 
-    scenario.toml -+-> traffic --> trajectories.parquet --> tpog --> tpog.parquet ---+
-                   |                                         ^                       +--> score --> scores.parquet --> report
-                   +-> statics --> statics.ply --------------+--> scan --> scans.parquet --+
+    scenario.toml -+-> traffic -> trajectories.parquet -> tpog -> tpog.parquet -+
+                   |                                       ^                    +-> score -> scores.parquet -> report
+                   +-> statics -> statics.ply -------------+-> scan -> scans.parquet
 
 From a notebook::
 
@@ -12,7 +12,7 @@ From a notebook::
 
     scenario = pipeline.load("scenarios/nishishinjuku", ["traffic.frames=500"])
     record = pipeline.run(scenario, "runs/trial")
-    p = pipeline.read_tpog("runs/trial/tpog.parquet").p
+    p = pipeline.read_tpog("runs/trial/tpog.parquet").p  # share of frames in which each voxel is occupied
 
 Names are imported when they are first used, so that ``import pipeline`` costs nothing.
 """
@@ -22,29 +22,29 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from pipeline.errors import EgvsError, InputError, RunError
-    from pipeline.results import read_scans, read_scores, read_tpog, read_trajectories, read_visibility
-    from pipeline.scenario import Scenario, load
-    from pipeline.workflow import run, verify
+from pipeline.core.version import __version__
 
-__version__ = "0.1.0"
+if TYPE_CHECKING:
+    from pipeline.artefacts.readers import read_scans, read_scores, read_tpog, read_trajectories, read_visibility
+    from pipeline.core.errors import EgvsError, InputError, RunError
+    from pipeline.runs.workflow import run, verify
+    from pipeline.scenario.loading import load
+    from pipeline.scenario.models import Scenario
 
 _HOME = {
-    "EgvsError": "errors",
-    "InputError": "errors",
-    "RunError": "errors",
-    "Scenario": "scenario",
-    "load": "scenario",
-    "read_scans": "results",
-    "read_scores": "results",
-    "read_tpog": "results",
-    "read_trajectories": "results",
-    "read_visibility": "results",
-    "run": "workflow",
-    "verify": "workflow",
+    "EgvsError": "core.errors",
+    "InputError": "core.errors",
+    "RunError": "core.errors",
+    "Scenario": "scenario.models",
+    "load": "scenario.loading",
+    "read_scans": "artefacts.readers",
+    "read_scores": "artefacts.readers",
+    "read_tpog": "artefacts.readers",
+    "read_trajectories": "artefacts.readers",
+    "read_visibility": "artefacts.readers",
+    "run": "runs.workflow",
+    "verify": "runs.workflow",
 }
-_STAGES = ("traffic", "statics", "tpog", "scan", "score", "report")
 
 __all__ = [
     "EgvsError",
@@ -66,6 +66,8 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name in _HOME:
         return getattr(importlib.import_module(f"pipeline.{_HOME[name]}"), name)
-    if name in _STAGES:
-        return importlib.import_module(f"pipeline.{name}")
     raise AttributeError(f"module 'pipeline' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -94,7 +94,7 @@ def mini(tmp_path: Path) -> Path:
 @pytest.fixture
 def egvs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     """Call the command line in this process: ``code, out, err = egvs("run", folder)``."""
-    from pipeline import cli
+    from pipeline.cli import app as cli
 
     def call(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["egvs", *(str(a) for a in arguments)])

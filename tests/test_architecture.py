@@ -1,8 +1,7 @@
 """Do imports point one way, and does the package stay what it promises to be?
 
-errors, grid, schemas, scenario -> kernels -> tables, statics, sensors -> stages -> workflow -> command line: no edge runs back,
-none runs from stage to stage, and heavy libraries are imported only where they are needed.
-"""
+errors, grid, schemas, scenario -> kernels -> tables, statics, sensors -> stages -> workflow -> command line: no edge
+runs back, none runs from stage to stage, and heavy libraries are imported only where they are needed."""
 
 from __future__ import annotations
 
@@ -52,7 +51,8 @@ LAYER_OF = {name: level for level, names in enumerate(LAYERS) for name in names}
 
 
 def modules() -> dict[str, Path]:
-    """Name -> file of every module; everything under kernels/ counts as "kernels", everything under effects/ as "effects"."""
+    """Name -> file of every module; everything under kernels/ counts as "kernels", everything under effects/ as
+    "effects"."""
     return {str(p.relative_to(PACKAGE).with_suffix("")): p for p in sorted(PACKAGE.rglob("*.py"))}
 
 
@@ -108,7 +108,7 @@ def run_python(code: str) -> str:
     return subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True).stdout
 
 
-@pytest.mark.parametrize("module", ["pipeline", "pipeline.cli"])
+@pytest.mark.parametrize("module", ["pipeline", "pipeline.cli.app"])
 def test_nothing_heavy_is_imported_for_help(module: str) -> None:
     heavy = "numpy numba pyarrow pydantic shapely trimesh matplotlib embreex scipy rich.table traci sumolib"
     code = f"import sys, {module}; print([m for m in {heavy.split()} if m in sys.modules])"

@@ -1,8 +1,7 @@
 """Are there any mismatches?
 
-``python -m benchmarks.numerics`` hunts at full length (``--scale 1e-3`` is a smoke test), prints one table, and ends with 1 when a
-decision came out other than exact arithmetic has it.
-"""
+``python -m benchmarks.numerics`` hunts at full length (``--scale 1e-3`` is a smoke test), prints one table, and ends
+with 1 when a decision came out other than exact arithmetic has it."""
 
 from __future__ import annotations
 
@@ -54,7 +53,9 @@ def main(arguments: list[str] | None = None) -> int:
     if chosen.markdown is not None:
         chosen.markdown.write_text(markdown(rows), encoding="utf-8")
     for name, part in found.items():
-        console.print(f"{name}: {sum(row.mismatches for row in part)} mismatches in {sum(row.cases for row in part):,} cases")
+        console.print(
+            f"{name}: {sum(row.mismatches for row in part)} mismatches in {sum(row.cases for row in part):,} cases"
+        )
     wrong = sum(row.mismatches for row in rows)
     console.print(f"all: {wrong} mismatches, {time.perf_counter() - start:.0f} s")
     return 1 if wrong else 0

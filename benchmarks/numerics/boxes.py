@@ -1,10 +1,9 @@
 """Does the occupancy count other voxels than exact arithmetic does, on a million boxes?
 
-Each box is counted by itself and its voxels are compared with the depth of overlap, computed in float64 from the fifteen axes of
-the separating-axis theorem (the flat path of the kernel cuts polygons instead and shares nothing with it; the pitched one decides
-by the same theorem, but not by depth). Where a depth lies within 1e-8 m of the 0.1 mm bound, the pair goes to 50-digit arithmetic.
-So every answer is certain, and only the doubtful ones are slow.
-"""
+Each box is counted by itself and its voxels are compared with the depth of overlap, computed in float64 from the
+fifteen axes of the separating-axis theorem (the flat path of the kernel cuts polygons instead and shares nothing with
+it; the pitched one decides by the same theorem, but not by depth). Where a depth lies within 1e-8 m of the 0.1 mm
+bound, the pair goes to 50-digit arithmetic. So every answer is certain, and only the doubtful ones are slow."""
 
 from __future__ import annotations
 
@@ -17,8 +16,8 @@ import numpy as np
 
 import pipeline
 from benchmarks.numerics.row import Row
-from pipeline import tpog, traffic
 from pipeline.kernels import boxes
+from pipeline.stages import tpog, traffic
 from tests.oracles import boxes as oracle
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -74,9 +73,9 @@ def depth_in(box, low, voxel_m):
 def compare(values, shape, voxel_m, doubtful, nearest):
     """Count each box by itself and compare.
 
-    Returns how many voxels differ, how many pairs there were, and how many entries of ``doubtful`` (box, ix, iy, iz, what the
-    kernel says) are filled: pairs within UNSURE_M of the bound. ``nearest`` gets each box's least distance of a depth to the bound.
-    """
+    Returns how many voxels differ, how many pairs there were, and how many entries of ``doubtful`` (box, ix, iy, iz,
+    what the kernel says) are filled: pairs within UNSURE_M of the bound. ``nearest`` gets each box's least distance of
+    a depth to the bound."""
     nx, ny, nz = shape[0], shape[1], shape[2]
     steps, seen = np.zeros((nz + 1, nx, ny), np.int32), np.full((3, nx, ny), -1, np.int64)
     axes, normals, low = np.empty((3, 3)), np.empty((15, 3)), np.empty(3)
@@ -108,7 +107,13 @@ def compare(values, shape, voxel_m, doubtful, nearest):
                     nearest[b] = min(nearest[b], abs(deep - 1e-4))
                     if abs(deep - 1e-4) <= UNSURE_M:
                         if n < doubtful.shape[0]:
-                            doubtful[n, 0], doubtful[n, 1], doubtful[n, 2], doubtful[n, 3], doubtful[n, 4] = b, ix, iy, iz, said
+                            doubtful[n, 0], doubtful[n, 1], doubtful[n, 2], doubtful[n, 3], doubtful[n, 4] = (
+                                b,
+                                ix,
+                                iy,
+                                iz,
+                                said,
+                            )
                         n += 1
                     else:
                         wrong += said != (1 if deep > 1e-4 else 0)
@@ -134,7 +139,8 @@ def check(values, shape, voxel_m):
 
 
 def hostile(rng, n, shape, voxel_m):
-    """Boxes (n, 8): sides on voxel faces or 0.1 mm, 1e-9 m, an ulp beside; yaw at or beside multiples of 45 degrees; thin, huge."""
+    """Boxes (n, 8): sides on voxel faces or 0.1 mm, 1e-9 m, an ulp beside; yaw at or beside multiples of 45 degrees;
+    thin, huge."""
     span = np.asarray(shape, float)
     place = np.rint(rng.uniform(-1, 1, (n, 3)) + rng.uniform(0, 1, (n, 3)) * 2 * span) * voxel_m / 2
     beside = rng.choice([0.0, 1e-4, -1e-4, 0.9e-4, 1.1e-4, 1e-9, -1e-9, 1e-4 + 3e-9, 1e-4 - 3e-9, 1e-4 + 1e-7], (n, 3))
@@ -170,7 +176,13 @@ def hunt(case, make, seed, n, shape, voxel_m):
     while done < n:
         size = min(n - done, 5_000)
         found = check(np.ascontiguousarray(make(rng, size, shape, voxel_m)), shape, voxel_m)
-        pairs, asked, excluded, wrong, done = pairs + found[0], asked + found[1], excluded + found[2], wrong + found[3], done + size
+        pairs, asked, excluded, wrong, done = (
+            pairs + found[0],
+            asked + found[1],
+            excluded + found[2],
+            wrong + found[3],
+            done + size,
+        )
     return Row(
         case,
         RULE,
@@ -183,7 +195,8 @@ def hunt(case, make, seed, n, shape, voxel_m):
 
 
 def real(scale):
-    """Rows of the shipped traffic: every box against its depths, and the counts after a move of 1e-9 m along each axis."""
+    """Rows of the shipped traffic: every box against its depths, and the counts after a move of 1e-9 m along each
+    axis."""
     frames = max(100, round(5000 * min(scale, 1.0) / 100) * 100)
     scenario = pipeline.load(ROOT / "scenarios" / "nishishinjuku", [f"traffic.frames={frames}"])
     with tempfile.TemporaryDirectory() as temporary:

@@ -1,8 +1,7 @@
 """Does a beam ever leak, or end on another surface than the one that it truly meets first?
 
-Scenes with known answers, hostile ones against a float64 brute force over all triangles, and every beam of every site of the
-shipped scenarios.
-"""
+Scenes with known answers, hostile ones against a float64 brute force over all triangles, and every beam of every site
+of the shipped scenarios."""
 
 from __future__ import annotations
 
@@ -16,11 +15,12 @@ from numpy.typing import NDArray
 
 import pipeline
 from benchmarks.numerics.row import Row
-from pipeline import sensors, sites, statics
-from pipeline.grid import Roi
-from pipeline.raycast import Caster
-from pipeline.scenario import Scenario
-from pipeline.world import World
+from pipeline.core.grid import Roi
+from pipeline.scenario.models import Scenario
+from pipeline.sensing import sensors, sites
+from pipeline.stages import statics
+from pipeline.world.casting import Caster
+from pipeline.world.mesh import World
 from tests.oracles import cast
 
 Floats = NDArray[np.float64]
@@ -108,7 +108,9 @@ def _pole(rng: np.random.Generator, scale: float) -> Row:
     met = np.abs(y) < 0.05
     error = np.abs(found - np.sqrt(150.0**2 + y**2 + 0.01))[np.isfinite(found) & met & ~near]
     wrong = int(((np.isfinite(found) != met) & ~near).sum()) + int((error > 1e-3).sum())
-    return Row("a pole of 0.1 m at 150 m", _RANGE_RULE, "geometry", len(y), int(near.sum()), wrong, f"{error.max():.1e} m")
+    return Row(
+        "a pole of 0.1 m at 150 m", _RANGE_RULE, "geometry", len(y), int(near.sum()), wrong, f"{error.max():.1e} m"
+    )
 
 
 def _box(rng: np.random.Generator, scale: float) -> Row:
@@ -164,7 +166,9 @@ def _surfaces(rng: np.random.Generator, scale: float) -> Iterator[Row]:
             n = _many(scale, 100_000)
             chosen, side, s = rng.integers(0, len(surface), n), rng.integers(0, 3, n), rng.random((n, 1))
             s[: n // 4] = 0.0
-            parts.append(_to(_caster(surface), o, surface[chosen, side] * (1 - s) + surface[chosen, (side + 1) % 3] * s))
+            parts.append(
+                _to(_caster(surface), o, surface[chosen, side] * (1 - s) + surface[chosen, (side + 1) % 3] * s)
+            )
         found, true = (np.concatenate(part) for part in zip(*parts, strict=True))
         yield _known(f"sides and corners of 3,200 coplanar triangles, seen at {graze_deg:g} degrees", found, true)
 
@@ -172,7 +176,9 @@ def _surfaces(rng: np.random.Generator, scale: float) -> Iterator[Row]:
 def _slivers(rng: np.random.Generator, scale: float) -> Row:
     parts, count, tip, o = [], 600, np.array([100.0, 50.0, 5.0]), np.array([30.0, 50.123, 1.0])
     for width in (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7):
-        rim = np.column_stack([np.zeros(count + 1), 50 + (np.arange(count + 1) - count / 2) * width, np.full(count + 1, 5.0)])
+        rim = np.column_stack(
+            [np.zeros(count + 1), 50 + (np.arange(count + 1) - count / 2) * width, np.full(count + 1, 5.0)]
+        )
         fan = np.stack([rim[:-1], rim[1:], np.broadcast_to(tip, (count, 3))], axis=1)
         n = _many(scale, 20_000)
         s = rng.random((n, 1)) * 0.99
@@ -221,7 +227,9 @@ def _scenes(rng: np.random.Generator, scale: float, lattice: bool) -> Row:
         both = np.isfinite(found) & np.isfinite(true)
         worst = max(worst, float(np.abs(found[both] - true[both]).max(initial=0.0)))
     name = "random scenes on a coarse lattice" if lattice else "random scenes, needles down to 1 micrometre"
-    return Row(f"{name}, aimed at corners, sides, faces", _FIRST_RULE, "float64 brute force", cases, 0, wrong, f"{worst:.1e} m")
+    return Row(
+        f"{name}, aimed at corners, sides, faces", _FIRST_RULE, "float64 brute force", cases, 0, wrong, f"{worst:.1e} m"
+    )
 
 
 def _scene(name: str) -> tuple[Scenario, Caster, Floats]:
@@ -231,7 +239,8 @@ def _scene(name: str) -> tuple[Scenario, Caster, Floats]:
 
 
 def _compare(case: str, jobs: Iterator[tuple[Caster, Floats, Floats, Floats]]) -> Row:
-    """Rays against all triangles. Excluded, and counted: where float32 takes another surface, less than 1 mm behind the first."""
+    """Rays against all triangles. Excluded, and counted: where float32 takes another surface, less than 1 mm behind the
+    first."""
     cases, wrong, close, gap, worst = 0, 0, 0, 0.0, 0.0
     for caster, triangles, o, d in jobs:
         found, (true, _) = caster.first_hits(o, d)[0], cast.first_hits(o, d, triangles)
@@ -241,7 +250,10 @@ def _compare(case: str, jobs: Iterator[tuple[Caster, Floats, Floats, Floats]]) -
         near = np.flatnonzero(other & both)
         close, wrong = close + int((apart[near] < 1e-3).sum()), wrong + int((apart[other] >= 1e-3).sum())
         cases += len(d)
-        gap, worst = max(gap, float(apart[near].max(initial=0.0))), max(worst, float(apart[both & ~other].max(initial=0.0)))
+        gap, worst = (
+            max(gap, float(apart[near].max(initial=0.0))),
+            max(worst, float(apart[both & ~other].max(initial=0.0))),
+        )
     figure = f"{worst:.1e} m; another surface: {close + wrong}, up to {gap:.1e} m"
     return Row(case, _FIRST_RULE, "float64 brute force", cases, close, wrong, figure)
 

@@ -8,9 +8,9 @@ import mpmath
 import numpy as np
 
 from benchmarks.numerics.row import Row
-from pipeline.entropy import Field, binary_entropy
-from pipeline.grid import Grid
-from pipeline.sensors import CATALOGUE
+from pipeline.core.grid import Grid
+from pipeline.scoring.egvs import EntropyField, binary_entropy
+from pipeline.sensing.sensors import CATALOGUE
 
 _LARGEST = 2**32 - 1
 
@@ -25,7 +25,9 @@ def _true(count: int, frames: int) -> mpmath.mpf:
     """H in 50 digits, from its definition."""
     with mpmath.workdps(70):
         p = mpmath.mpf(count) / frames
-        return -p * mpmath.log(p, 2) - (1 - p) * mpmath.log1p(-p) / mpmath.log(2) if 0 < count < frames else mpmath.mpf(0)
+        return (
+            -p * mpmath.log(p, 2) - (1 - p) * mpmath.log1p(-p) / mpmath.log(2) if 0 < count < frames else mpmath.mpf(0)
+        )
 
 
 def _held(case: str, pairs: list[tuple[int, int]]) -> Row:
@@ -34,7 +36,9 @@ def _held(case: str, pairs: list[tuple[int, int]]) -> Row:
         found, true = binary_entropy(count, frames), _true(count, frames)
         wrong += found != float(mpmath.nstr(true, 45)) or found != binary_entropy(frames - count, frames)
         worst = max(worst, float(abs(found - true) / true) if true else abs(found))
-    return Row(case, "H correctly rounded, symmetric", "mpmath, 50 digits", len(pairs), 0, wrong, f"{worst:.2e} relative")
+    return Row(
+        case, "H correctly rounded, symmetric", "mpmath, 50 digits", len(pairs), 0, wrong, f"{worst:.2e} relative"
+    )
 
 
 def _ends(scale: float) -> Row:
@@ -64,8 +68,10 @@ def _case(rng: np.random.Generator) -> tuple[list[int], int, list[int], float]:
     return counts.tolist(), frames, hits.tolist(), gamma
 
 
-def _field(counts: list[int], frames: int) -> Field:
-    return Field.of(np.array(counts, dtype=np.int64).reshape(-1, 1, 1), frames, Grid((0.0, 0.0, 0.0), 1.0, (len(counts), 1, 1)))
+def _field(counts: list[int], frames: int) -> EntropyField:
+    return EntropyField.of(
+        np.array(counts, dtype=np.int64).reshape(-1, 1, 1), frames, Grid((0.0, 0.0, 0.0), 1.0, (len(counts), 1, 1))
+    )
 
 
 def _sums(rng: np.random.Generator, scale: float) -> Row:
@@ -101,7 +107,15 @@ def _order(rng: np.random.Generator, scale: float) -> Row:
         first = _field(counts, frames).score(np.array(hits, dtype=np.uint32), gamma)
         again = _field([counts[i] for i in turn], frames).score(np.array(hits, dtype=np.uint32)[turn], gamma)
         wrong += first != again
-    return Row("EGVS with the voxels in another order", "the same bits", "itself", cases, 0, wrong, "0" if not wrong else "differs")
+    return Row(
+        "EGVS with the voxels in another order",
+        "the same bits",
+        "itself",
+        cases,
+        0,
+        wrong,
+        "0" if not wrong else "differs",
+    )
 
 
 def _directions(scale: float) -> Row:
@@ -116,7 +130,17 @@ def _directions(scale: float) -> Row:
             with mpmath.workdps(30):
                 az = mpmath.radians(mpmath.mpf(round(azimuth * 10**6)) / 10**6)
                 el = mpmath.radians(mpmath.mpf(repr(sensor.elevations_deg[r])))
-                true = [float(v) for v in (mpmath.cos(el) * mpmath.cos(az), mpmath.cos(el) * mpmath.sin(az), mpmath.sin(el))]
+                true = [
+                    float(v) for v in (mpmath.cos(el) * mpmath.cos(az), mpmath.cos(el) * mpmath.sin(az), mpmath.sin(el))
+                ]
             error = float(np.abs(directions[k] - true).max())
             cases, wrong, worst = cases + 1, wrong + (error > 1e-15), max(worst, error)
-    return Row("beams of the catalogue's sensors", "direction within 1e-15", "mpmath, 30 digits", cases, 0, wrong, f"{worst:.1e}")
+    return Row(
+        "beams of the catalogue's sensors",
+        "direction within 1e-15",
+        "mpmath, 30 digits",
+        cases,
+        0,
+        wrong,
+        f"{worst:.1e}",
+    )

@@ -1,10 +1,9 @@
 """Does the march cross other voxels than exact arithmetic does, on millions of segments?
 
-Most segments are settled by sorted cuts in float64, a scheme that shares nothing with the march but the formula of a crossing:
-all crossings of all planes, sorted; between two of them the middle decides which voxel it is. Wherever a piece is within 2e-8 m of
-the 1 micrometre bound, or its middle closer to a plane than rounding could move it, the segment goes to the rational oracle
-instead. So every answer is certain, and only the doubtful ones are slow.
-"""
+Most segments are settled by sorted cuts in float64, a scheme that shares nothing with the march but the formula of a
+crossing: all crossings of all planes, sorted; between two of them the middle decides which voxel it is. Wherever a
+piece is within 2e-8 m of the 1 micrometre bound, or its middle closer to a plane than rounding could move it, the
+segment goes to the rational oracle instead. So every answer is certain, and only the doubtful ones are slow."""
 
 from __future__ import annotations
 
@@ -17,9 +16,10 @@ import numpy as np
 
 import pipeline
 from benchmarks.numerics.row import Row
-from pipeline import statics, survey
 from pipeline.kernels import march
-from pipeline.world import read_ply
+from pipeline.sensing import scanner as survey
+from pipeline.stages import statics
+from pipeline.world.mesh import read_ply
 from tests.oracles import march as oracle
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -120,7 +120,8 @@ def walk(o, d, shape, voxel_m):
 
 
 def check(o, d, shape, voxel_m):
-    """(excluded, mismatches, asked): segments with a chord within 1e-8 m of the bound; wrong ones; settled by rationals."""
+    """(excluded, mismatches, asked): segments with a chord within 1e-8 m of the bound; wrong ones; settled by
+    rationals."""
     verdict = np.empty(len(o), np.int64)
     compare(o, d, np.asarray(shape, np.int64), voxel_m, verdict)
     excluded = mismatches = 0
@@ -133,7 +134,8 @@ def check(o, d, shape, voxel_m):
 
 
 def hostile(rng, n, shape, voxel_m):
-    """Starts and extents (n, 3) made of what hurts: lattice points, last bits, 1e-12 to 1e-4 beside, zeros, subnormals, far."""
+    """Starts and extents (n, 3) made of what hurts: lattice points, last bits, 1e-12 to 1e-4 beside, zeros, subnormals,
+    far."""
     span = np.asarray(shape, float)
 
     def points(size):
@@ -218,7 +220,8 @@ def fragile(o, d, shape, voxel_m, moved_m):
     pieces = np.sort(times[:n])
     first, last = np.empty((3, 2), np.int64), np.empty(3, np.int64)
     for i in range(n - 1):
-        # Every voxel that the segment touches when made a little larger, seen from the two ends and the middle of a piece.
+        # Every voxel that the segment touches when made a little larger, seen from the two ends and the middle of a
+        # piece.
         for a in range(3):
             x, y = o[a] + pieces[i] * d[a], o[a] + pieces[i + 1] * d[a]
             first[a, 0] = np.int64(max(np.floor(min(x, y) - 2 * grow), 0.0))
@@ -297,7 +300,11 @@ def shipped(name, scale):
         found = count_fragile(o, d, shape, grid.voxel_m, 1e-9)
         in_plane, others = in_plane + found[0], others + found[1]
         found = march.audit(o, d, shape, grid.voxel_m, np.zeros(int(shape.prod()), np.uint32))
-        worst_sum, longest_gap, broken = max(worst_sum, found[0]), max(longest_gap, found[1]), broken + found[2] + found[3]
+        worst_sum, longest_gap, broken = (
+            max(worst_sum, found[0]),
+            max(longest_gap, found[1]),
+            broken + found[2] + found[3],
+        )
     return [
         Row(f"beams of {name}", RULE, f"sorted cuts with a margin; {asked} by fractions", total, excluded, mismatches, "-"),
         Row(f"beams of {name}, chords add up", "to 1e-12 of the segment, no voxel twice", "march.audit", total, 0,
@@ -321,7 +328,9 @@ def far_chords(scale):
         count, _, _ = march.walk(o, d, shape, voxel_m, np.zeros(1, np.uint32), cells, t_cells)
         for c in range(count):
             voxel = tuple(int(i) for i in np.unravel_index(cells[c], tuple(shape)))
-            worst = max(worst, abs(Fraction(t_cells[c, 1]) - Fraction(t_cells[c, 0]) - exact[voxel]) * Fraction(2 * FAR_M))
+            worst = max(
+                worst, abs(Fraction(t_cells[c, 1]) - Fraction(t_cells[c, 0]) - exact[voxel]) * Fraction(2 * FAR_M)
+            )
     return Row(
         "chords of beams from 1e7 m away",
         "to 4 u R = 4.5e-9 m",

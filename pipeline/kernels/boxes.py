@@ -5,18 +5,19 @@ A box occupies a voxel when the box, made ``SHRINK_M`` (0.1 mm) smaller on each 
 positive volume. So a car whose side lies on a voxel face, as lane centres make them, does not touch what is behind it,
 and the last bit of a sine decides nothing.
 
-- A flat box (pitch 0) is a rectangle times an interval of layers. The rectangle is convex, so what it covers of a column
-  of cells :math:`x \in [i, i+1)` is one interval of :math:`y`, found by cutting its four sides to the column.
+- A flat box (pitch 0) is a rectangle times an interval of layers. The rectangle is convex, so what it covers of a
+  column of cells :math:`x \in [i, i+1)` is one interval of :math:`y`, found by cutting its four sides to the column.
 - A pitched box is tested voxel by voxel with separating axes (Gottschalk, Lin, Manocha 1996, "OBBTree"): three axes of
   the grid, three of the box, nine cross products. A column of voxels meets a convex box in one interval of layers.
 
-How deep a box overlaps a voxel is the largest length by which its six faces can be moved inwards with volume still shared. Both
-ways decide as for a box whose corners are moved by rounding alone: right wherever the depth differs from ``SHRINK_M`` by more than
-2^-48 of the largest coordinate or size, which is 4e-13 m for 100 m and under 1e-9 m up to 100 km.
+How deep a box overlaps a voxel is the largest length by which its six faces can be moved inwards with volume still
+shared. Both ways decide as for a box whose corners are moved by rounding alone: right wherever the depth differs from
+``SHRINK_M`` by more than 2^-48 of the largest coordinate or size, which is 4e-13 m for 100 m and under 1e-9 m up to 100
+km.
 
-Two boxes in a voxel in a frame count once. Counting works on intervals of layers: a column notes the last frame in which it
-was occupied and the layers that were; the counts are differences along z, summed up by :func:`sum_layers` at the end.
-"""
+Two boxes in a voxel in a frame count once. Counting works on intervals of layers: a column notes the last frame in
+which it was occupied and the layers that were; the counts are differences along z, summed up by :func:`sum_layers` at
+the end."""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ SHRINK_M = 1e-4
 """An overlap up to this depth is no contact."""
 
 TINY = 1e-100
-"""A cross product shorter than this is 0 but for products that vanish; any longer one, however rough, is a sound axis."""
+"""A cross product shorter than this is 0 but for products that vanish; any longer one, however rough, is a sound
+axis."""
 
 _kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -90,7 +92,9 @@ def overlaps(c, axes, half, low, voxel_m):  # type: ignore[no-untyped-def]
     for i in range(3):
         if _axis_parts(axes[i, 0], axes[i, 1], axes[i, 2], c, axes, half, low, voxel_m):
             return False
-        if _axis_parts(1.0 if i == 0 else 0.0, 1.0 if i == 1 else 0.0, 1.0 if i == 2 else 0.0, c, axes, half, low, voxel_m):
+        if _axis_parts(
+            1.0 if i == 0 else 0.0, 1.0 if i == 1 else 0.0, 1.0 if i == 2 else 0.0, c, axes, half, low, voxel_m
+        ):
             return False
         x, y, z = axes[i, 0], axes[i, 1], axes[i, 2]
         if _axis_parts(0.0, z, -y, c, axes, half, low, voxel_m):
@@ -123,7 +127,8 @@ def _is_fresh(row, j_low, j_high, frame):  # type: ignore[no-untyped-def]
 
 @_kernel
 def _occupy_row(ix, j_low, j_high, k_low, k_high, frame, steps, seen):  # type: ignore[no-untyped-def]
-    """Count layers k_low .. k_high - 1 of a row of fresh columns. Separate loops over one array each: they vectorise."""
+    """Count layers k_low .. k_high - 1 of a row of fresh columns. Separate loops over one array each: they
+    vectorise."""
     for array, value in ((seen[0], frame), (seen[1], k_low), (seen[2], k_high)):
         row = array[ix]
         for iy in range(j_low, j_high):
@@ -137,7 +142,8 @@ def _occupy_row(ix, j_low, j_high, k_low, k_high, frame, steps, seen):  # type: 
 
 @_kernel
 def _occupy_again(ix, iy, k_low, k_high, steps, seen, spare, n_spare):  # type: ignore[no-untyped-def]
-    """Count the layers of a column that other boxes of this frame left free. Returns the number of spare intervals in use."""
+    """Count the layers of a column that other boxes of this frame left free. Returns the number of spare intervals in
+    use."""
     low, high = seen[1, ix, iy], seen[2, ix, iy]
     if k_low >= low and k_high <= high:
         return n_spare
@@ -192,7 +198,8 @@ def count_boxes(frames, boxes, shape, voxel_m, steps, seen):  # type: ignore[no-
     steps
         Added to: differences of the counts along z, (nz + 1, nx, ny) int32: neighbours along y lie together.
     seen
-        Scratch that lives as long as ``steps``: last frame of each column and its layers, (3, nx, ny) int64, -1 at first.
+        Scratch that lives as long as ``steps``: last frame of each column and its layers, (3, nx, ny) int64, -1 at
+        first.
     """
     nx, ny, nz = shape[0], shape[1], shape[2]
     px, py = np.empty(4), np.empty(4)

@@ -20,9 +20,11 @@ def crossings(o, d, shape, voxel_m, first, cells, enter_m, leave_m):  # type: ig
     Parameters
     ----------
     o, d, shape, voxel_m
-        Sensor (3,), beam ends seen from it (n, 3), both in voxel units; the grid, as in :func:`pipeline.kernels.march.count_hits`.
+        Sensor (3,), beam ends seen from it (n, 3), both in voxel units; the grid, as in
+        :func:`pipeline.kernels.march.count_hits`.
     first
-        (n + 1,) int64. Counting: ``first[i + 1]`` is set to the crossings of piece i. Listing: where each piece's begin.
+        (n + 1,) int64. Counting: ``first[i + 1]`` is set to the crossings of piece i. Listing: where each piece's
+        begin.
     cells, enter_m, leave_m
         Filled: flat index, range of entry and of exit of each crossing.
     """

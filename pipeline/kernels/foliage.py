@@ -1,16 +1,17 @@
 r"""Where does the leaves' share of a beam end?
 
 Frame: any one with the world's axes, in metres, float64. A crown is a closed surface of triangles with one leaf density
-throughout; along a beam the share that gets as far as a depth s of leaves is :math:`e^{-k s}`, where overlapping crowns add up.
+throughout; along a beam the share that gets as far as a depth s of leaves is :math:`e^{-k s}`, where overlapping crowns
+add up.
 
 Steps for a beam: leave out crowns whose bounding ball it misses; meet the triangles of the others by the rules of
-:mod:`pipeline.kernels.rays`, as the caster does, so that a crown begins where it began when it was opaque; what lies between two
-neighbouring meetings is inside when its middle is (winding number, or on the surface), so nothing has to pair, and an edge that is
-met twice adds a stretch without length; cut what is inside into steps; end each step's loss at its mean depth.
+:mod:`pipeline.kernels.rays`, as the caster does, so that a crown begins where it began when it was opaque; what lies
+between two neighbouring meetings is inside when its middle is (winding number, or on the surface), so nothing has to
+pair, and an edge that is met twice adds a stretch without length; cut what is inside into steps; end each step's loss
+at its mean depth.
 
-Shares are whole multiples of 2**-32, as hits are, so the parts of a beam add up to exactly that beam; depths of ends are rounded to
-1 nanometre. So last-bit differences of exp between machines do not travel on.
-"""
+Shares are whole multiples of 2**-32, as hits are, so the parts of a beam add up to exactly that beam; depths of ends
+are rounded to 1 nanometre. So last-bit differences of exp between machines do not travel on."""
 
 from __future__ import annotations
 
@@ -86,7 +87,9 @@ def _stretches(triangles, planes, ball, o, d, far, ts, low, high, count):  # typ
             count += 1
         if i + 1 < met:
             middle = 0.5 * (t + ts[i + 1])
-            joined = ts[i + 1] - t <= EDGE_M or _holds(ox + middle * dx, oy + middle * dy, oz + middle * dz, triangles, planes)
+            joined = ts[i + 1] - t <= EDGE_M or _holds(
+                ox + middle * dx, oy + middle * dy, oz + middle * dz, triangles, planes
+            )
             if joined:
                 high[count - 1] = min(max(high[count - 1], ts[i + 1]), far)
     return count
@@ -165,21 +168,22 @@ def cut(o, d, far, weight, size, starts, balls, triangles, planes, extinction, s
     Parameters
     ----------
     o, d, far
-        The sensor (3,), unit directions (n, 3), and the range at which each beam ends (n,), float64; in the frame of the region
-        of interest, which is the box [0, ``size``]. Leaves outside it are one step: where in them a beam ends changes no voxel.
+        The sensor (3,), unit directions (n, 3), and the range at which each beam ends (n,), float64; in the frame of
+        the region of interest, which is the box [0, ``size``]. Leaves outside it are one step: where in them a beam
+        ends changes no voxel.
     weight
         Of each beam, (n,) float64.
     starts, balls, triangles, planes
-        Triangles starts[c] to starts[c + 1] are those of crown c, (crowns + 1,) int64; centre and squared radius of a ball
-        round each crown, (crowns, 4); triangles (m, 3, 3) and planes (m, 4, 4), float64.
+        Triangles starts[c] to starts[c + 1] are those of crown c, (crowns + 1,) int64; centre and squared radius of a
+        ball round each crown, (crowns, 4); triangles (m, 3, 3) and planes (m, 4, 4), float64.
     extinction, step_m
         Nepers a metre within one crown, above 0; the longest step.
 
     Returns
     -------
     rows, shares, ends
-        For each part the beam that it is of, ascending, int64; its share of that beam, float64; the range at which it ends, and
-        infinity for the part that goes on to where the beam ends.
+        For each part the beam that it is of, ascending, int64; its share of that beam, float64; the range at which it
+        ends, and infinity for the part that goes on to where the beam ends.
     """
     room, total = triangles.shape[0] + 1, 0
     ts, low, high, marks = np.empty(room), np.empty(room), np.empty(room), np.empty(2 * room + 2)
@@ -203,7 +207,9 @@ def cut(o, d, far, weight, size, starts, balls, triangles, planes, extinction, s
             more = marked + int((high[:count] - low[:count]).sum() / step_m)
         rows, shares, ends = _with_room(rows, shares, ends, total, more)
         least, free_shares, free_ends = LEAST / weight[n], shares[total:], ends[total:]
-        found = _parts(marks[:marked], low, high, count, inner, outer, least, extinction, step_m, free_shares, free_ends)
+        found = _parts(
+            marks[:marked], low, high, count, inner, outer, least, extinction, step_m, free_shares, free_ends
+        )
         rows[total : total + found] = n
         total += found
     return rows[:total], shares[:total], ends[:total]

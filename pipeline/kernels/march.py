@@ -1,29 +1,31 @@
 r"""Which voxels does a segment cross?
 
-Frame: the grid's own, in voxel units, so that voxel :math:`(i, j, k)` is :math:`[i, i+1) \times [j, j+1) \times [k, k+1)`.
-A segment is :math:`p(t) = o + t\,d,\ 0 \le t \le 1`. It crosses a voxel when the chord that they share is longer than
-``CHORD_M`` (1 micrometre).
+Frame: the grid's own, in voxel units, so that voxel :math:`(i, j, k)` is :math:`[i, i+1) \times [j, j+1) \times [k,
+k+1)`. A segment is :math:`p(t) = o + t\,d,\ 0 \le t \le 1`. It crosses a voxel when the chord that they share is longer
+than ``CHORD_M`` (1 micrometre).
 
-Steps, after Amanatides and Woo (1987), "A Fast Voxel Traversal Algorithm for Ray Tracing", with three departures that make
-the outcome independent of rounding:
+Steps, after Amanatides and Woo (1987), "A Fast Voxel Traversal Algorithm for Ray Tracing", with three departures that
+make the outcome independent of rounding:
 
-1. The crossing of plane :math:`k` is computed by itself, :math:`t_k = (k - o) / d`, with a true division, for all planes of an
-   axis in one go (which vectorises), then the three lists are merged. Accumulating :math:`t \mathrel{+}= \Delta t` would add
-   up an error with each step.
-2. Crossings that are equal are stepped one after the other without moving on, so a segment through an edge or a corner goes
+1. The crossing of plane :math:`k` is computed by itself, :math:`t_k = (k - o) / d`, with a true division, for all
+   planes of an
+   axis in one go (which vectorises), then the three lists are merged. Accumulating :math:`t \mathrel{+}= \Delta t`
+   would add up an error with each step.
+2. Crossings that are equal are stepped one after the other without moving on, so a segment through an edge or a corner
+   goes
    on diagonally: what it passes in between has a chord of length 0.
-3. A voxel counts by the length of its chord, so the order of crossings that differ by rounding alone does not matter: what
+3. A voxel counts by the length of its chord, so the order of crossings that differ by rounding alone does not matter:
+   what
    lies between them is far shorter than ``CHORD_M``.
 
-A component that is exactly 0 (or -0) never crosses a plane: the segment belongs to the voxel whose half-open side holds it.
-The number of steps is bounded by the number of planes between both ends.
+A component that is exactly 0 (or -0) never crosses a plane: the segment belongs to the voxel whose half-open side holds
+it. The number of steps is bounded by the number of planes between both ends.
 
-How far that carries: :math:`k - o` and the division are each off by at most :math:`u = 2^{-53}` of their value, so each end of
-a chord by :math:`2 u R` and its length by :math:`4 u R` and less than a hundredth more, with R the distance from the segment's
-start to that end. For R up to 1e7 m that is 4.5e-9 m: right wherever the chord differs from ``CHORD_M`` by more than 1e-8 m. The
-segment may end anywhere, up to the largest float64. Any other finite input is walked in as many steps, with :math:`4 u R` in
-place of 1e-8 m.
-"""
+How far that carries: :math:`k - o` and the division are each off by at most :math:`u = 2^{-53}` of their value, so each
+end of a chord by :math:`2 u R` and its length by :math:`4 u R` and less than a hundredth more, with R the distance from
+the segment's start to that end. For R up to 1e7 m that is 4.5e-9 m: right wherever the chord differs from ``CHORD_M``
+by more than 1e-8 m. The segment may end anywhere, up to the largest float64. Any other finite input is walked in as
+many steps, with :math:`4 u R` in place of 1e-8 m."""
 
 from __future__ import annotations
 
@@ -97,7 +99,8 @@ def _shortest(dx, dy, dz, voxel_m):  # type: ignore[no-untyped-def]
 
 @_kernel
 def _note(hits, cells, t_cells, count, cell, t, t_next, shortest):  # type: ignore[no-untyped-def]
-    """Count a voxel if crossed, or list it where a list is wanted (settled when compiled: ``cells`` is None or an array).
+    """Count a voxel if crossed, or list it where a list is wanted (settled when compiled: ``cells`` is None or an
+    array).
 
     Returns how many are listed now.
     """
@@ -140,7 +143,11 @@ def _walk(o, d, shape, voxel_m, hits, cells, t_cells, times):  # type: ignore[no
     # Unsigned indices: signed ones would be checked for "count from the end" at each step; a step back wraps round.
     stride_y, stride_x = shape[2], shape[1] * shape[2]
     cell = np.uint64(np.int64(cx) * stride_x + np.int64(cy) * stride_y + np.int64(cz))
-    step_x, step_y, step_z = np.uint64(np.int64(sx) * stride_x), np.uint64(np.int64(sy) * stride_y), np.uint64(np.int64(sz))
+    step_x, step_y, step_z = (
+        np.uint64(np.int64(sx) * stride_x),
+        np.uint64(np.int64(sy) * stride_y),
+        np.uint64(np.int64(sz)),
+    )
     shortest = _shortest(dx, dy, dz, voxel_m)
     one = np.uint64(1)
     ix, iy, iz = np.uint64(0), np.uint64(0), np.uint64(0)
@@ -260,10 +267,10 @@ def audit(o, d, shape, voxel_m, last_beam):  # type: ignore[no-untyped-def]
     Returns
     -------
     worst_sum, longest_gap_m, misplaced, doubled
-        Largest difference between the clipped segment and the sum of the chords of its voxels, computed from each voxel by
-        itself, and of the gaps between them, as a share of the segment; longest piece that belongs to no voxel (chords up
-        to 1 micrometre, at most three in a row); chords whose middle lies outside their voxel by more than 1e-9 of the grid;
-        voxels visited twice by a beam.
+        Largest difference between the clipped segment and the sum of the chords of its voxels, computed from each voxel
+        by itself, and of the gaps between them, as a share of the segment; longest piece that belongs to no voxel
+        (chords up to 1 micrometre, at most three in a row); chords whose middle lies outside their voxel by more than
+        1e-9 of the grid; voxels visited twice by a beam.
     """
     longest = shape[0] + shape[1] + shape[2] + 3
     cells, t_cells, times = np.empty(longest, np.int64), np.empty((longest, 2), np.float64), _scratch(shape)
@@ -285,7 +292,13 @@ def audit(o, d, shape, voxel_m, last_beam):  # type: ignore[no-untyped-def]
             middle, cell = 0.5 * (start + end), cells[i]
             low, high, away = t_first, t_last, 0.0
             for a in range(3):
-                k = float(cell // (shape[1] * shape[2]) if a == 0 else cell // shape[2] % shape[1] if a == 1 else cell % shape[2])
+                k = float(
+                    cell // (shape[1] * shape[2])
+                    if a == 0
+                    else cell // shape[2] % shape[1]
+                    if a == 1
+                    else cell % shape[2]
+                )
                 low, high = _clip(o[a], d[beam, a], k, k + 1.0, low, high)
                 away = max(away, abs(o[a] + middle * d[beam, a] - k - 0.5))
             total += max(high - low, 0.0)

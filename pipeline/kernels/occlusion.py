@@ -1,20 +1,20 @@
 r"""How often do moving boxes stop the beams of one sensor before each voxel?
 
-Frame: the grid's own, in metres (the world's axes, zero at the grid's origin). A box stops a beam when the beam and the box, made
-``SHRINK_M`` (0.1 mm) smaller on each of its six sides, share a chord. So a box is here exactly as deep as where it occupies
-voxels (:mod:`pipeline.kernels.boxes`), and a beam along a car's side is not stopped. The beam ends where it enters the shrunk
-box:
+Frame: the grid's own, in metres (the world's axes, zero at the grid's origin). A box stops a beam when the beam and the
+box, made ``SHRINK_M`` (0.1 mm) smaller on each of its six sides, share a chord. So a box is here exactly as deep as
+where it occupies voxels (:mod:`pipeline.kernels.boxes`), and a beam along a car's side is not stopped. The beam ends
+where it enters the shrunk box:
 
 .. math:: t = \max_a \min_\pm \frac{\pm h_a - o_a}{d_a}
 
-with the sensor :math:`o` and the unit direction :math:`d` along the box's own axes (slabs: Kay and Kajiya 1986, "Ray Tracing
-Complex Scenes"). A box that holds the sensor stops nothing.
+with the sensor :math:`o` and the unit direction :math:`d` along the box's own axes (slabs: Kay and Kajiya 1986, "Ray
+Tracing Complex Scenes"). A box that holds the sensor stops nothing.
 
-Steps of :func:`count_blocked`: the beams come sorted by azimuth. A box asks only those within its azimuths and elevations, seen
-from the sensor; those bounds are taken round the *unshrunk* box, so rounding loses no beam. In a frame each beam keeps the
-nearest box; when the frame is over, one is added at the first crossing that lies behind it. Sums along each beam then give the
-frames in which a crossing was not reached. Memory holds a number a beam and a number a crossing, however many frames there are.
-"""
+Steps of :func:`count_blocked`: the beams come sorted by azimuth. A box asks only those within its azimuths and
+elevations, seen from the sensor; those bounds are taken round the *unshrunk* box, so rounding loses no beam. In a frame
+each beam keeps the nearest box; when the frame is over, one is added at the first crossing that lies behind it. Sums
+along each beam then give the frames in which a crossing was not reached. Memory holds a number a beam and a number a
+crossing, however many frames there are."""
 
 from __future__ import annotations
 
@@ -44,7 +44,9 @@ def bounds(boxes, low, high):  # type: ignore[no-untyped-def]
     for b in range(boxes.shape[0]):
         axes_of(boxes[b, 3], boxes[b, 4], axes)
         for a in range(3):
-            reach = 0.5 * (boxes[b, 5] * abs(axes[0, a]) + boxes[b, 6] * abs(axes[1, a]) + boxes[b, 7] * abs(axes[2, a]))
+            reach = 0.5 * (
+                boxes[b, 5] * abs(axes[0, a]) + boxes[b, 6] * abs(axes[1, a]) + boxes[b, 7] * abs(axes[2, a])
+            )
             low[b, a], high[b, a] = boxes[b, a] - reach, boxes[b, a] + reach
 
 
@@ -71,7 +73,8 @@ def _slab(o, d, half, first, last):  # type: ignore[no-untyped-def]
 
 @_kernel
 def _directions(box, low, high, o):  # type: ignore[no-untyped-def]
-    """First and last azimuth, and lowest and highest slope (rise over run), of all that can lie in a box, seen from the sensor.
+    """First and last azimuth, and lowest and highest slope (rise over run), of all that can lie in a box, seen from the
+    sensor.
 
     Taken round the upright block with the box's yaw that holds the (perhaps pitched) box; azimuths may leave [-pi, pi].
     """
@@ -102,7 +105,8 @@ def _directions(box, low, high, o):  # type: ignore[no-untyped-def]
 
 @_kernel
 def _stop(box, o, d, slope, azimuth, limit, bound, scratch, nearest, touched, count):  # type: ignore[no-untyped-def]
-    """Shorten ``nearest`` of the beams that a box stops; list those that no box of the frame stopped before in ``touched``.
+    """Shorten ``nearest`` of the beams that a box stops; list those that no box of the frame stopped before in
+    ``touched``.
 
     ``bound`` is what :func:`_directions` returned. Returns how many are listed now.
     """
@@ -135,7 +139,8 @@ def _stop(box, o, d, slope, azimuth, limit, bound, scratch, nearest, touched, co
 
 @_kernel
 def _note(touched, count, nearest, row, first, enter_m, blocked):  # type: ignore[no-untyped-def]
-    """Add the frame that is over: one at the first crossing behind where each of ``count`` beams ended. Clears ``nearest``."""
+    """Add the frame that is over: one at the first crossing behind where each of ``count`` beams ended. Clears
+    ``nearest``."""
     for k in range(count):
         i = touched[k]
         begin, end = first[row[i]], first[row[i] + 1]
@@ -158,8 +163,8 @@ def count_blocked(o, d, azimuth, slope, row, first, enter_m, frames, boxes, low,
     row
         Which beam of ``first`` each of these is, (n,) int64; each has at least one crossing.
     first, enter_m
-        Crossings first[i] to first[i + 1] belong to beam i, int64; range at which each is entered, ascending along a beam,
-        (k,) float64.
+        Crossings first[i] to first[i + 1] belong to beam i, int64; range at which each is entered, ascending along a
+        beam, (k,) float64.
     frames, boxes
         Frame of each box, ascending, (m,) int64; the boxes as in :func:`bounds`, (m, 8).
     low, high

@@ -4,8 +4,9 @@ Frame: any one with the world's axes, in metres, float64; ray :math:`o + t\,d` w
 
 Embree works in float32 and proposes; the functions here decide, by rules that rounding cannot turn:
 
-- A ray meets a triangle when it pierces its plane at :math:`t = (n \cdot a - n \cdot o) / n \cdot d > 0`, no further than
-  ``EDGE_M`` (1 micrometre) outside the triangle. So no ray slips between two triangles that share an edge or a vertex.
+- A ray meets a triangle when it pierces its plane at :math:`t = (n \cdot a - n \cdot o) / n \cdot d > 0`, no further
+  than ``EDGE_M`` (1 micrometre) outside the triangle. So no ray slips between two triangles that share an edge or a
+  vertex.
 - A plane seen at less than ``GRAZE`` (1e-9) radians is not met; the surface beside it is.
 - A plane that passes within ``EDGE_M`` of the start is not met: the sensor stands on it.
 
@@ -26,7 +27,8 @@ GRAZE = 1e-9
 """A plane seen at a smaller angle (its sine) is not met."""
 
 SURE_M = 2e-5
-"""Nearer to an edge than this, float32 may take the wrong one of the two triangles that share it: its rounding at 200 m."""
+"""Nearer to an edge than this, float32 may take the wrong one of the two triangles that share it: its rounding at 200
+m."""
 
 SHALLOW = 0.01
 """A surface seen at a smaller angle (its sine): float32's rounding, some 1e-5 m, moves the hit on it by millimetres."""
@@ -55,8 +57,8 @@ def planes(triangles, normals, found):  # type: ignore[no-untyped-def]
     triangles, normals
         Corners (m, 3, 3) and unit normals (m, 3), float64; no two corners of a triangle at one place.
     found
-        Filled, (m, 4, 4) float64: row 0 is the triangle's own plane, row 1 + i stands on the side from corner i to the next.
-        Each holds a unit normal and its product with a point of the plane.
+        Filled, (m, 4, 4) float64: row 0 is the triangle's own plane, row 1 + i stands on the side from corner i to the
+        next. Each holds a unit normal and its product with a point of the plane.
     """
     for m in range(triangles.shape[0]):
         n, a = normals[m], triangles[m, 0]
@@ -98,7 +100,8 @@ def _inside(triangle, plane, x, y, z):  # type: ignore[no-untyped-def]
 
 @_inlined
 def meet(triangle, plane, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Range at which a ray meets one triangle (infinity when it does not), how far inside that is, and the sine of the angle.
+    """Range at which a ray meets one triangle (infinity when it does not), how far inside that is, and the sine of the
+    angle.
 
     Parameters
     ----------
@@ -125,7 +128,8 @@ def settle(proposed, triangles, planes, o, d, range_m, ranges, doubtful):  # typ
     Parameters
     ----------
     proposed
-        Index of the triangle that each ray meets first in slightly enlarged form, -1 for none, ``FIN`` for a fin, (n,) int64.
+        Index of the triangle that each ray meets first in slightly enlarged form, -1 for none, ``FIN`` for a fin, (n,)
+        int64.
     triangles, planes
         All triangles (m, 3, 3) and their planes (m, 4, 4), float64.
     o, d
@@ -135,8 +139,8 @@ def settle(proposed, triangles, planes, o, d, range_m, ranges, doubtful):  # typ
     ranges
         Filled: range of each hit, infinity where nothing is met, (n,) float64.
     doubtful
-        Filled: the rays that met a triangle less than ``SURE_M`` inside, its enlargement only, or at an angle below ``SHALLOW``,
-        (n,) int64.
+        Filled: the rays that met a triangle less than ``SURE_M`` inside, its enlargement only, or at an angle below
+        ``SHALLOW``, (n,) int64.
 
     Returns
     -------
@@ -170,8 +174,8 @@ def search(rays, triangles, planes, boxes, starts, o, d, ranges):  # type: ignor
     rays
         Indices of the rays, (k,) int64.
     boxes, starts
-        Boxes round the triangles, round each ``GROUP`` consecutive boxes of those, and so on to a single one: (b, 6) float64,
-        low and high corner; where each level starts, (levels + 1,) int64.
+        Boxes round the triangles, round each ``GROUP`` consecutive boxes of those, and so on to a single one: (b, 6)
+        float64, low and high corner; where each level starts, (levels + 1,) int64.
     triangles, planes, o, d, ranges
         As in :func:`settle`; ``ranges`` is filled for these rays.
     """

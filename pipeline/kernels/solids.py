@@ -2,14 +2,14 @@ r"""Which voxels does static geometry fill, and which points lie inside a solid?
 
 Frame: the grid's own, in metres. Two questions, because a triangle mesh is only a surface:
 
-- :func:`touch`: a triangle reaches deeper than ``SHRINK_M`` (0.1 mm) into a voxel. Separating axes of a triangle and a cube
-  (Akenine-Moeller 2001, "Fast 3D Triangle-Box Overlap Testing"), the cube made 0.1 mm smaller on each side, so that a plane that
-  coincides with voxel faces (the ground at z = 0) fills none.
-- :func:`wind`: a voxel without surface in it is inside or outside as a whole; its centre decides, by the winding number along
-  +z. Corners and centres are first moved to the nearest multiple of ``SNAP_M``, which is far less than half a voxel, so that the
-  sides of edges are decided in whole numbers, without rounding. A centre exactly above an edge would be counted twice or not at
-  all; each edge is therefore looked at from its lexicographically smaller end, and what lies on it is to its left, as if every
-  point were moved by (-e^2, e). So the triangles of a closed solid never disagree.
+- :func:`touch`: a triangle reaches deeper than ``SHRINK_M`` (0.1 mm) into a voxel. Separating axes of a triangle and a
+  cube (Akenine-Moeller 2001, "Fast 3D Triangle-Box Overlap Testing"), the cube made 0.1 mm smaller on each side, so
+  that a plane that coincides with voxel faces (the ground at z = 0) fills none.
+- :func:`wind`: a voxel without surface in it is inside or outside as a whole; its centre decides, by the winding number
+  along +z. Corners and centres are first moved to the nearest multiple of ``SNAP_M``, which is far less than half a
+  voxel, so that the sides of edges are decided in whole numbers, without rounding. A centre exactly above an edge would
+  be counted twice or not at all; each edge is therefore looked at from its lexicographically smaller end, and what lies
+  on it is to its left, as if every point were moved by (-e^2, e). So the triangles of a closed solid never disagree.
 """
 
 from __future__ import annotations

@@ -1,15 +1,15 @@
 """How deep does a box overlap a voxel, and which voxels do vehicles occupy?
 
-The depth is the largest length by which all six faces of the box can be moved inwards while box and voxel still share a volume (and
-the box has one). A box of half sizes :math:`h_i - s` shares a volume with a voxel exactly when no axis n of the fifteen of the
-separating-axis theorem parts them (Gottschalk, Lin, Manocha 1996, "OBBTree", Theorem 1), that is, when for each
+The depth is the largest length by which all six faces of the box can be moved inwards while box and voxel still share a
+volume (and the box has one). A box of half sizes :math:`h_i - s` shares a volume with a voxel exactly when no axis n of
+the fifteen of the separating-axis theorem parts them (Gottschalk, Lin, Manocha 1996, "OBBTree", Theorem 1), that is,
+when for each
 
 .. math:: |g \\cdot n| < r \\, |n|_1 + \\sum_i (h_i - s) \\, |a_i \\cdot n|
 
-with g from centre to centre, r half a voxel, and :math:`a_i` the box's axes. Solved for s, the least right side is the depth; a
-voxel is occupied when the depth is above 0.1 mm. The numbers may be fractions (boxes whose sine and cosine are rational) or mpmath
-floats of 50 digits; nothing here knows which.
-"""
+with g from centre to centre, r half a voxel, and :math:`a_i` the box's axes. Solved for s, the least right side is the
+depth; a voxel is occupied when the depth is above 0.1 mm. The numbers may be fractions (boxes whose sine and cosine are
+rational) or mpmath floats of 50 digits; nothing here knows which."""
 
 from __future__ import annotations
 
@@ -81,18 +81,27 @@ def exact_box(box: Any) -> tuple[list[Any], list[list[Any]], list[Any]]:
     """Centre, axes and half sizes of (x, y, z, yaw, pitch, length, width, height), floats, to 50 digits."""
     with mpmath.workdps(DIGITS):
         x, y, z, yaw, pitch, *size = (mpmath.mpf(float(v)) for v in box)
-        return [x, y, z], axes_of(mpmath.sin(yaw), mpmath.cos(yaw), mpmath.sin(pitch), mpmath.cos(pitch)), [s / 2 for s in size]
+        return (
+            [x, y, z],
+            axes_of(mpmath.sin(yaw), mpmath.cos(yaw), mpmath.sin(pitch), mpmath.cos(pitch)),
+            [s / 2 for s in size],
+        )
 
 
 def depths(box: Any, shape: Any, voxel_m: float, least: float = -1e-3) -> dict[tuple[int, int, int], Any]:
-    """Depth of one box (grid frame) in each voxel, where it is above ``least``; voxels out of its ball's reach are passed over."""
+    """Depth of one box (grid frame) in each voxel, where it is above ``least``; voxels out of its ball's reach are
+    passed over."""
     centre, axes, half = exact_box(box)
     reach = float(sum(half)) + 1e-2
     found = {}
     with mpmath.workdps(DIGITS):
         voxel = mpmath.mpf(voxel_m)
         ranges = [
-            [i for i in range(n) if float(centre[a]) - reach < (i + 1) * voxel_m and i * voxel_m < float(centre[a]) + reach]
+            [
+                i
+                for i in range(n)
+                if float(centre[a]) - reach < (i + 1) * voxel_m and i * voxel_m < float(centre[a]) + reach
+            ]
             for a, n in enumerate(shape)
         ]
         normals = parting(axes, half, voxel)
@@ -113,7 +122,8 @@ def occupied(box: Any, shape: Any, voxel_m: float) -> tuple[set[tuple[int, int, 
 
 
 def tpog(frames: Any, values: Any, shape: Any, voxel_m: float, total: int) -> tuple[Any, int]:
-    """Frames in which each voxel is occupied (nested lists by ix, iy, iz), box by box and frame by frame; and doubtful pairs."""
+    """Frames in which each voxel is occupied (nested lists by ix, iy, iz), box by box and frame by frame; and doubtful
+    pairs."""
     counts = [[[0] * shape[2] for _ in range(shape[1])] for _ in range(shape[0])]
     doubtful = 0
     for frame in range(total):

@@ -1,9 +1,9 @@
 """What does a ray meet first, and which voxels does a segment cross - slowly, obviously, in float64?
 
 Shares no code with the pipeline. Rays: each is held against every triangle (Moeller and Trumbore 1997, "Fast, Minimum
-Storage Ray/Triangle Intersection"), then against the rules that the pipeline documents: a plane seen at a sine below 1e-9 or
-within 1 micrometre of the start is not met, and a point up to 1 micrometre outside a triangle is on it. Segments: all crossings
-with the planes of the grid are collected and sorted; the middle of each piece tells the voxel.
+Storage Ray/Triangle Intersection"), then against the rules that the pipeline documents: a plane seen at a sine below
+1e-9 or within 1 micrometre of the start is not met, and a point up to 1 micrometre outside a triangle is on it.
+Segments: all crossings with the planes of the grid are collected and sorted; the middle of each piece tells the voxel.
 """
 
 import numba
@@ -82,7 +82,8 @@ def first_hits(o, d, corners, edge_m=EDGE_M, graze=GRAZE):
 
 
 def differ(found, true, tolerance_m=1e-9):
-    """Which outcomes differ: met against not met, or ranges further apart than the tolerance (relative to 1 m + range)."""
+    """Which outcomes differ: met against not met, or ranges further apart than the tolerance (relative to 1 m +
+    range)."""
     with np.errstate(invalid="ignore"):
         close = np.abs(found - true) <= tolerance_m * (1.0 + np.abs(true))
     return ~((found == true) | close)

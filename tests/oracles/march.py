@@ -1,9 +1,8 @@
 """Which voxels does a segment cross, in rational arithmetic?
 
-Slow and obvious: along each axis, the stretch of the segment inside each slab of voxels; for each voxel, what its three stretches
-share. Every float64 is a rational number, so nothing here is rounded. Frame: the grid's own, in voxel units; start ``o``, extent
-``d``, both given as floats or fractions; shares of the segment are fractions from 0 to 1.
-"""
+Slow and obvious: along each axis, the stretch of the segment inside each slab of voxels; for each voxel, what its three
+stretches share. Every float64 is a rational number, so nothing here is rounded. Frame: the grid's own, in voxel units;
+start ``o``, extent ``d``, both given as floats or fractions; shares of the segment are fractions from 0 to 1."""
 
 from __future__ import annotations
 
@@ -26,7 +25,8 @@ def in_world(site_m: Sequence[float], beam_m: Sequence[float], origin_m: Sequenc
 
 
 def slabs(o: Number, d: Number, n: int, grow: Fraction = ZERO) -> list[tuple[int, Fraction, Fraction]]:
-    """(index, from, to) of each half-open slab [i - grow, i + 1 + grow) of one axis that the segment shares a stretch with."""
+    """(index, from, to) of each half-open slab [i - grow, i + 1 + grow) of one axis that the segment shares a stretch
+    with."""
     start, extent = Fraction(o), Fraction(d)
     found = []
     for i in range(n):
@@ -42,7 +42,9 @@ def slabs(o: Number, d: Number, n: int, grow: Fraction = ZERO) -> list[tuple[int
     return found
 
 
-def shares(o: Sequence[Number], d: Sequence[Number], shape: Sequence[int], grow: Fraction = ZERO) -> dict[Voxel, Fraction]:
+def shares(
+    o: Sequence[Number], d: Sequence[Number], shape: Sequence[int], grow: Fraction = ZERO
+) -> dict[Voxel, Fraction]:
     """How much of the segment lies in each voxel that is ``grow`` larger on each side."""
     xs, ys, zs = (slabs(o[a], d[a], int(shape[a]), grow) for a in range(3))
     found = {}
@@ -91,15 +93,16 @@ def fragile(
 ) -> tuple[set[Voxel], set[Voxel]]:
     """The voxels that may change when either end moves by up to ``moved_m``: by their chord, and along a face plane.
 
-    No point of the segment moves further than its ends, so a chord after the move is no longer than that of a voxel ``moved_m``
-    larger on each side, and no shorter than that of one smaller, give or take twice ``moved_m`` (the segment's length changes). A
-    voxel is fragile where those two lie on either side of 1 micrometre.
+    No point of the segment moves further than its ends, so a chord after the move is no longer than that of a voxel
+    ``moved_m`` larger on each side, and no shorter than that of one smaller, give or take twice ``moved_m`` (the
+    segment's length changes). A voxel is fragile where those two lie on either side of 1 micrometre.
 
     Returns
     -------
     by_chord, along_face
-        Fragile voxels whose chord lies within 1e-8 m of the bound; the others. There the smaller and the larger voxel cut off
-        pieces of more than 4e-9 m in all, so the segment runs within ``moved_m`` of a face plane for longer than that.
+        Fragile voxels whose chord lies within 1e-8 m of the bound; the others. There the smaller and the larger voxel
+        cut off pieces of more than 4e-9 m in all, so the segment runs within ``moved_m`` of a face plane for longer
+        than that.
     """
     moved = Fraction(moved_m)
     grow, length2 = moved / Fraction(voxel_m), length2_m2(d, voxel_m)
@@ -107,7 +110,8 @@ def fragile(
     found = {
         voxel
         for voxel, share in outer.items()
-        if longer(share, length2, CHORD_M - 2 * moved) and not longer(inner.get(voxel, ZERO), length2, CHORD_M + 2 * moved)
+        if longer(share, length2, CHORD_M - 2 * moved)
+        and not longer(inner.get(voxel, ZERO), length2, CHORD_M + 2 * moved)
     }
     by_chord = found & doubtful(o, d, shape, voxel_m)
     return by_chord, found - by_chord

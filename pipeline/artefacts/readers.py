@@ -1,0 +1,106 @@
+"""How does one get artefacts back as arrays?
+
+Readers for notebooks, for the stages, and for people who want to compute further. Each checks what it reads and says
+which file is wrong. Tables come as Arrow tables (``.to_pandas()`` where pandas is installed), grids as NumPy arrays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from pipeline.artefacts import tables
+from pipeline.core.errors import InputError
+from pipeline.core.grid import Grid
+from pipeline.kernels.crossings import accumulate
+
+SEPARABLE = 0.9
+"""Neighbours in rank are told apart when the chance that the better is better (``beats_next``) reaches this."""
+
+
+@dataclass(frozen=True)
+class Tpog:
+    """A Traffic Probabilistic Occupancy Grid.
+
+    Attributes
+    ----------
+    grid
+        Where the voxels are.
+    frames
+        T, the number of frames.
+    counts
+        Frames in which each voxel is occupied, all blocks added up, (nx, ny, nz) int64.
+    """
+
+    grid: Grid
+    frames: int
+    counts: NDArray[np.int64]
+
+    @property
+    def p(self) -> NDArray[np.float64]:
+        """Share of the frames in which each voxel is occupied, (nx, ny, nz) float64."""
+        return self.counts / self.frames
+
+
+def read_tpog(path: str | Path) -> Tpog:
+    """Read ``tpog.parquet``; InputError when it is corrupt or a row lies outside the grid."""
+    path = Path(path)
+    with tables.reader(path, "tpog") as (file, about):
+        grid, frames = Grid.from_json(about["grid"]), int(about["frames"])
+        counts = np.zeros(int(np.prod(grid.shape)), dtype=np.int64)
+        for group in range(file.num_row_groups):  # one block each: memory does not grow with their number
+            table = tables.read_group(file, group, path, ["ix", "iy", "iz", "count"])
+            index = [table.column(name).to_numpy() for name in ("ix", "iy", "iz")]
+            for axis, (values, size) in enumerate(zip(index, grid.shape, strict=True)):
+                if len(values) and not (values.min() >= 0 and values.max() < size):
+                    raise InputError(path, f"i{'xyz'[axis]} leaves the grid", f"0 to {size - 1}")
+            if len(table):
+                flat = np.ravel_multi_index(index, grid.shape)
+                accumulate(flat, table.column("count").to_numpy().astype(np.int64), counts)
+    if counts.max(initial=0) > frames:
+        raise InputError(path, f"a voxel is occupied in {counts.max()} of {frames} frames", "counts up to the frames")
+    return Tpog(grid, frames, counts.reshape(grid.shape))
+
+
+def read_scores(path: str | Path) -> pa.Table:
+    """Read ``scores.parquet``."""
+    return tables.read(Path(path), "scores")[0]
+
+
+def read_trajectories(path: str | Path) -> pa.Table:
+    """Read ``trajectories.parquet``."""
+    return tables.read(Path(path), "trajectories")[0]
+
+
+def read_scans(path: str | Path) -> pa.Table:
+    """Read ``scans.parquet``."""
+    return tables.read(Path(path), "scans")[0]
+
+
+def read_accuracy(path: str | Path) -> tuple[list[dict[str, Any]], dict[str, Any]] | None:
+    """Rows and metadata of ``accuracy.parquet``; None where there is none."""
+    path = Path(path)
+    if not path.is_file():
+        return None
+    try:
+        table, about = tables.read(path, "accuracy")
+    except InputError as error:
+        raise InputError(path, "is no accuracy study", f"remove it, or run egvs accuracy again ({error})") from None
+    return table.to_pylist(), about
+
+
+def read_visibility(path: str | Path, site: str) -> NDArray[np.float64]:
+    """Hits of one site in every voxel, (nx, ny, nz) float64, from ``visibility.parquet``."""
+    path = Path(path)
+    table, about = tables.read(path, "visibility")
+    mine = table.filter(pa.compute.equal(table.column("site"), site))
+    if len(mine) == 0 and site not in {s["site"] for s in about["sites"]}:
+        raise InputError(path, f"no site {site!r}", "a site that score.keep_visibility names")
+    hits = np.zeros(Grid.from_json(about["grid"]).shape)
+    hits[tuple(mine.column(name).to_numpy() for name in ("ix", "iy", "iz"))] = mine.column("hits").to_numpy()
+    return hits

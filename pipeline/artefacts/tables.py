@@ -1,0 +1,179 @@
+"""How do artefacts get onto disk whole, and back?
+
+The only module that reads and writes Parquet, and the only one that knows how a file is written: aside first
+(``.<name>.partial``), then renamed, so that a killed run leaves no half-written artefact.
+
+Metadata is one JSON object under the Parquet key ``egvs``. Nothing in a file depends on the clock, the machine, the
+number of threads or the path."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from pipeline.artefacts import schemas
+from pipeline.core import files
+from pipeline.core.errors import InputError
+from pipeline.core.grid import MAX_VOXELS, Grid
+
+_KEY = b"egvs"
+_WRITE = {"compression": "zstd", "compression_level": 3, "version": "2.6", "write_statistics": True}
+
+
+class TableWriter:
+    """Writes one artefact in pieces, each a row group. Made by :func:`writer`."""
+
+    def __init__(self, file: pq.ParquetWriter, schema: pa.Schema) -> None:
+        self._file, self._schema = file, schema
+
+    def write(self, columns: dict[str, Any]) -> None:
+        """Append one row group. ``columns`` maps every column's name to an array of equal length."""
+        arrays = [pa.array(columns[f.name], type=f.type) for f in self._schema]
+        table = pa.Table.from_arrays(arrays, schema=self._schema)
+        self._file.write_table(table, row_group_size=max(1, table.num_rows))
+
+    def describe(self, metadata: dict[str, Any]) -> None:
+        """Set the artefact's metadata; may be called last, when the rows are known."""
+        self._file.add_key_value_metadata({_KEY: files.canonical_json(metadata)})
+
+
+@contextmanager
+def writer(path: Path, artefact: str, optional: tuple[str, ...] = ()) -> Iterator[TableWriter]:
+    """Open an artefact for writing in pieces; the file appears under its name only when all went well.
+
+    ``optional`` names the columns beyond the needed ones that this file has.
+    """
+    schema = schemas.arrow_schema(artefact, optional)
+    strings = [f.name for f in schema if f.type == pa.string()]
+    with files.aside(path) as partial, pq.ParquetWriter(partial, schema, use_dictionary=strings, **_WRITE) as file:
+        yield TableWriter(file, schema)
+
+
+def write(path: Path, artefact: str, columns: dict[str, Any], metadata: dict[str, Any]) -> None:
+    """Write one artefact whole, as one row group."""
+    with writer(path, artefact) as out:
+        out.write(columns)
+        out.describe(metadata)
+
+
+def read(path: Path, artefact: str, columns: list[str] | None = None) -> tuple[pa.Table, dict[str, Any]]:
+    """Read an artefact: its Arrow table and its metadata.
+
+    Raises
+    ------
+    InputError
+        When the file is missing, corrupt, or does not have the artefact's columns and types.
+    """
+    with reader(path, artefact) as (file, metadata):
+        try:
+            return file.read(columns=columns, use_threads=False), metadata
+        except (pa.ArrowInvalid, OSError) as error:
+            raise _corrupt(path, error) from None
+
+
+@contextmanager
+def reader(path: Path, artefact: str) -> Iterator[tuple[pq.ParquetFile, dict[str, Any]]]:
+    """Open an artefact to read its row groups one by one; checks as :func:`read` does."""
+    if not path.is_file():
+        raise InputError(path, "no such file", f"run the stage that makes {path.name} first")
+    try:
+        file = pq.ParquetFile(path)
+    except (pa.ArrowInvalid, OSError) as error:
+        raise _corrupt(path, error) from None
+    with file:
+        _check_columns(path, artefact, file.schema_arrow)
+        raw = (file.metadata.metadata or {}).get(_KEY)
+        if raw is None:
+            raise InputError(path, "no metadata under the key 'egvs'", f"a {artefact} file written by egvs")
+        metadata = _metadata(path, artefact, raw)
+        yield file, metadata
+
+
+def read_group(file: pq.ParquetFile, group: int, path: Path, columns: list[str] | None = None) -> pa.Table:
+    """Read one row group of an open artefact."""
+    try:
+        return file.read_row_group(group, columns=columns, use_threads=False)
+    except (pa.ArrowInvalid, OSError) as error:
+        raise _corrupt(path, error) from None
+
+
+def read_metadata(path: Path, artefact: str) -> dict[str, Any]:
+    """The JSON object under the key ``egvs`` alone."""
+    with reader(path, artefact) as (_, metadata):
+        return metadata
+
+
+def _check_columns(path: Path, artefact: str, found: pa.Schema) -> None:
+    wanted = schemas.arrow_schema(artefact)
+    for field in wanted:
+        index = found.get_field_index(field.name)
+        if index < 0:
+            raise InputError(path, f"column '{field.name}' is missing", f"the columns {', '.join(wanted.names)}")
+        if found.field(index).type != field.type:
+            raise InputError(path, f"column '{field.name}' is {found.field(index).type}", f"{field.type}")
+    for field in schemas.arrow_schema(artefact, schemas.optional_columns(artefact)):
+        index = found.get_field_index(field.name)
+        if index >= 0 and found.field(index).type != field.type:
+            raise InputError(path, f"column '{field.name}' is {found.field(index).type}", f"{field.type}")
+    extra = sorted(set(found.names) - set(wanted.names) - set(schemas.optional_columns(artefact)))
+    if extra:
+        raise InputError(path, f"unknown columns {', '.join(extra)}", f"the columns {', '.join(wanted.names)}")
+
+
+_PROMISED: dict[str, tuple[str, ...]] = {
+    "trajectories": ("frames",),
+    "tpog": ("grid", "frames", "block_frames"),
+    "scans": ("sites",),
+    "visibility": ("grid", "sites"),
+    "accuracy": ("inputs", "tolerance", "stages"),
+}
+"""What the metadata of an artefact must hold for those who read it."""
+
+_SITE = ("site", "x_m", "y_m", "z_m", "sensor")
+
+
+def _metadata(path: Path, artefact: str, raw: bytes) -> dict[str, Any]:
+    """The checked metadata; InputError naming what is wrong with it."""
+    try:
+        metadata = json.loads(raw)
+    except (ValueError, RecursionError) as error:
+        raise InputError(path, f"its metadata is no JSON ({error})", "an unaltered file; make it again") from None
+    if not isinstance(metadata, dict):
+        raise InputError(path, f"its metadata is {metadata!r}", "an unaltered file; make it again")
+    if metadata.get("schema") != schemas.VERSION:
+        raise InputError(path, f"schema version {metadata.get('schema')}", f"version {schemas.VERSION}")
+    for key in _PROMISED.get(artefact, ()):
+        if not _is_sound(key, metadata.get(key)):
+            raise InputError(
+                path, f"its metadata says {key} = {metadata.get(key)!r}", "an unaltered file; make it again"
+            )
+    return metadata
+
+
+def _is_sound(key: str, value: Any) -> bool:
+    if key == "grid":
+        try:
+            grid = Grid.from_json(value)
+        except (KeyError, TypeError, ValueError, AttributeError):
+            return False
+        return grid.voxel_m > 0 and min(grid.shape) > 0 and math.prod(grid.shape) <= MAX_VOXELS
+    if key == "sites":
+        return isinstance(value, list) and all(isinstance(s, dict) and all(k in s for k in _SITE) for s in value)
+    if key == "inputs":
+        return isinstance(value, str)
+    if key == "stages":
+        return isinstance(value, dict)
+    if key == "tolerance":
+        return isinstance(value, float) and value > 0
+    return isinstance(value, int) and not isinstance(value, bool) and value > 0
+
+
+def _corrupt(path: Path, error: Exception) -> InputError:
+    return InputError(path, f"cannot be read as Parquet ({str(error).splitlines()[0]})", "a whole file; make it again")

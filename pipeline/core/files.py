@@ -1,0 +1,54 @@
+"""Files appear whole or not at all, and are known by their hashes.
+
+A file is written aside first (``.<name>.partial``), then renamed, so that a killed run leaves no half-written artefact.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from pipeline.core.errors import InputError
+
+
+@contextmanager
+def aside(path: Path) -> Iterator[Path]:
+    """Yield a path to write to; rename it to ``path`` when the block ends well, remove it when it does not."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.partial")
+    if path.is_dir():
+        raise InputError(path, "is a folder", "a file, or nothing, where an artefact is written")
+    try:
+        yield partial
+        partial.replace(path)
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file whole or not at all (UTF-8, line ends as given)."""
+    with aside(path) as partial:
+        partial.write_bytes(text.encode("utf-8"))
+
+
+def sha256_of(path: Path) -> str:
+    """Hex digest of a file's bytes; InputError when it is not there."""
+    if not path.is_file():
+        raise InputError(path, "no such file", f"run the stage that makes {path.name} first")
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def hash_of(value: Any) -> str:
+    """Hex digest of a JSON value, independent of the order of its keys."""
+    return hashlib.sha256(canonical_json(value)).hexdigest()
+
+
+def canonical_json(value: Any) -> bytes:
+    """A JSON value as bytes that do not depend on the order of its keys."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False).encode("utf-8")

@@ -1,0 +1,47 @@
+r"""What if a constant share of returns is lost?
+
+Model: :math:`detect(r) = 1 - share`, whatever the range. It is the expectation of dropping each return by the throw of
+a die, as the LiDAR of CARLA does under ``dropoff_general_rate`` (Dosovitskiy et al. 2017, CoRL, PMLR 78).
+
+Calls for it: losses that are known as one number (a sensor's own statistics, a dirty window, packets lost on the way),
+and a margin of safety: gamma caps the hits, so a site with beams to spare loses less than the share. Limits: real
+losses depend on range, incidence and material (Manivasagam et al. 2020, CVPR, learn them); a loss that belongs to range
+or weather is better named as such."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from pipeline.effects.registry import Detect, Parameters, Scene
+from pipeline.sensing.sensors import Sensor
+
+
+class Model(Parameters):
+    """Parameters of ``[effects.dropout]``."""
+
+    share: Annotated[float, Field(ge=0, le=1, description="Share of the returns that are lost")]
+
+
+class Dropout(Detect):
+    """A constant share of returns lost."""
+
+    NAME: ClassVar[str] = "dropout"
+    SOURCE: ClassVar[str] = "Dosovitskiy et al. 2017 (CARLA), dropoff_general_rate, as an expectation"
+    Model: ClassVar[type[Parameters]] = Model
+
+    def idle(self, scene: Scene) -> str | None:
+        """Nothing is lost when the share is nothing."""
+        del scene
+        return "share is 0" if self.parameters.share == 0 else None
+
+    def detect(self, range_m: NDArray[np.float64], sensor: Sensor) -> NDArray[np.float64]:
+        """1 - share."""
+        del sensor
+        return np.full(len(range_m), 1.0 - self.parameters.share)
+
+
+EFFECT = Dropout

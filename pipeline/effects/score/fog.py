@@ -1,0 +1,92 @@
+r"""How much of a return does fog take away?
+
+Model: the pulse is thinned on its way out and back, by an extinction that follows from how far one sees and falls with
+the wavelength,
+
+.. math:: detect(r) = e^{-2 \alpha r}, \qquad
+          \alpha = \frac{-\ln \varepsilon}{V} \left( \frac{\lambda}{550\,\mathrm{nm}} \right)^{-q}
+
+for a visibility V at which the contrast of a black target has fallen to epsilon (Koschmieder 1924). The exponent q
+depends on V:
+
+- ``kruse`` (Kruse, McGlauchlin and McQuistan 1962, Elements of Infrared Technology): 1.6 above 50 km, 1.3 above 6 km,
+  else :math:`0.585 \, V_{km}^{1/3}`. Made from haze; it says that fog is thinner in the infrared, which measurements in
+  fog deny.
+- ``kim`` (Kim, McArthur and Korevaar 2001, Proc. SPIE 4214, 26-37), the default: the same above 6 km, then :math:`0.16
+  \, V_{km} + 0.34` above 1 km, :math:`V_{km} - 0.5` above 0.5 km, and 0 below: in fog all wavelengths suffer alike.
+  ITU-R P.1814-1 (09/2025) has this exponent too; the edition of 2007 had Kruse's.
+
+Both models mean the visibility at a contrast of 2 % (-ln 0.02 = 3.91), so that is the default. Instruments at roads and
+airports report the meteorological optical range, which is at 5 % (-ln 0.05 = 3.00): for theirs, set ``contrast =
+0.05``; V is converted to 2 % before q is looked up.
+
+Calls for it: a site that must work in fog, mist or haze. Limits: the share of the pulse that comes back stands for the
+chance that it is noticed; a sensor with power in reserve loses less, and one whose detector is blinded by the fog's own
+return loses more. Homogeneous fog; single scattering; wavelengths from 400 to 1550 nm."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from pipeline.effects.registry import Detect, Parameters
+from pipeline.sensing.sensors import Sensor
+
+_GREEN_NM = 550.0
+_MODELS_CONTRAST = 0.02
+
+
+class Model(Parameters):
+    """Parameters of ``[effects.fog]``."""
+
+    visibility_m: Annotated[float, Field(gt=0, description="How far one sees; fog is below 1000, dense fog below 200")]
+    model: Annotated[
+        Literal["kim", "kruse"], Field(description="How the exponent of the wavelength follows from the visibility")
+    ] = "kim"
+    contrast: Annotated[
+        float,
+        Field(gt=0, lt=1, description="At which visibility_m was measured; 0.05 for the meteorological optical range"),
+    ] = _MODELS_CONTRAST
+
+
+class Fog(Detect):
+    """Two-way extinction by fog."""
+
+    NAME: ClassVar[str] = "fog"
+    SOURCE: ClassVar[str] = "Kim, McArthur and Korevaar 2001, Proc. SPIE 4214; Kruse et al. 1962"
+    Model: ClassVar[type[Parameters]] = Model
+
+    def extinction_per_m(self, wavelength_nm: float) -> float:
+        """Extinction coefficient in nepers a metre."""
+        green_per_m = -math.log(self.parameters.contrast) / self.parameters.visibility_m
+        visibility_km = -math.log(_MODELS_CONTRAST) / green_per_m / 1000
+        q = _kim(visibility_km) if self.parameters.model == "kim" else _kruse(visibility_km)
+        return float(green_per_m * (wavelength_nm / _GREEN_NM) ** -q)
+
+    def detect(self, range_m: NDArray[np.float64], sensor: Sensor) -> NDArray[np.float64]:
+        """exp(-2 alpha r) at the sensor's wavelength."""
+        share: NDArray[np.float64] = np.exp(-2 * self.extinction_per_m(sensor.wavelength_nm) * range_m)
+        return share
+
+
+def _kruse(visibility_km: float) -> float:
+    """Exponent q of Kruse et al."""
+    if visibility_km > 6:
+        return 1.6 if visibility_km > 50 else 1.3
+    return float(0.585 * visibility_km ** (1 / 3))
+
+
+def _kim(visibility_km: float) -> float:
+    """Exponent q of Kim et al.; Kruse's from 6 km on."""
+    if visibility_km > 6:
+        return _kruse(visibility_km)
+    if visibility_km > 1:
+        return 0.16 * visibility_km + 0.34
+    return max(visibility_km - 0.5, 0.0)
+
+
+EFFECT = Fog

@@ -1,0 +1,78 @@
+"""How is a user's XML file read without trusting it, and without holding it whole?
+
+Steps: undo gzip where the first two bytes say so; parse with defusedxml, which refuses entities; hand out one child of
+the root at a time and forget it. Whatever is wrong with the file becomes an :class:`InputError` that names it (for a
+copy: that names what the user named)."""
+
+from __future__ import annotations
+
+import gzip
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any, cast
+from xml.etree.ElementTree import Element, ParseError
+
+from pipeline.core.errors import InputError
+
+_GZIP = b"\x1f\x8b"
+
+
+def is_gzip(path: Path) -> bool:
+    """Whether the file's first bytes are those of gzip, whatever its name says."""
+    with path.open("rb") as file:
+        return file.read(2) == _GZIP
+
+
+@contextmanager
+def opened(path: Path, name: Path | None = None) -> Iterator[IO[bytes]]:
+    """The file's bytes, unzipped; a damaged gzip becomes an InputError."""
+    try:
+        with gzip.open(path) if is_gzip(path) else path.open("rb") as file:
+            yield cast(IO[bytes], file)
+    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+        raise InputError(
+            name or path, f"is a damaged gzip file ({error})", "a whole file; fetch or make it again"
+        ) from None
+
+
+def children(path: Path, root: str, name: Path | None = None) -> Iterator[Element]:
+    """The children of the root element one by one, each whole; a child is forgotten when the next is asked for.
+
+    Raises
+    ------
+    InputError
+        When the root is not ``root`` (where that is not empty), the XML is malformed or declares entities, or its gzip
+        is damaged.
+    """
+    from defusedxml.common import DefusedXmlException
+
+    with opened(path, name) as file:
+        path = name or path
+        try:
+            yield from _children(file, path, root)
+        except ParseError as error:
+            raise InputError(path, f"is not well-formed XML: {error}", "a whole XML file") from None
+        except DefusedXmlException:
+            raise InputError(path, "declares XML entities, which are refused", "a file without them") from None
+
+
+def _children(file: IO[bytes], path: Path, root: str) -> Iterator[Element]:
+    from defusedxml.ElementTree import iterparse
+
+    depth, top = 0, None
+    events: Iterator[tuple[str, Any]] = iterparse(file, events=("start", "end"))
+    for event, element in events:
+        if event == "start":
+            depth += 1
+            if top is None:
+                top = element
+                if root and top.tag != root:
+                    raise InputError(path, f"its root is <{top.tag}>", f"a file whose root is <{root}>")
+        else:
+            depth -= 1
+            if depth == 1:
+                yield element
+                assert top is not None
+                top.clear()

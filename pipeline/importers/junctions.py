@@ -1,0 +1,283 @@
+"""Where is the junction, how far does the region of interest reach round it, and where could a pole stand at its kerbs?
+
+Steps: read lanes, junctions and the projection from a SUMO network -> :class:`Streets`; :func:`choose` a junction;
+:func:`region` round it; :func:`kerb_sites` along the carriageway's rim.
+
+World frame: the network's own x, y in metres. Longitude and latitude become x, y by the network's ``<location>``, as
+netconvert did:
+
+    (x, y) = projection(lon, lat) + netOffset
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import shapely
+from shapely.geometry import LineString, Point, Polygon, box
+from shapely.geometry.base import BaseGeometry
+
+from pipeline.core.errors import InputError
+from pipeline.formats import safe_xml as safexml
+
+XY = tuple[float, float]
+
+ROI_LEAST_M, ROI_MOST_M, ROI_STEP_M, ROI_HEIGHT_M = 60.0, 120.0, 10.0, 5.0
+APPROACH_M = 20.0
+"""How much of each approach belongs to the region of interest, at least."""
+
+SPACING_M = 10.0
+KERB_M = 1.0
+KERB_LEAST_M = 0.5
+CLEARANCE_M = 1.0
+BEYOND_ROI_M = 5.0
+HEIGHTS_M = (3.0, 4.5)
+MOST_SPOTS = 12
+LANE_WIDTH_M = 3.2
+"""SUMO's default."""
+
+_HAIR_M = 0.01
+_ISLAND_M2 = 100.0
+_SLIDES_M = (0.0, 1.0, -1.0, 2.0, -2.0, 3.0, -3.0, 4.0, -4.0)
+
+
+@dataclass(frozen=True)
+class Junction:
+    """A junction of the network."""
+
+    id: str
+    at_m: XY
+    area: BaseGeometry
+    lanes_in: int
+    arms: int
+    signalised: bool
+    names: tuple[str, ...]
+
+    @property
+    def title(self) -> str:
+        """What a person would call it."""
+        what = "signalised junction" if self.signalised else "junction without signals"
+        if len(self.names) < 2:
+            return " in ".join([what, *self.names])
+        return f"{what} of {', '.join(self.names[:-1])} and {self.names[-1]}"
+
+
+@dataclass(frozen=True)
+class Street:
+    """A road in one direction: the nodes that it joins, and its lanes at their full width."""
+
+    ends: tuple[str, str]
+    area: BaseGeometry
+    name: str
+    lane_length_m: float
+
+
+@dataclass(frozen=True)
+class Streets:
+    """What is needed of a network: where vehicles drive, its junctions, its projection.
+
+    ``inside`` are the lanes within junctions; ``nodes_m`` places each node, also those that are no junction.
+    """
+
+    streets: tuple[Street, ...]
+    inside: tuple[BaseGeometry, ...]
+    nodes_m: dict[str, XY]
+    junctions: tuple[Junction, ...]
+    projection: str
+    offset_m: XY
+
+    @property
+    def lane_areas(self) -> list[BaseGeometry]:
+        """The carriageway in pieces: all lanes, also those inside junctions, at their full width."""
+        return [*(s.area for s in self.streets), *self.inside]
+
+    @property
+    def lane_length_m(self) -> float:
+        """All lanes outside junctions, one after another."""
+        return math.fsum(s.lane_length_m for s in self.streets)
+
+    def to_xy(self, lons_deg: Sequence[float], lats_deg: Sequence[float]) -> list[XY]:
+        """World-frame x, y in metres of positions in degrees."""
+        from pyproj import Proj
+
+        xs, ys = Proj(self.projection)(list(lons_deg), list(lats_deg))
+        return [(x + self.offset_m[0], y + self.offset_m[1]) for x, y in zip(xs, ys, strict=True)]
+
+
+@dataclass(frozen=True)
+class Region:
+    """The region of interest from above; it starts at z = 0 and is ``ROI_HEIGHT_M`` high."""
+
+    center_m: XY
+    size_m: XY
+
+    @property
+    def area(self) -> Polygon:
+        """Its rectangle."""
+        (x, y), (w, d) = self.center_m, self.size_m
+        return box(x - w / 2, y - d / 2, x + w / 2, y + d / 2)
+
+
+@dataclass(frozen=True)
+class Spot:
+    """A place for a pole and where a sensor there would look: x, y in metres, yaw in degrees."""
+
+    x_m: float
+    y_m: float
+    yaw_deg: float
+
+
+def read(path: Path) -> Streets:
+    """Read a network that netconvert wrote from OpenStreetMap."""
+    streets: list[Street] = []
+    inside: list[BaseGeometry] = []
+    raw: list[Element] = []
+    projection, offset_m = "", (0.0, 0.0)
+    for element in safexml.children(path, "net"):
+        function = element.get("function", "")
+        if element.tag == "location":
+            projection, offset_m = element.attrib["projParameter"], _points(element.attrib["netOffset"])[0]
+        elif element.tag == "edge" and function == "internal":
+            inside.append(_area(element))
+        elif element.tag == "edge" and not function:
+            streets.append(_street(element))
+        elif element.tag == "junction" and element.get("type") != "internal":
+            raw.append(element)
+    nodes_m = {e.attrib["id"]: (float(e.attrib["x"]), float(e.attrib["y"])) for e in raw}
+    junctions = [_junction(e, streets) for e in raw if e.get("type") != "dead_end" and e.get("incLanes")]
+    return Streets(tuple(streets), tuple(inside), nodes_m, tuple(junctions), projection, offset_m)
+
+
+def choose(streets: Streets, at_m: XY | None) -> Junction | None:
+    """The signalised junction nearest to ``at_m``, or the largest; one without signals only where there is no other.
+
+    A junction is where at least three streets meet, so that the signals of a mere crossing for pedestrians do not
+    count, unless nothing else is there."""
+    met = [j for j in streets.junctions if j.arms >= 3]
+    groups = (
+        [j for j in met if j.signalised],
+        [j for j in streets.junctions if j.signalised],
+        met,
+        streets.junctions,
+    )
+    among = next((group for group in groups if group), None)
+    if among is None:
+        return None
+    if at_m is None:
+        return min(among, key=lambda j: (-j.lanes_in, -j.area.area, j.id))
+    return min(among, key=lambda j: (Point(at_m).distance(j.area), math.dist(at_m, j.at_m), j.id))
+
+
+def region(junction: Junction) -> Region:
+    """A box round the junction with a piece of each approach; all its corners are whole metres."""
+    x0, y0, x1, y1 = junction.area.bounds
+    steps = (math.ceil((side + 2 * APPROACH_M) / ROI_STEP_M) for side in (x1 - x0, y1 - y0))
+    width, depth = (min(max(n * ROI_STEP_M, ROI_LEAST_M), ROI_MOST_M) for n in steps)
+    return Region((float(round((x0 + x1) / 2)), float(round((y0 + y1) / 2))), (width, depth))
+
+
+def kerb_sites(streets: Streets, junction: Junction, roi: Region, objects: Sequence[BaseGeometry]) -> list[Spot]:
+    """Places for poles along the kerbs of the junction and its approaches, in and around the region of interest.
+
+    They stand ``KERB_M`` outside the carriageway (rounded to 0.1 m, never nearer than ``KERB_LEAST_M``),
+    ``CLEARANCE_M`` from every object, about ``SPACING_M`` apart along the kerb and never nearer to each other than half
+    of it. Islands smaller than 100 m2 count as carriageway. Of more than ``MOST_SPOTS`` places, the nearest to the
+    junction are taken."""
+    window = box(*roi.area.buffer(BEYOND_ROI_M, join_style="mitre").bounds)
+    near = window.buffer(50.0)
+    everything = [*streets.lane_areas, *(j.area for j in streets.junctions)]
+    road = shapely.union_all([area for area in everything if area.intersects(near)])
+    own = shapely.union_all([junction.area, *_approaches(streets, junction, window)]).buffer(1.5 * KERB_M)
+    rim = shapely.intersection(_without_islands(road).buffer(KERB_M).boundary, window.intersection(own))
+    blocked = [o.buffer(CLEARANCE_M + _HAIR_M) for o in objects if o.intersects(near)]
+    forbidden = shapely.union_all([road.buffer(KERB_LEAST_M + _HAIR_M), *blocked])
+    shapely.prepare(forbidden)
+    places = [place for line in _lines(rim) for place in _along(line, forbidden, window)]
+    center = junction.area.centroid
+    taken = _nearest(places, (center.x, center.y))
+    yaws = [(math.degrees(math.atan2(center.y - y, center.x - x)), x, y) for x, y in taken]
+    return [Spot(x, y, float(round(yaw_deg))) for yaw_deg, x, y in sorted(yaws)]
+
+
+def _nearest(places: Sequence[XY], center: XY) -> list[XY]:
+    """The places nearest to the center that are not too near to each other."""
+    taken: list[XY] = []
+    for place in sorted(places, key=lambda p: (math.dist(p, center), p)):
+        if all(math.dist(place, other) >= SPACING_M / 2 for other in taken):
+            taken.append(place)
+    return taken[:MOST_SPOTS]
+
+
+def _approaches(streets: Streets, junction: Junction, window: BaseGeometry) -> list[BaseGeometry]:
+    """The streets that one reaches from the junction without leaving the window, in either direction."""
+    inside = {node for node, at_m in streets.nodes_m.items() if window.covers(Point(at_m))}
+    reached, grown = {junction.id}, True
+    while grown:
+        ends = {end for s in streets.streets if reached & inside & set(s.ends) for end in s.ends}
+        grown = not ends <= reached
+        reached |= ends
+    return [s.area for s in streets.streets if (reached & inside | {junction.id}) & set(s.ends)]
+
+
+def _along(line: LineString, forbidden: BaseGeometry, window: BaseGeometry) -> list[XY]:
+    """Free places along a line, evenly spaced; one that is taken moves a little along the kerb."""
+    count = round(line.length / SPACING_M)
+    spots = []
+    for index in range(count):
+        middle_m = (index + 0.5) * line.length / count
+        for slide_m in _SLIDES_M:
+            point = line.interpolate(min(max(middle_m + slide_m, 0.0), line.length))
+            x, y = round(point.x, 1), round(point.y, 1)
+            if window.covers(Point(x, y)) and not forbidden.intersects(Point(x, y)):
+                spots.append((x, y))
+                break
+    return spots
+
+
+def _without_islands(area: BaseGeometry) -> BaseGeometry:
+    polygons = [p for p in shapely.get_parts(area) if isinstance(p, Polygon)]
+    large = [Polygon(p.exterior, [r for r in p.interiors if Polygon(r).area >= _ISLAND_M2]) for p in polygons]
+    return shapely.union_all(large)
+
+
+def _lines(rim: BaseGeometry) -> list[LineString]:
+    merged = shapely.line_merge(rim) if rim.geom_type == "MultiLineString" else rim
+    return [line for line in shapely.get_parts(shapely.normalize(merged)) if isinstance(line, LineString)]
+
+
+def _junction(element: Element, streets: Sequence[Street]) -> Junction:
+    name = element.attrib["id"]
+    at_m = float(element.attrib["x"]), float(element.attrib["y"])
+    corners = _points(element.get("shape", ""))
+    area = shapely.make_valid(Polygon(corners)) if len(corners) >= 3 else Point(at_m).buffer(1.0)
+    meeting = [s for s in streets if name in s.ends]
+    arms = {end for s in meeting for end in s.ends} - {name}
+    names = tuple(sorted({s.name for s in meeting if s.name}))
+    signalised = element.attrib["type"].startswith("traffic_light")
+    return Junction(name, at_m, area, len(element.get("incLanes", "").split()), len(arms), signalised, names)
+
+
+def _street(element: Element) -> Street:
+    ends = element.attrib["from"], element.attrib["to"]
+    length_m = math.fsum(float(lane.attrib["length"]) for lane in element.iter("lane"))
+    return Street(ends, _area(element), element.get("name", ""), length_m)
+
+
+def _area(edge: Element) -> BaseGeometry:
+    """Its lanes at their full width; pavements are none."""
+    lanes = [(_points(lane.attrib["shape"]), lane) for lane in edge.iter("lane") if lane.get("allow") != "pedestrian"]
+    return shapely.union_all([
+        LineString(points).buffer(float(lane.get("width", LANE_WIDTH_M)) / 2, cap_style="flat")
+        for points, lane in lanes if len(set(points)) > 1
+    ])  # fmt: skip
+
+
+def _points(text: str) -> list[XY]:
+    try:
+        return [(float(x), float(y)) for x, y, *_ in (pair.split(",") for pair in text.split())]
+    except ValueError:
+        raise InputError("network", f"a shape holds no coordinates ({text[:40]!r})", "what netconvert writes") from None

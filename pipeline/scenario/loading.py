@@ -1,0 +1,130 @@
+"""Reads and checks a scenario.
+
+Steps of :func:`load`: read the TOML file, lay the ``--set`` overrides over it, validate. Files that it names are
+found relative to the folder; ``$SUMO_HOME/`` in front names a file that SUMO ships.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import re
+import tomllib
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from pipeline.core.errors import InputError
+from pipeline.core.grid import Grid
+from pipeline.scenario.messages import explain
+from pipeline.scenario.models import FILE, Scenario
+
+
+def load(path: str | Path, overrides: Iterable[str] = ()) -> Scenario:
+    """Read and check a scenario.
+
+    Parameters
+    ----------
+    path
+        The folder, or its ``scenario.toml``.
+    overrides
+        ``"key.key=value"``, the value as in TOML (a bare word is taken as a string).
+
+    Raises
+    ------
+    InputError
+        Naming file, key, value, and what would be right.
+    """
+    path = Path(path)
+    file = path / FILE if path.is_dir() else path
+    values = _read(file, ())
+    for override in overrides:
+        if override.partition("=")[0].strip() == "extends":
+            raise InputError(
+                f"--set {override}", "a scenario is extended by its file alone", "extends = ... in a scenario.toml"
+            )
+        _lay_over(values, override)
+    scenario = from_values(values, file.parent, str(file))
+    if scenario.effects:
+        registry = importlib.import_module("pipeline.effects.registry")
+        for name, parameters in scenario.effects.items():
+            registry.make(name, parameters, f"{file}: effects")
+    source, idle = scenario.traffic.idle_keys()
+    if idle:
+        raise InputError(
+            f"{file}: traffic", f"{', '.join(sorted(idle))} would act on nothing beside {source}", "remove it"
+        )
+    return scenario
+
+
+def _read(file: Path, heirs: tuple[Path, ...]) -> dict[str, Any]:
+    """The values of a scenario file, laid over those of the scenario that it extends."""
+    if not file.is_file():
+        raise InputError(
+            file.parent if file.name == FILE else file,
+            f"no {FILE} there",
+            f"a folder with a {FILE}, or the file itself",
+        )
+    if file.resolve() in heirs:
+        raise InputError(f"{file}: extends", "leads back to itself", "a scenario that does not extend this one")
+    try:
+        values = tomllib.loads(file.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(file, f"is not valid TOML: {error}") from None
+    if not isinstance(base := values.get("extends", ""), str):
+        raise InputError(f"{file}: extends", f"{base!r}", "the path of a scenario's folder")
+    return _merged(_read(file.parent / base / FILE, (*heirs, file.resolve())), values) if base else values
+
+
+def _merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    merged = dict(below)
+    for key, value in above.items():
+        both = isinstance(value, dict) and isinstance(below.get(key), dict)
+        merged[key] = _merged(below[key], value) if both else value
+    return merged
+
+
+def _bases(folder: Path, extends: str, place: str) -> Iterator[Path]:
+    """The scenario's folder, then those of the scenarios that it extends."""
+    yield folder
+    while extends:
+        folder = folder / extends
+        if not (folder / FILE).is_file():
+            raise InputError(f"{place}: extends", f"no {FILE} in {folder}", "the path of a scenario's folder")
+        yield folder
+        extends = tomllib.loads((folder / FILE).read_text(encoding="utf-8")).get("extends", "")
+
+
+def from_values(values: dict[str, Any], folder: Path, place: str) -> Scenario:
+    """Check a scenario that is at hand as nested values (as ``run.json`` holds it)."""
+    values.setdefault("name", re.sub(r'[\s/\\:*?"<>|]+', "_", folder.resolve().name) or "scenario")
+    try:
+        scenario = Scenario.of(values)
+    except ValidationError as error:
+        raise explain(error, place) from None
+    scenario._folders = tuple(_bases(folder, scenario.extends, place))
+    Grid.over(scenario.roi.box, scenario.roi.voxel_m, f"{place}: roi")
+    return scenario
+
+
+def json_schema() -> str:
+    """The JSON Schema that editors use to complete and check a scenario.toml."""
+    return json.dumps(Scenario.model_json_schema(), indent=2, ensure_ascii=False) + "\n"
+
+
+def _lay_over(values: dict[str, Any], override: str) -> None:
+    key, equals, text = override.partition("=")
+    if not equals or not key.strip():
+        raise InputError(f"--set {override}", "no key=value", "for example --set traffic.frames=500")
+    try:
+        value = tomllib.loads(f"v = {text}")["v"]
+    except tomllib.TOMLDecodeError:
+        value = text
+    *parents, last = key.strip().split(".")
+    for parent in parents:
+        values = values.setdefault(parent, {})
+        if not isinstance(values, dict):
+            raise InputError(f"--set {override}", f"'{parent}' is not a table", "a key that the scenario knows")
+    values[last] = value

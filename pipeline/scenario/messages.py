@@ -1,0 +1,51 @@
+"""What is wrong with a scenario, in words: key, value, what would be right."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from pipeline.core.errors import InputError
+from pipeline.scenario.models import Scenario
+
+
+def explain(error: ValidationError, place: str) -> InputError:
+    """One line for each thing that is wrong: key, value, what would be right."""
+    lines = []
+    for item in error.errors():
+        key = ".".join(str(part) for part in item["loc"])
+        if item["type"] == "extra_forbidden":
+            lines.append((key, "unknown key", nearest_key(item["loc"])))
+        elif item["type"] == "missing":
+            lines.append((key, "missing", "this key is needed"))
+        elif item["type"] == "value_error":
+            lines.append((key or "scenario", str(item["ctx"]["error"]), ""))
+        else:
+            lines.append((key, f"{item['input']!r}", item["msg"][0].lower() + item["msg"][1:]))
+    key, found, right = lines[0]
+    more = "".join(f"\n{place}: {k}: {f}" + (f"; {r}" if r else "") for k, f, r in lines[1:])
+    return InputError(f"{place}: {key}", found, right + more)
+
+
+def nearest_key(loc: Sequence[str | int]) -> str:
+    """What the user may have meant by an unknown key."""
+    model: type[BaseModel] | None = Scenario
+    for part in loc[:-1]:
+        if model is not None and part in model.model_fields:
+            model = _model_of(model.model_fields[str(part)].annotation)
+    known = sorted(model.model_fields) if model is not None else []
+    near = difflib.get_close_matches(str(loc[-1]), known, 1, 0.5)
+    return f"did you mean {near[0]}?" if near else f"known here are {', '.join(known)}"
+
+
+def _model_of(annotation: Any) -> type[BaseModel] | None:
+    """The model inside an annotation such as ``tuple[SiteLine, ...]`` or ``SiteGrid | None``."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    for inner in getattr(annotation, "__args__", ()):
+        if found := _model_of(inner):
+            return found
+    return None

@@ -1,0 +1,191 @@
+"""What does a scenario say, and is it sound?
+
+A scenario is a folder with a ``scenario.toml`` and the files that it names. The frozen models below are its only
+definition: each key with its unit in its name, each default written once. ``data_schemas/scenario.schema.json`` is made
+from them.
+
+Steps of :func:`load`: read the TOML file, lay the ``--set`` overrides over it, validate. Files that it names are
+found relative to the folder; ``$SUMO_HOME/`` in front names a file that SUMO ships.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import (
+    Field,
+    PrivateAttr,
+    model_validator,
+)
+
+from pipeline.core.errors import InputError
+from pipeline.core.grid import Grid, Roi
+from pipeline.core.models import StrictModel
+from pipeline.core.sumo_home import sumo_home
+from pipeline.scenario.sensors import SensorModel
+from pipeline.scenario.traffic import TrafficModel
+from pipeline.scenario.types import Name, Point2, Point3, Positive
+
+FILE = "scenario.toml"
+_SUMO = "$SUMO_HOME/"
+
+
+class RoiModel(StrictModel):
+    """The region of interest, a box in the world frame, and the voxels that it is cut into."""
+
+    center_m: Point3 = Field(description="Centre of the box, world frame (x east, y north, z up)")
+    size_m: tuple[Positive, Positive, Positive] = Field(description="Size along x, y, z; a whole number of voxels each")
+    voxel_m: Positive = Field(0.25, description="Edge length of a voxel")
+
+    @property
+    def box(self) -> Roi:
+        """The box alone, without voxels."""
+        return Roi.around(self.center_m, self.size_m)
+
+    @property
+    def grid(self) -> Grid:
+        """The box cut into voxels; raises InputError when they do not fit."""
+        return Grid.over(self.box, self.voxel_m)
+
+
+class MeshModel(StrictModel):
+    """A triangle mesh that trimesh loads (PLY, OBJ, STL, GLB), in metres, z up."""
+
+    file: str
+    offset_m: Point3 = Field((0.0, 0.0, 0.0), description="Added to every vertex to reach the world frame")
+    kind: Name = Field("mesh", description="Shown in messages and in the report")
+
+
+class StaticsModel(StrictModel):
+    """The static world."""
+
+    footprints: tuple[str, ...] = Field(
+        (), description="GeoJSON files in world-frame metres; features have height_m and may have base_m, radius_m"
+    )
+    polygons: tuple[str, ...] = Field((), description="SUMO .poly.xml files")
+    polygon_height_m: Positive = Field(9.0, description="Height of polygons that name none")
+    meshes: tuple[MeshModel, ...] = ()
+    ground: bool = Field(True, description="A ground plane at z = 0")
+
+
+class TpogModel(StrictModel):
+    """How frames are counted."""
+
+    blocks: int = Field(10, ge=1, le=65535, description="Blocks of consecutive frames; divides traffic.frames")
+
+
+class SiteGrid(StrictModel):
+    """Sites on a square lattice."""
+
+    low_m: Point2 = Field(description="South-west corner, where the first site stands")
+    high_m: Point2 = Field(description="No site beyond this corner")
+    spacing_m: Positive
+    heights_m: tuple[Positive, ...] = Field(min_length=1)
+
+
+class SiteLine(StrictModel):
+    """Sites along a line, the first at its start."""
+
+    line_m: tuple[Point2, ...] = Field(min_length=2)
+    spacing_m: Positive
+    heights_m: tuple[Positive, ...] = Field(min_length=1)
+
+
+class SitesModel(StrictModel):
+    """Candidate sites: a file, or a rule. Pose and sensor below hold for every site that names none of its own."""
+
+    file: str | None = Field(None, description="CSV (site, x_m, y_m, z_m, ...) or GeoJSON points")
+    grid: SiteGrid | None = None
+    along: tuple[SiteLine, ...] = ()
+    points: str | None = Field(
+        None, description="A measured empty scan (PCD, PLY, LAS, LAZ, CSV; world frame) of the only site"
+    )
+    sensor: str = Field("VLP-32C", description="A name from `egvs sensors` or from [sensors]")
+    yaw_deg: float = Field(0.0, description="The sensor's x axis, counter-clockwise from +x")
+    pitch_deg: float = Field(0.0, ge=-90, le=90, description="Nose up positive")
+    roll_deg: float = 0.0
+
+    @model_validator(mode="after")
+    def _one_source(self) -> SitesModel:
+        given = [key for key in ("file", "grid", "along") if getattr(self, key)]
+        if len(given) != 1:
+            raise ValueError(f"exactly one of file, grid and along is needed, found {' and '.join(given) or 'none'}")
+        return self
+
+
+class ScanModel(StrictModel):
+    """How empty scans are kept."""
+
+    keep: bool = Field(
+        True, description="false: no scans.parquet; score casts as it goes, for sweeps over thousands of sites"
+    )
+
+
+class ScoreModel(StrictModel):
+    """How a site is scored."""
+
+    gamma: float = Field(
+        10.0, ge=0, allow_inf_nan=True, description="Beams in a voxel above this number count no more; may be inf"
+    )
+    keep_visibility: tuple[str, ...] | Literal["all"] = Field(
+        (), description="Sites whose hits in every voxel are written to visibility.parquet"
+    )
+    standard_error: bool = Field(True, description="Say how far each score may be off because the traffic was short")
+
+
+class Scenario(StrictModel):
+    """Everything that a run depends on. Made by :func:`load`."""
+
+    name: Name = Field("", min_length=0, validate_default=False, description="Defaults to the folder's name")
+    description: str = ""
+    extends: str = Field(
+        "", description="A scenario folder whose keys hold where this one says nothing; tables merge, lists replace"
+    )
+    seed: int = Field(0, ge=0, le=2**63 - 1, description="The one seed; all randomness derives from it")
+    roi: RoiModel
+    traffic: TrafficModel
+    statics: StaticsModel = StaticsModel()
+    tpog: TpogModel = TpogModel()
+    sites: SitesModel
+    sensors: dict[str, SensorModel] = Field(default_factory=dict)
+    scan: ScanModel = ScanModel()
+    score: ScoreModel = ScoreModel()
+    effects: dict[str, dict[str, Any]] = Field(
+        default_factory=dict, description="What goes beyond the plain scene; `egvs effects` prints names and parameters"
+    )
+
+    _folders: tuple[Path, ...] = PrivateAttr(default=(Path(),))
+
+    @model_validator(mode="after")
+    def _across(self) -> Scenario:
+        if self.traffic.frames % self.tpog.blocks:
+            raise ValueError(f"tpog.blocks = {self.tpog.blocks} does not divide traffic.frames = {self.traffic.frames}")
+        return self
+
+    @property
+    def folder(self) -> Path:
+        """The folder that relative file names start from."""
+        return self._folders[0]
+
+    @property
+    def file(self) -> Path:
+        """The scenario file, for messages."""
+        return self.folder / FILE
+
+    def with_effects(self, effects: dict[str, dict[str, Any]]) -> Scenario:
+        """The same scenario with these effects instead of its own."""
+        other = self.model_copy(update={"effects": effects})
+        other._folders = self._folders
+        return other
+
+    def find(self, name: str, key: str) -> Path:
+        """The file that the scenario, or one that it extends, names under ``key``; InputError when it is not there."""
+        folders = (sumo_home(),) if name.startswith(_SUMO) else self._folders
+        for folder in folders:
+            if (path := folder / name.removeprefix(_SUMO)).is_file():
+                return path
+        shown = folders[0] / name.removeprefix(_SUMO)
+        raise InputError(
+            f"{self.file}: {key} = {name!r}", f"no such file ({shown})", "a path relative to the scenario's folder"
+        )

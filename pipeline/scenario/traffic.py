@@ -1,0 +1,107 @@
+"""The keys of ``[traffic]``: where vehicles come from, how many, how long they are watched."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from pipeline.core.models import StrictModel
+from pipeline.scenario.types import Name, Positive
+
+
+class VehicleKind(StrictModel):
+    """One row of the fleet: a SUMO vType with its real size and its share of the trips."""
+
+    name: Name = Field(description="Identifier of the SUMO vType; for a finished FCD file, the type that it names")
+    vclass: str = Field("passenger", description="SUMO vClass")
+    share: Positive = Field(1.0, description="Share of the trips, relative to the other kinds")
+    length_m: Positive
+    width_m: Positive
+    height_m: Positive
+    attributes: dict[str, str | float] = Field(
+        default_factory=dict, description="Further attributes of the SUMO vType, under SUMO's own names"
+    )
+
+
+_FLEET = (
+    VehicleKind(name="car", share=0.78, length_m=4.5, width_m=1.75, height_m=1.5),
+    VehicleKind(name="van", vclass="delivery", share=0.12, length_m=4.9, width_m=1.9, height_m=2.1),
+    VehicleKind(name="truck", vclass="truck", share=0.07, length_m=7.6, width_m=2.3, height_m=3.0),
+    VehicleKind(name="bus", vclass="bus", share=0.03, length_m=10.9, width_m=2.5, height_m=3.1),
+)
+
+
+class TrafficModel(StrictModel):
+    """Where vehicles come from: a network (with drawn or given demand), a SUMO configuration, or a finished FCD
+    file."""
+
+    network: str | None = Field(
+        None, description="A .net.xml(.gz) or an OpenStreetMap file; may start with $SUMO_HOME/"
+    )
+    routes: tuple[str, ...] = Field(
+        (), description="Route files for the network; none: trips are drawn between its fringe edges"
+    )
+    sumocfg: str | None = Field(None, description="A .sumocfg that names network and demand")
+    fcd: str | None = Field(
+        None, description="A finished FCD file (XML, CSV or Parquet, may be gzipped); nothing is simulated"
+    )
+    vehicles: int = Field(50, ge=1, description="Vehicles in the whole network at all times")
+    hold: Literal["exactly", "at_most"] = Field(
+        "exactly", description="Whether a frame with fewer vehicles is an error"
+    )
+    frames: int = Field(5000, ge=1, le=2**32 - 1, description="Frames to record")
+    frame_period_s: Positive = Field(1.0, description="Time between two frames; a whole number of steps")
+    step_s: Positive = Field(0.25, description="SUMO's step length")
+    warmup_s: float = Field(300.0, ge=0, description="Time before the first frame")
+    lateral_resolution_m: float = Field(
+        0.8, ge=0, description="SUMO's sublane width; 0 makes lane changes instant jumps"
+    )
+    trips_per_s: Positive = Field(
+        2.0, description="Rate of drawn trips; more than the network takes, so that N is held"
+    )
+    max_depart_delay_s: Positive = Field(120.0, description="A trip that could not start for so long is given up")
+    min_trip_m: float = Field(0.0, ge=0, description="Drawn trips are at least so long as the crow flies")
+    edge_weights: dict[str, Annotated[float, Field(ge=0)]] = Field(
+        default_factory=dict,
+        description="Drawn trips that start or end at an edge, relative to others; its number of lanes if not named",
+    )
+    kinds: tuple[VehicleKind, ...] = Field(
+        _FLEET, min_length=1, description="The fleet of drawn trips; the sizes in a finished FCD file"
+    )
+
+    @model_validator(mode="after")
+    def _one_source(self) -> TrafficModel:
+        given = [key for key in ("network", "sumocfg", "fcd") if getattr(self, key) is not None]
+        if len(given) != 1:
+            raise ValueError(
+                f"exactly one of network, sumocfg and fcd is needed, found {' and '.join(given) or 'none'}"
+            )
+        names = [kind.name for kind in self.kinds]
+        if len(set(names)) != len(names):
+            raise ValueError(
+                f"two kinds have the same name: {', '.join(sorted({n for n in names if names.count(n) > 1}))}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _not_endless(self) -> TrafficModel:
+        lasts_s = self.warmup_s + self.frames * self.frame_period_s
+        for what, amount, most in (
+            ("frames", self.frames, 10_000_000),
+            ("seconds of traffic", lasts_s, 1e7),
+            ("drawn trips (trips_per_s times these seconds)", lasts_s * self.trips_per_s, 1e7),
+        ):
+            if amount > most:
+                raise ValueError(f"{amount:,.0f} {what}: at most {most:,.0f} can be handled")
+        return self
+
+    def idle_keys(self) -> tuple[str, set[str]]:
+        """The source of the traffic, and the keys that the user set although they act on nothing with this source."""
+        drawn = {"trips_per_s", "min_trip_m", "edge_weights", "kinds"}
+        simulated = {"vehicles", "hold", "step_s", "lateral_resolution_m", "max_depart_delay_s"}
+        if self.fcd is not None:
+            return "fcd", self.model_fields_set & ({"routes"} | simulated | drawn - {"kinds"})
+        if self.sumocfg is not None:
+            return "sumocfg", self.model_fields_set & ({"routes"} | drawn)
+        return "routes", self.model_fields_set & (drawn if self.routes else set())

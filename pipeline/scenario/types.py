@@ -1,0 +1,17 @@
+"""Kinds of values that a scenario holds: lengths, points, names."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+FARTHEST_M = 1e8
+"""Coordinates beyond this are a mistake: the Earth is 4e7 m round."""
+
+Positive = Annotated[float, Field(gt=0)]
+Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
+NotNegative = Annotated[float, Field(ge=0)]
+Point2 = tuple[Coordinate, Coordinate]
+Point3 = tuple[Coordinate, Coordinate, Coordinate]
+Name = Annotated[str, Field(min_length=1, pattern=r"^[^\s/\\:*?\"<>|]+$")]

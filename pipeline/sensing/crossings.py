@@ -1,0 +1,78 @@
+"""Which voxels does each beam of a site cross, and at which range?
+
+Where effects weight beams, counting is not enough: every crossing is listed with its range, a few thousand pieces at a
+time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.core.grid import Grid
+from pipeline.kernels import crossings as kernels
+
+_ROWS = 2048  # beams listed at once: bounds the memory
+
+
+@dataclass(frozen=True)
+class Crossings:
+    """Crossings of some beam pieces of one site, piece after piece, along each.
+
+    Attributes
+    ----------
+    site
+        What the scan's metadata says of the site.
+    grid
+        The grid of the voxels.
+    rows
+        Which pieces of the scan these are, as a slice of its rows.
+    first
+        Crossings first[i] to first[i + 1] belong to piece i, (rows + 1,) int64.
+    ends_m
+        Where each piece ends seen from the sensor, (rows, 3) float64.
+    cells
+        Flat index of the voxel of each crossing, (k,) int64.
+    enter_m, leave_m
+        Range from the sensor where the piece enters and leaves the voxel, (k,) float64.
+    """
+
+    site: dict[str, Any]
+    grid: Grid
+    rows: slice
+    first: NDArray[np.int64]
+    ends_m: NDArray[np.float64]
+    cells: NDArray[np.int64]
+    enter_m: NDArray[np.float64]
+    leave_m: NDArray[np.float64]
+
+    @property
+    def middle_m(self) -> NDArray[np.float64]:
+        """Range of the middle of each chord, (k,) float64."""
+        return 0.5 * (self.enter_m + self.leave_m)
+
+    @property
+    def piece(self) -> NDArray[np.int64]:
+        """The piece of each crossing, (k,) int64, from 0."""
+        return np.repeat(np.arange(len(self.first) - 1), np.diff(self.first))
+
+
+def listed(site: dict[str, Any], ends_m: NDArray[np.float64], grid: Grid) -> Iterator[Crossings]:
+    """All crossings of a site's beams, a few thousand beams at a time."""
+    position_m = np.array([site["x_m"], site["y_m"], site["z_m"]])
+    o = grid.to_grid_m(position_m) / grid.voxel_m
+    shape = np.asarray(grid.shape, dtype=np.int64)
+    for start in range(0, len(ends_m), _ROWS):
+        rows = slice(start, min(start + _ROWS, len(ends_m)))
+        ends = ends_m[rows]
+        first = np.zeros(len(ends) + 1, dtype=np.int64)
+        nothing = np.empty(0, dtype=np.int64), np.empty(0), np.empty(0)
+        kernels.crossings(o, ends / grid.voxel_m, shape, grid.voxel_m, first, *nothing)
+        np.cumsum(first, out=first)
+        total = int(first[-1])
+        cells, enter, leave = np.empty(total, dtype=np.int64), np.empty(total), np.empty(total)
+        kernels.crossings(o, ends / grid.voxel_m, shape, grid.voxel_m, first, cells, enter, leave)
+        yield Crossings(site, grid, rows, first, ends, cells, enter, leave)

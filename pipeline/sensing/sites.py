@@ -1,0 +1,184 @@
+"""Where could a sensor stand?
+
+Candidate sites come from a CSV, a GeoJSON file, or a rule (a lattice, or along lines). Each has a position in the world
+frame in metres, a pose in degrees, and a sensor; what a site does not name is taken from the scenario's ``[sites]``.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.core.errors import InputError
+from pipeline.scenario.models import Scenario, SiteGrid, SiteLine
+from pipeline.scenario.types import FARTHEST_M
+
+_NEEDED = ("site", "x_m", "y_m", "z_m")
+_POSE = ("yaw_deg", "pitch_deg", "roll_deg")
+_TEXTS = ("sensor", "points")
+_NAME = re.compile(r"[^/\\\x00-\x1f]{1,80}")  # becomes part of file names
+
+
+@dataclass(frozen=True)
+class Site:
+    """A candidate: position in the world frame (metres), pose (degrees), sensor, and the file of a measured scan if
+    any."""
+
+    site: str
+    x_m: float
+    y_m: float
+    z_m: float
+    yaw_deg: float
+    pitch_deg: float
+    roll_deg: float
+    sensor: str
+    points: str | None = None
+
+    @property
+    def position_m(self) -> tuple[float, float, float]:
+        """(x, y, z) in the world frame."""
+        return self.x_m, self.y_m, self.z_m
+
+    def to_json(self) -> dict[str, Any]:
+        """Name, pose and sensor, as the artefacts' metadata holds them."""
+        return {key: value for key, value in asdict(self).items() if key != "points"}
+
+
+def of(scenario: Scenario) -> tuple[Site, ...]:
+    """All candidate sites of a scenario, in the order of the file or the rule.
+
+    Raises
+    ------
+    InputError
+        Naming file and row: a missing or unknown column, a value that is no finite number, a name used twice.
+    """
+    model = scenario.sites
+    if model.file is not None:
+        path = scenario.find(model.file, "sites.file")
+        rows = _geojson(path) if path.suffix.lower() in (".geojson", ".json") else _csv(path)
+    else:
+        path = scenario.file
+        rows = _lattice(model.grid) if model.grid is not None else _lines(model.along)
+    found: dict[str, Site] = {}
+    for place, row in rows:
+        site = _site(place, row, scenario)
+        if site.site in found:
+            raise InputError(place, f"site {site.site!r} stands there twice", "a name of its own for each site")
+        found[site.site] = site
+    if not found:
+        raise InputError(path, "holds no site", "at least one")
+    keep = scenario.score.keep_visibility
+    for name in () if keep == "all" else keep:
+        if name not in found:
+            raise InputError(
+                f"{scenario.file}: score.keep_visibility", f"no site {name!r}", f"one of {', '.join(found)}, or 'all'"
+            )
+    return _with_points(tuple(found.values()), scenario)
+
+
+def _with_points(sites: tuple[Site, ...], scenario: Scenario) -> tuple[Site, ...]:
+    points = scenario.sites.points
+    if points is None:
+        return sites
+    if len(sites) != 1:
+        raise InputError(f"{scenario.file}: sites.points", f"one measured scan for {len(sites)} sites",
+                         "a column 'points' in the sites file, or a single site")  # fmt: skip
+    return (Site(**{**asdict(sites[0]), "points": points}),)
+
+
+def _site(place: str, row: dict[str, Any], scenario: Scenario) -> Site:
+    unknown = sorted(set(row) - {*_NEEDED, *_POSE, *_TEXTS})
+    if unknown:
+        raise InputError(place, f"unknown column {unknown[0]!r}", f"{', '.join((*_NEEDED, *_POSE, *_TEXTS))}")
+    for key in _NEEDED:
+        if row.get(key) in (None, ""):
+            raise InputError(place, f"{key} is missing", f"the columns {', '.join(_NEEDED)}")
+    values: dict[str, Any] = {"site": str(row["site"]).strip()}
+    if not _NAME.fullmatch(values["site"]):
+        raise InputError(f"{place}: site", f"{values['site'][:80]!r}", "a name of up to 80 characters without / and \\")
+    for key in (*_NEEDED[1:], *_POSE):
+        value = row.get(key)
+        values[key] = _number(place, key, getattr(scenario.sites, key) if value in (None, "") else value)
+    if not -90 <= values["pitch_deg"] <= 90:
+        raise InputError(f"{place}: pitch_deg", f"{values['pitch_deg']:g}", "between -90 and 90, nose up positive")
+    values["sensor"] = str(row.get("sensor") or scenario.sites.sensor).strip()
+    values["points"] = str(row["points"]).strip() if row.get("points") else None
+    return Site(**values)
+
+
+def _number(place: str, key: str, value: Any) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not abs(number) <= FARTHEST_M or isinstance(value, bool):
+        raise InputError(f"{place}: {key}", f"{value!r}", f"a finite number, at most {FARTHEST_M:g}")
+    return number
+
+
+def _csv(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            rows = csv.DictReader(file, skipinitialspace=True)
+            names = list(rows.fieldnames or ())
+            if twice := sorted({name for name in names if names.count(name) > 1}):
+                raise InputError(path, f"the column {twice[0]!r} stands there twice", "each column once")
+            for row in rows:
+                place = f"{path}: row {row.get('site') or '?'}"
+                if None in row or None in row.values():
+                    raise InputError(
+                        place, "has more or fewer values than the header has columns", "one value a column"
+                    )
+                yield place, dict(row)
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(path, f"cannot be read as CSV ({error})", "UTF-8 text with a header row") from None
+
+
+def _geojson(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    try:
+        features = json.loads(path.read_text(encoding="utf-8"))["features"]
+        for number, feature in enumerate(features):
+            place = f"{path}: feature {number}"
+            geometry, properties = feature["geometry"], dict(feature.get("properties") or {})
+            if geometry["type"] != "Point":
+                raise InputError(place, f"is a {geometry['type']}", "a Point")
+            row = dict(zip(("x_m", "y_m", "z_m"), geometry["coordinates"], strict=False))
+            name = properties.pop("name", None)
+            yield place, {"site": name, **row, **properties}
+    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, ValueError, RecursionError) as error:
+        raise InputError(path, f"cannot be read as GeoJSON ({error})", "a FeatureCollection of Points") from None
+
+
+def _lattice(rule: SiteGrid) -> Iterator[tuple[str, dict[str, Any]]]:
+    axes = []
+    for low, high in zip(rule.low_m, rule.high_m, strict=True):
+        count = math.floor((high - low) / rule.spacing_m + 1e-9) + 1
+        axes.append([low + i * rule.spacing_m for i in range(count)])
+    spots = [(x, y) for y in axes[1] for x in axes[0]]
+    yield from _named("g", [(x, y, z) for x, y in spots for z in rule.heights_m], "sites.grid")
+
+
+def _lines(rules: tuple[SiteLine, ...]) -> Iterator[tuple[str, dict[str, Any]]]:
+    spots = []
+    for rule in rules:
+        line = np.asarray(rule.line_m)
+        along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+        where = np.arange(math.floor(along[-1] / rule.spacing_m + 1e-9) + 1) * rule.spacing_m
+        xs, ys = np.interp(where, along, line[:, 0]), np.interp(where, along, line[:, 1])
+        spots += [(float(x), float(y), z) for x, y in zip(xs, ys, strict=True) for z in rule.heights_m]
+    yield from _named("a", spots, "sites.along")
+
+
+def _named(letter: str, spots: list[tuple[float, float, float]], place: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    width = max(2, len(str(len(spots))))
+    for number, (x, y, z) in enumerate(spots, start=1):
+        name = f"{letter}{number:0{width}d}"
+        yield f"{place}: {name}", {"site": name, "x_m": x, "y_m": y, "z_m": z}

@@ -1,0 +1,269 @@
+r"""Which settings does the accuracy study try?
+
+One knob at a time around the scenario's own setting, and a small full grid of those that cost most. Two kinds, which
+are never mixed: a setting that *approximates* the scenario's number more or less well (how long and how finely traffic
+is watched, how coarsely SUMO steps, beams thinned and weighted up, the quality of an effect), and one that *measures*
+something else (voxel, gamma, without an effect that is named, with one that is not). Effects that are not named are
+tried where they need no number of the user's (a rate of rain, a sensor's rated range) and change something in this
+scene.
+
+Every setting is a list of ``--set`` overrides, so that what the study recommends can be typed. Thinned beams need no
+code of their own: with every f-th beam a voxel has hits n, weighted up f n, and :math:`\min(\gamma, f n) = f
+\min(\gamma / f, n)`; so gamma is divided by f, and the share of ``egvs_limit`` stays exactly what it is with weights.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from pipeline.core.errors import InputError
+from pipeline.core.grid import Grid
+from pipeline.effects import registry as effects
+from pipeline.scenario.models import Scenario
+from pipeline.scenario.traffic import TrafficModel
+from pipeline.sensing import sites
+from pipeline.sensing.sensors import Sensor, resolve
+from pipeline.stages import statics
+
+APPROXIMATES, MEASURES, REFERENCE, SCENARIO = "approximates", "measures", "reference", "scenario"
+WITHOUT, WITH = "without ", "with "
+"""How the names of settings begin that leave out an effect, or switch one on."""
+
+FRAMES = (250, 500, 1000, 2500)
+LONGER = (2, 4, 8)
+"""Times the scenario's own traffic."""
+PERIODS_S = (0.5, 1.0, 2.0)
+STEPS_S = (0.05, 0.1, 0.5, 1.0)
+THINNED = (2, 4)
+VOXELS_M = (1.0, 0.5, 0.25, 0.125)
+GAMMAS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
+GRID_LONGER, GRID_WATCHED_S = (1, 4, 8, 16), ((None, None), (None, 1.0), (0.5, 1.0), (1.0, 1.0))
+"""The grid: lengths of the traffic, and pairs of SUMO step and frame period (None: the scenario's)."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One setting of the study.
+
+    Attributes
+    ----------
+    name
+        What distinguishes it, in words; unique.
+    kind, knob
+        ``APPROXIMATES`` or ``MEASURES``, and which knob is turned.
+    overrides
+        As after ``--set``.
+    without
+        An effect that is left out.
+    weight
+        What each beam stands for, where beams are thinned.
+    beside
+        The setting with the same traffic that shows what the knob alone does.
+    steps
+        SUMO's steps, where traffic is simulated anew.
+    """
+
+    name: str
+    kind: str
+    knob: str
+    overrides: tuple[str, ...] = ()
+    without: str | None = None
+    weight: float = 1.0
+    beside: str = SCENARIO
+    steps: float = 0.0
+
+
+def reference(scenario: Scenario, times: int) -> Setting:
+    """The scenario with its traffic watched for ``times`` as long."""
+    frames = scenario.traffic.frames * times
+    return Setting(REFERENCE, REFERENCE, "frames", (f"traffic.frames={frames}",) if times > 1 else ())
+
+
+def is_default(scenario: Scenario, own: Scenario) -> bool:
+    """Whether traffic is watched as a scenario that says nothing about it has it, and all else is as in ``own``."""
+    defaults = {key: TrafficModel.model_fields[key].default for key in ("frames", "frame_period_s", "step_s")}
+    return own.traffic.fcd is None and scenario == own.model_copy(
+        update={"traffic": own.traffic.model_copy(update=defaults)}
+    )
+
+
+def settings(scenario: Scenario) -> list[Setting]:
+    """All settings but the reference, the scenario's own first; the cheap and telling ones before the others."""
+    found = [Setting(SCENARIO, SCENARIO, "")]
+    watched = sorted(_watched(scenario), key=lambda setting: setting.steps)
+    for setting in (*_measures(scenario), *_quality(scenario), *_thinned(scenario), *watched):
+        if setting.overrides not in [other.overrides for other in found if other.without == setting.without]:
+            found.append(setting)
+    return found
+
+
+def _watched(scenario: Scenario) -> Iterator[Setting]:
+    """How long and how finely traffic is watched."""
+    own, blocks = scenario.traffic, scenario.tpog.blocks
+    for frames in FRAMES:
+        if frames < own.frames and frames % blocks == 0:
+            yield Setting(f"{frames} frames", APPROXIMATES, "frames", (f"traffic.frames={frames}",))
+    for period_s in PERIODS_S:
+        yield from _traffic(scenario, "period", 1, None, period_s)
+    if own.fcd is not None:
+        return
+    for step_s in STEPS_S:
+        yield from _traffic(scenario, "step", 1, step_s, _period_with(step_s, own.frame_period_s))
+    for times in LONGER:
+        yield from _traffic(scenario, "frames", times, None, None)
+    for times in GRID_LONGER:
+        for step, period in GRID_WATCHED_S:
+            yield from _traffic(scenario, "grid", times, step, period)
+
+
+def _period_with(step_s: float, period_s: float) -> float | None:
+    """The frame period nearest to the scenario's that a step divides; None for the scenario's own."""
+    if _divides(step_s, period_s):
+        return None
+    return max(1, int(period_s / step_s)) * step_s
+
+
+def _traffic(
+    scenario: Scenario, knob: str, times: int, step_s: float | None, period_s: float | None
+) -> Iterator[Setting]:
+    """Traffic ``times`` as long as the scenario's, stepped and watched so; nothing where times do not divide one
+    another."""
+    own, blocks = scenario.traffic, scenario.tpog.blocks
+    step, period = step_s or own.step_s, period_s or own.frame_period_s
+    frames = round(own.frames * own.frame_period_s * times / period / blocks) * blocks
+    simulated = own.fcd is None
+    if frames == 0 or (simulated and not (_divides(step, period) and _divides(step, own.warmup_s))):
+        return
+    name, overrides = f"{frames} frames", []
+    if frames != own.frames:
+        overrides.append(f"traffic.frames={frames}")
+    if period != own.frame_period_s:
+        name += f" every {period:g} s"
+        overrides.append(f"traffic.frame_period_s={float(f'{period:.6g}')}")
+    if step != own.step_s:
+        name += f", step {step:g} s"
+        overrides.append(f"traffic.step_s={step}")
+    if overrides:
+        steps = (own.warmup_s + frames * period) / step
+        yield Setting(name, APPROXIMATES, knob, tuple(overrides), steps=steps)
+
+
+def _divides(part: float, whole: float) -> bool:
+    return abs(whole / part - round(whole / part)) < 1e-9
+
+
+def _thinned(scenario: Scenario) -> Iterator[Setting]:
+    """Every second and fourth azimuth, every second channel; weighted up."""
+    where = sites.of(scenario)
+    if any(site.points is not None for site in where):
+        return
+    used = [
+        resolve(name, scenario.sensors, f"{scenario.file}: sensors")
+        for name in dict.fromkeys(site.sensor for site in where)
+    ]
+    for factor in THINNED:
+        if all(sensor.azimuths % factor == 0 for sensor in used):
+            changes = [o for s in used for o in _sensor(scenario, s, factor, range(s.channels))]
+            yield _weighted(scenario, f"every {_ordinal(factor)} azimuth", "azimuth", changes, float(factor))
+    kept = [sorted(range(s.channels), key=lambda ring, s=s: s.elevations_deg[ring])[::2] for s in used]  # type: ignore[misc]
+    weights = {s.channels / len(rings) for s, rings in zip(used, kept, strict=True)}
+    if len(weights) == 1 and weights != {1.0}:
+        changes = [o for s, rings in zip(used, kept, strict=True) for o in _sensor(scenario, s, 1, rings)]
+        yield _weighted(scenario, "every 2nd channel", "channels", changes, weights.pop())
+
+
+def _weighted(scenario: Scenario, name: str, knob: str, changes: list[str], weight: float) -> Setting:
+    gamma = f"score.gamma={scenario.score.gamma / weight}"
+    return Setting(name, APPROXIMATES, knob, (*changes, gamma), weight=weight)
+
+
+def _ordinal(factor: int) -> str:
+    return "2nd" if factor == 2 else f"{factor}th"
+
+
+def _sensor(scenario: Scenario, sensor: Sensor, factor: int, rings: range | list[int]) -> Iterator[str]:
+    """Overrides that make a sensor of the same name with fewer beams."""
+    own = scenario.sensors.get(sensor.name)
+    step = own.azimuth_step_deg if own is not None else 360.0 / sensor.azimuths
+    values: dict[str, object] = {"azimuth_step_deg": step * factor}
+    if len(rings) < sensor.channels or own is None:
+        values["elevations_deg"] = [sensor.elevations_deg[r] for r in rings]
+        values["azimuth_offsets_deg"] = [sensor.azimuth_offsets_deg[r] for r in rings]
+        values["channels"] = len(rings)
+    if own is None:
+        values["range_m"] = sensor.range_m
+    if own is None and scenario.effects:
+        optics = {
+            name: getattr(sensor, name)
+            for name in ("wavelength_nm", "divergence_mrad", "rated_range_m", "rated_reflectivity")
+        }
+        values |= {name: list(v) if isinstance(v, tuple) else v for name, v in optics.items() if v is not None}
+    for key, value in values.items():
+        yield f"sensors.{sensor.name}.{key}={json.dumps(value)}"
+
+
+def _measures(scenario: Scenario) -> Iterator[Setting]:
+    """Other voxels (with gamma as it is, and scaled by the face of a voxel), other caps, without an effect."""
+    own, gamma = scenario.roi.voxel_m, scenario.score.gamma
+    for voxel_m in VOXELS_M:
+        if voxel_m == own or not _fits(scenario, voxel_m):
+            continue
+        yield Setting(f"voxel {voxel_m:g} m", MEASURES, "voxel", (f"roi.voxel_m={voxel_m}",))
+        scaled = gamma * (voxel_m / own) ** 2
+        if scaled != gamma:
+            overrides = (f"roi.voxel_m={voxel_m}", f"score.gamma={scaled}")
+            yield Setting(f"voxel {voxel_m:g} m, gamma {scaled:g}", MEASURES, "voxel and gamma", overrides)
+    for cap in GAMMAS:
+        if cap != gamma:
+            yield Setting(f"gamma {cap:g}", MEASURES, "gamma", (f"score.gamma={cap}",))
+    for name in scenario.effects:
+        yield Setting(f"{WITHOUT}{name}", MEASURES, "effect", (), without=name)
+    for name in _others(scenario):
+        yield Setting(f"{WITH}{name}", MEASURES, "effect", (f"effects.{name}={{}}",))
+
+
+def _others(scenario: Scenario) -> Iterator[str]:
+    """Effects that are not named, need no parameter, and would act."""
+    place, scene = f"{scenario.file}: effects", None
+    for name in effects.KINDS:
+        if name in scenario.effects or name == effects.SELF_ACTING or effects.needs(name):
+            continue
+        scene = scene or effects.Scene(scenario, statics.build(scenario, statics.Tally.empty()), sites.of(scenario))
+        effect = effects.make(name, {}, place)
+        if effect.idle(scene) is None and effect.lacks(scene) is None:
+            yield name
+
+
+def _fits(scenario: Scenario, voxel_m: float) -> bool:
+    try:
+        Grid.over(scenario.roi.box, voxel_m, "")
+    except InputError:
+        return False
+    return True
+
+
+def _takes(name: str, parameters: dict[str, object]) -> bool:
+    try:
+        effects.make(name, parameters, "")
+    except InputError:
+        return False
+    return True
+
+
+def _quality(scenario: Scenario) -> Iterator[Setting]:
+    """Each named effect's own knobs, which its class lists from cheap to fine as ``QUALITY``: a value for each
+    parameter."""
+    for name, parameters in scenario.effects.items():
+        effect = effects.make(name, dict(parameters), f"{scenario.file}: effects")
+        for key, values in effect.QUALITY.items():
+            own = getattr(effect.parameters, key)
+            if not _takes(name, {**parameters, key: values[0]}):  # a knob of another method
+                continue
+            finest = SCENARIO if values[-1] == own else f"{name} {key} {values[-1]}"
+            for value in reversed(values):
+                if value != own:
+                    overrides = (f"effects.{name}.{key}={json.dumps(value)}",)
+                    beside = SCENARIO if value == values[-1] else finest
+                    yield Setting(f"{name} {key} {value}", APPROXIMATES, name, overrides, beside=beside)

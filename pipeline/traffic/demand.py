@@ -1,0 +1,189 @@
+"""Which trips are drawn when the scenario names a network but no routes?
+
+Steps: for each kind of vehicle, find the pairs of edges that a trip may join; draw, for each departure, a kind by its
+share and one of its pairs by the weights of both ends (their lanes, unless the scenario says otherwise); write trips
+and vTypes as SUMO reads them. SUMO finds the way itself.
+
+A trip starts where nobody can come from elsewhere in the network (the fringe) and ends where nobody can go on; a
+turnaround is no way on. A network without such ends (a loop, a cut-out whose streets all turn back) gets trips between
+any two edges at least a quarter of the network's diagonal apart; the stage's result says so.
+
+Trips are more than the network takes, so that ``--max-num-vehicles`` holds N: the idea is that of SUMO's
+randomTrips.py. All randomness comes from the generator that is passed in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.core.errors import InputError
+from pipeline.scenario.traffic import TrafficModel, VehicleKind
+from pipeline.traffic.network import Network
+
+UPRIGHT = {"maxSpeedLat": "1.0", "lcMaxSpeedLatStanding": "0", "lcMaxSpeedLatFactor": "0.2"}
+"""Without these, cars of the sublane model stand 35 to 47 degrees askew at the stop line (measured)."""
+
+_MAX_ORIGINS = 256
+_FAR_SHARE = 0.25
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Trips that a kind may make: ``origin[i]`` to ``target[i]`` (positions in ``Network.edges``), drawn with
+    ``weight[i]``."""
+
+    origin: NDArray[np.int64]
+    target: NDArray[np.int64]
+    weight: NDArray[np.float64]
+    fringe: bool
+
+
+def pairs(network: Network, kind: VehicleKind, traffic: TrafficModel, rng: np.random.Generator, place: str) -> Pairs:
+    """The trips that ``kind`` may make.
+
+    Raises
+    ------
+    InputError
+        When there is none: the kind may drive nowhere, or no trip is as long as ``min_trip_m``.
+    """
+    lanes = np.array([edge.lanes_for(kind.vclass) for edge in network.edges], dtype=np.float64)
+    if not lanes.any():
+        raise InputError(
+            f"{place}.kinds",
+            f"kind {kind.name!r} (vClass {kind.vclass}) may use no lane of the network",
+            "a kind that the network admits",
+        )
+    min_trip_m, weights = traffic.min_trip_m, _weights(network, lanes, traffic, place)
+    links = network.links(kind.vclass)
+    sources, sinks = _fringe(lanes, links)
+    if not (found := _reachable(network, weights, links, sources, sinks, min_trip_m)).origin.size:
+        far = max(min_trip_m, _FAR_SHARE * network.diagonal_m)
+        anywhere = np.flatnonzero(lanes)
+        some = np.sort(rng.choice(anywhere, min(_MAX_ORIGINS, anywhere.size), replace=False))
+        found = _reachable(network, weights, links, some, anywhere, far, fringe=False)
+    if not found.weight.any():
+        raise InputError(
+            f"{place}.kinds",
+            f"kind {kind.name!r} (vClass {kind.vclass}) can go from no edge to another that is {min_trip_m:g} m away",
+            "a connected network, or a smaller min_trip_m",
+        )
+    return found
+
+
+def _weights(network: Network, lanes: NDArray[np.float64], traffic: TrafficModel, place: str) -> NDArray[np.float64]:
+    """How likely a trip starts or ends at each edge: as the scenario says, else by its lanes for this kind."""
+    index = {edge.id: i for i, edge in enumerate(network.edges)}
+    weights = lanes.copy()
+    for edge, weight in traffic.edge_weights.items():
+        if edge not in index:
+            raise InputError(f"{place}.edge_weights", f"the network has no edge {edge!r}", "the id of an edge")
+        weights[index[edge]] = weight if lanes[index[edge]] else 0.0
+    return weights
+
+
+def _fringe(lanes: NDArray[np.float64], links: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    onward = links[links[:, 2] == 0]
+    usable = lanes > 0
+    entered, left = (np.isin(np.arange(lanes.size), onward[:, column]) for column in (1, 0))
+    return np.flatnonzero(usable & ~entered), np.flatnonzero(usable & ~left)
+
+
+def _reachable(
+    network: Network,
+    weights: NDArray[np.float64],
+    links: NDArray[np.int64],
+    sources: NDArray[np.int64],
+    sinks: NDArray[np.int64],
+    min_trip_m: float,
+    fringe: bool = True,
+) -> Pairs:
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import breadth_first_order
+
+    edges, n = network.edges, weights.size
+    graph = csr_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(n, n))
+    start, end = (np.array([getattr(e, key) for e in edges]) for key in ("start_m", "end_m"))
+    is_sink = np.zeros(n, dtype=bool)
+    is_sink[sinks] = True
+    origins, targets = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    for source in sources:
+        reached = np.sort(breadth_first_order(graph, source, return_predecessors=False)).astype(np.int64)
+        back = np.array([edges[t].to_node == edges[source].from_node for t in reached])
+        far = np.hypot(*(end[reached] - start[source]).T) >= min_trip_m
+        good = reached[is_sink[reached] & (reached != source) & ~back & far]
+        origins.append(np.full(good.size, source))
+        targets.append(good)
+    origin, target = np.concatenate(origins), np.concatenate(targets)
+    return Pairs(origin, target, weights[origin] * weights[target], fringe)
+
+
+def draw(
+    network: Network,
+    kinds: Sequence[VehicleKind],
+    all_pairs: Sequence[Pairs],
+    departs_s: NDArray[np.float64],
+    rng: np.random.Generator,
+) -> list[tuple[str, str, str]]:
+    """For each departure: the name of the kind, the edge where the trip starts, the edge where it ends."""
+    shares = np.array([kind.share for kind in kinds])
+    chosen = rng.choice(len(kinds), size=departs_s.size, p=shares / shares.sum())
+    pick = np.empty(departs_s.size, dtype=np.int64)
+    for index, found in enumerate(all_pairs):
+        mine = chosen == index
+        pick[mine] = rng.choice(found.origin.size, size=int(mine.sum()), p=found.weight / found.weight.sum())
+    return [
+        (kinds[k].name, network.edges[all_pairs[k].origin[i]].id, network.edges[all_pairs[k].target[i]].id)
+        for k, i in zip(chosen, pick, strict=True)
+    ]
+
+
+def trips_xml(trips: Sequence[tuple[str, str, str]], departs_s: NDArray[np.float64]) -> str:
+    """A SUMO route file with one ``<trip>`` a departure."""
+    lines = [
+        f'    <trip id="{index}" depart="{depart:.3f}" from={quoteattr(origin)} to={quoteattr(target)}'
+        f' type={quoteattr(kind)} departLane="best" departSpeed="max"/>'
+        for index, ((kind, origin, target), depart) in enumerate(zip(trips, departs_s, strict=True))
+    ]
+    return "\n".join(["<routes>", *lines, "</routes>", ""])
+
+
+def vtypes_xml(kinds: Sequence[VehicleKind]) -> str:
+    """A SUMO additional file with one ``<vType>`` a kind, with its real size."""
+    lines = []
+    for kind in kinds:
+        values = (
+            {
+                "id": kind.name,
+                "vClass": kind.vclass,
+                "length": kind.length_m,
+                "width": kind.width_m,
+                "height": kind.height_m,
+            }
+            | UPRIGHT
+            | kind.attributes
+        )
+        lines.append(f"    <vType {' '.join(f'{key}={quoteattr(str(value))}' for key, value in values.items())}/>")
+    return "\n".join(["<additional>", *lines, "</additional>", ""])
+
+
+def check_kinds(kinds: Sequence[VehicleKind], vehicle_classes: frozenset[str], place: str) -> None:
+    """Refuse an unknown vClass, and attributes that would contradict the kind's own keys."""
+    for kind in kinds:
+        if kind.vclass not in vehicle_classes:
+            raise InputError(
+                f"{place}.kinds",
+                f"kind {kind.name!r} has the vClass {kind.vclass!r}",
+                f"one of {', '.join(sorted(vehicle_classes))}",
+            )
+        own = sorted({"id", "vClass", "length", "width", "height"} & kind.attributes.keys())
+        if own:
+            raise InputError(
+                f"{place}.kinds",
+                f"kind {kind.name!r} has {', '.join(own)} among its attributes",
+                "name, vclass, length_m, width_m and height_m of the kind",
+            )

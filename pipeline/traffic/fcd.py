@@ -1,0 +1,388 @@
+"""What does a file of floating car data (FCD) say, whatever its format?
+
+Reads what SUMO writes with ``--fcd-output``: CSV, XML or Parquet, each maybe gzipped, told apart by their first bytes.
+Hands out Arrow tables with the columns of :data:`SCHEMA`, piece by piece, so that memory does not grow with the file.
+Then cuts the stream into groups of whole frames.
+
+Positions are SUMO's own: the middle of the front bumper in metres, the angle in degrees clockwise from north, the slope
+in degrees. Times are whole milliseconds, SUMO's own unit. Rows without a vehicle (SUMO writes one for an empty step)
+are left out; so are persons (unless asked for) and containers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from pipeline.core.errors import InputError
+from pipeline.formats import safe_xml as safexml
+from pipeline.scenario.types import FARTHEST_M
+
+SCHEMA = pa.schema(
+    [
+        ("time_ms", pa.int64()),
+        ("id", pa.string()),
+        ("type", pa.string()),
+        ("x", pa.float64()),
+        ("y", pa.float64()),
+        ("z", pa.float64()),
+        ("angle", pa.float64()),
+        ("slope", pa.float64()),
+        ("speed", pa.float64()),
+    ]
+)
+"""Columns of every table here. z and slope are 0 and speed is NaN where the file has none."""
+
+_NEEDED = ("time", "id", "x", "y", "angle", "type")
+_OPTIONAL = {"z": 0.0, "slope": 0.0, "speed": float("nan")}
+_STRINGS = ("id", "type")
+_OTHERS = {"vehicle": ("person_", "container_"), "person": ("vehicle_", "container_", "person_slope")}
+"""Columns that belong to others, or (a person's slope) mean nothing."""
+_BLOCK_BYTES = 1 << 20
+"""Arrow reads dozens of blocks ahead: with 4 MiB they take 150 MB, and reading is no faster."""
+
+_BATCH_ROWS = 1 << 16
+_RIGHT = "FCD with the attributes id, x, y, angle and type (--fcd-output.attributes id,x,y,z,angle,slope,type,speed)"
+
+
+def read(path: Path, who: str = "vehicle") -> Iterator[pa.Table]:
+    """The file's rows in the order of the file, as tables of :data:`SCHEMA`.
+
+    Parameters
+    ----------
+    who
+        ``"vehicle"``, or ``"person"`` for what ``--person-fcd-output`` wrote. A person's slope is left out: people
+        stand upright, and SUMO gives the lane's slope whichever way they walk.
+
+    Raises
+    ------
+    InputError
+        Naming the file and the row: a column is missing, a value is no number, time runs back, the file is damaged.
+    """
+    if not path.is_file():
+        raise InputError(path, "no such file", "a file that SUMO wrote with --fcd-output")
+    with safexml.opened(path) as file:
+        head = file.read(256).lstrip(b"\xef\xbb\xbf \t\r\n")
+    if not head:
+        raise InputError(path, "is empty", _RIGHT)
+    if head.startswith(b"PAR1"):
+        yield from _checked(_parquet(path, who), path, "row")
+    elif head.startswith(b"<"):
+        yield from _checked(_xml(path, who), path, f"{who} element")
+    else:
+        yield from _checked(_csv(path, who), path, "row")
+
+
+def _csv(path: Path, who: str) -> Iterator[pa.RecordBatch]:
+    from pyarrow import csv
+
+    with safexml.opened(path) as file:
+        header = file.readline().decode("utf-8", "replace").lstrip("\ufeff").strip()
+    delimiter = ";" if ";" in header else ","
+    columns = _columns([name.strip('"') for name in header.split(delimiter)], path, who)
+    convert = csv.ConvertOptions(
+        column_types={raw: pa.string() if name in _STRINGS else pa.float64() for name, raw in columns.items()},
+        include_columns=list(columns.values()),
+        null_values=[""],
+        strings_can_be_null=True,
+    )
+    reading = csv.ReadOptions(block_size=_BLOCK_BYTES, use_threads=False)
+    try:
+        with (
+            pa.input_stream(path, compression="gzip" if safexml.is_gzip(path) else None) as stream,
+            csv.open_csv(stream, reading, csv.ParseOptions(delimiter=delimiter), convert) as batches,
+        ):
+            for batch in batches:
+                yield batch.rename_columns(list(columns))
+    except (pa.ArrowInvalid, OSError) as error:
+        raise _damaged(path, "CSV", error) from None
+
+
+def _parquet(path: Path, who: str) -> Iterator[pa.RecordBatch]:
+    import pyarrow.parquet as pq
+
+    with _seekable(path) as source:
+        try:
+            with pq.ParquetFile(source) as file:
+                columns = _columns(file.schema_arrow.names, path, who)
+                for batch in file.iter_batches(_BATCH_ROWS, columns=list(columns.values())):
+                    yield batch.select(list(columns.values())).rename_columns(list(columns))
+        except (pa.ArrowInvalid, OSError) as error:
+            raise _damaged(path, "Parquet", error) from None
+
+
+@contextmanager
+def _seekable(path: Path) -> Iterator[Any]:
+    """Parquet is read from its end, so a gzipped one is unzipped into memory first."""
+    if safexml.is_gzip(path):
+        with safexml.opened(path) as file:
+            yield pa.BufferReader(file.read())
+    else:
+        yield path
+
+
+def _xml(path: Path, who: str) -> Iterator[pa.RecordBatch]:
+    rows: list[dict[str, str]] = []
+    for step in safexml.children(path, "fcd-export"):
+        rows += [{"time": step.get("time", ""), **one.attrib} for one in step.iter(who)]
+        if who == "person":
+            rows = [{key: value for key, value in row.items() if key != "slope"} for row in rows]
+        if len(rows) >= _BATCH_ROWS:
+            yield _xml_batch(rows, path)
+            rows.clear()
+    if rows:
+        yield _xml_batch(rows, path)
+
+
+def _xml_batch(rows: list[dict[str, str]], path: Path) -> pa.RecordBatch:
+    names = [*_NEEDED, *(name for name in _OPTIONAL if name in rows[0])]
+    columns = {name: pa.array([row.get(name) for row in rows], type=pa.string()) for name in names}
+    for row in (i for name in _NEEDED if columns[name].null_count for i in _where(pc.is_null(columns[name]))):
+        missing = next(name for name in _NEEDED if name not in rows[row])
+        raise InputError(
+            path, f"vehicle {rows[row].get('id')!r} at time {rows[row]['time']!r} has no {missing}", _RIGHT
+        )
+    for name in set(names) - set(_STRINGS):
+        try:
+            columns[name] = pc.cast(columns[name], pa.float64())
+        except pa.ArrowInvalid as error:
+            raise InputError(path, f"{name}: {error}", "a number") from None
+    return pa.record_batch(columns)
+
+
+def _columns(names: list[str], path: Path, who: str) -> dict[str, str]:
+    """Our name -> the file's, for each column that we use (SUMO calls x ``vehicle_x`` in CSV and Parquet)."""
+    ours = {
+        name.removeprefix(f"{who}_").removeprefix("timestep_"): name
+        for name in reversed(names)
+        if not name.startswith(_OTHERS[who])
+    }
+    for name in _NEEDED:
+        if name not in ours:
+            raise InputError(path, f"there is no column for {name!r} among {', '.join(names)[:200]}", _RIGHT)
+    return {name: ours[name] for name in (*_NEEDED, *_OPTIONAL) if name in ours}
+
+
+def _checked(batches: Iterable[pa.RecordBatch], path: Path, unit: str) -> Iterator[pa.Table]:
+    """Into :data:`SCHEMA`, with every number finite and time never running back. Rows count from 1, without a
+    header."""
+    done, last_ms = 0, None
+    for batch in batches:
+        values = {name: batch.column(name) for name in batch.schema.names}
+        taken = pc.and_(pc.is_valid(values["id"]), pc.fill_null(pc.not_equal(values["id"], ""), False))
+        row = np.flatnonzero(taken.to_numpy(zero_copy_only=False)) + done + 1
+        values = {name: pc.filter(column, taken) for name, column in values.items()}
+        _typed(values, row, path, unit)
+        for name in ("time", "x", "y", "angle", *(n for n in _OPTIONAL if n in values and n != "speed")):
+            _finite(values, name, row, path, unit)
+        time_ms = _milliseconds(values, row, path, unit)
+        last_ms = _forward(time_ms, last_ms, row, path, unit)
+        done += batch.num_rows
+        if row.size:
+            yield _table(values, time_ms)
+
+
+def _finite(values: dict[str, Any], name: str, row: NDArray[np.int64], path: Path, unit: str) -> None:
+    bad = np.flatnonzero(~(np.abs(_floats(values[name])) <= FARTHEST_M))
+    if bad.size:
+        found = values[name][int(bad[0])].as_py()
+        raise InputError(
+            f"{path}: {unit} {row[bad[0]]}",
+            f"{name} of vehicle {values['id'][int(bad[0])].as_py()!r} is {'empty' if found is None else found}",
+            f"a finite number, at most {FARTHEST_M:g}",
+        )
+
+
+def _typed(values: dict[str, Any], row: NDArray[np.int64], path: Path, unit: str) -> None:
+    bad = _where(pc.fill_null(pc.equal(values["type"], ""), True))
+    if bad.size:
+        raise InputError(
+            f"{path}: {unit} {row[bad[0]]}",
+            f"vehicle {values['id'][int(bad[0])].as_py()!r} has no type",
+            "the vehicle's type, which its size comes from",
+        )
+
+
+def _milliseconds(values: dict[str, Any], row: NDArray[np.int64], path: Path, unit: str) -> NDArray[np.int64]:
+    exact = _floats(values["time"]) * 1000.0
+    whole = np.rint(exact)
+    bad = np.flatnonzero(np.abs(exact - whole) > 1e-3)
+    if bad.size:
+        raise InputError(
+            f"{path}: {unit} {row[bad[0]]}",
+            f"time {exact[bad[0]] / 1000.0:.6f} s",
+            "a whole number of milliseconds, as SUMO counts",
+        )
+    return whole.astype(np.int64)
+
+
+def _forward(
+    time_ms: NDArray[np.int64], last_ms: int | None, row: NDArray[np.int64], path: Path, unit: str
+) -> int | None:
+    if not time_ms.size:
+        return last_ms
+    before = np.concatenate([[time_ms[0] if last_ms is None else last_ms], time_ms[:-1]])
+    bad = np.flatnonzero(time_ms < before)
+    if bad.size:
+        raise InputError(
+            f"{path}: {unit} {row[bad[0]]}",
+            f"time {time_ms[bad[0]] / 1000:g} s comes after {before[bad[0]] / 1000:g} s",
+            "rows in order of time",
+        )
+    return int(time_ms[-1])
+
+
+def _table(values: dict[str, Any], time_ms: NDArray[np.int64]) -> pa.Table:
+    n = time_ms.size
+    filled = {
+        name: pa.array(_floats(values[name]) if name in values else np.full(n, default))
+        for name, default in _OPTIONAL.items()
+    }
+    columns = values | filled | {"time_ms": pa.array(time_ms)}
+    return pa.table([pc.cast(columns[f.name], f.type) for f in SCHEMA], schema=SCHEMA)
+
+
+def _floats(column: Any) -> NDArray[np.float64]:
+    """Nulls become NaN; integers and float32 widen."""
+    array: NDArray[np.float64] = pc.cast(column, pa.float64()).to_numpy(zero_copy_only=False)
+    return array
+
+
+def _where(mask: Any) -> NDArray[np.int64]:
+    return np.flatnonzero(mask.to_numpy(zero_copy_only=False))
+
+
+def _damaged(path: Path, what: str, error: Exception) -> InputError:
+    return InputError(path, f"cannot be read as {what} ({str(error).splitlines()[0]})", "a whole file; make it again")
+
+
+@dataclass(frozen=True)
+class Window:
+    """Which time steps are frames: ``count`` of them, ``period_ms`` apart.
+
+    The first is at ``first_ms``; where that is None, ``skip_ms`` after the file's own first time step. ``complete``
+    says that every step was recorded, so that a time step without rows is an empty frame and not the end of the file.
+    """
+
+    count: int
+    period_ms: int
+    first_ms: int | None = None
+    skip_ms: int = 0
+    complete: bool = False
+
+
+@dataclass(frozen=True)
+class Group:
+    """Consecutive whole frames: ``rows`` has :data:`SCHEMA` and, at ``frame``, each row's frame."""
+
+    first_frame: int
+    frames: int
+    frame: NDArray[np.int64]
+    rows: pa.Table
+
+
+@dataclass
+class _Cut:
+    window: Window
+    place: str
+    first_ms: int | None = None
+    last_ms: int = 0
+    step_ms: int = 0
+    seen: int = 0
+    start: int = 0
+    frames: list[NDArray[np.int64]] = field(default_factory=list)
+    tables: list[pa.Table] = field(default_factory=list)
+
+    def add(self, table: pa.Table) -> int:
+        """Keep the rows of the window's frames; return how many frames are whole now."""
+        window, time_ms = self.window, table["time_ms"].to_numpy()
+        if self.first_ms is None:
+            own = int(time_ms[0])
+            self.first_ms, self.last_ms = (own + window.skip_ms if window.first_ms is None else window.first_ms), own
+            self.seen = 1
+        steps = np.diff(time_ms, prepend=self.last_ms)
+        steps = steps[steps > 0]
+        self.seen += steps.size
+        self.step_ms = int(np.gcd.reduce(steps, initial=self.step_ms))
+        self.last_ms = int(time_ms[-1])
+        frame, off = np.divmod(time_ms - self.first_ms, window.period_ms)
+        kept = np.flatnonzero((off == 0) & (frame >= 0) & (frame < window.count))
+        if kept.size:
+            self.frames.append(frame[kept])
+            self.tables.append(
+                table.slice(int(kept[0]), int(kept[-1] - kept[0] + 1)) if _solid(kept) else table.take(kept)
+            )
+        return int(np.clip(-((self.first_ms - self.last_ms) // window.period_ms), 0, window.count))
+
+    def take(self, frames: int) -> Group:
+        """The next ``frames`` frames."""
+        end = self.start + frames
+        frame = np.concatenate([np.empty(0, np.int64), *self.frames])
+        rows = pa.concat_tables([SCHEMA.empty_table(), *self.tables])
+        cut = int(np.searchsorted(frame, end))
+        group = Group(self.start, frames, frame[:cut], rows.slice(0, cut).combine_chunks())
+        self.frames, self.tables, self.start = [frame[cut:]], [rows.slice(cut)], end
+        return group
+
+    def finish(self) -> None:
+        """Check that the file held every frame."""
+        window = self.window
+        if window.complete:
+            return
+        if self.first_ms is None:
+            raise InputError(self.place, "holds no vehicle", _RIGHT)
+        if self.step_ms and window.period_ms % self.step_ms:
+            raise InputError(
+                f"{self.place}: frame_period_s = {window.period_ms / 1000:g}",
+                f"the file's time steps are {self.step_ms / 1000:g} s apart",
+                "a multiple of that",
+            )
+        there = max(0, (self.last_ms - self.first_ms) // window.period_ms + 1)
+        if there < window.count:
+            raise InputError(
+                f"{self.place}: frames = {window.count}",
+                f"the file has {there} frames {window.period_ms / 1000:g} s apart after a warm-up of"
+                f" {window.skip_ms / 1000:g} s ({self.seen} time steps in all)",
+                f"at most {there} frames, or a shorter warmup_s",
+            )
+
+
+def together(some: Group, others: Group) -> Group:
+    """Two streams' rows of the same frames as one group."""
+    return Group(
+        some.first_frame,
+        some.frames,
+        np.concatenate([some.frame, others.frame]),
+        pa.concat_tables([some.rows, others.rows]).combine_chunks(),
+    )
+
+
+def _solid(kept: NDArray[np.int64]) -> bool:
+    return bool(kept[-1] - kept[0] + 1 == kept.size)
+
+
+def groups(tables: Iterable[pa.Table], window: Window, frames_each: int, place: str) -> Iterator[Group]:
+    """Cut a stream of rows into groups of ``frames_each`` whole frames (the last may be shorter).
+
+    Raises
+    ------
+    InputError
+        When the stream ends before the window does, or its time steps do not fit the window's period.
+    """
+    cut = _Cut(window, place)
+    for table in tables:
+        whole = cut.add(table)
+        while whole - cut.start >= frames_each:
+            yield cut.take(frames_each)
+        if whole == window.count:
+            break
+    cut.finish()
+    while cut.start < window.count:
+        yield cut.take(min(frames_each, window.count - cut.start))

@@ -1,0 +1,273 @@
+"""How is SUMO found, started and asked?
+
+The only module that locates SUMO's programs or imports its Python tools (sumolib, traci), each inside the function that
+needs it. Programs run as subprocesses in the folder that holds their files, so that no path gets into what they write.
+
+What fails here is told with SUMO's own words and its exit code; a missing system library is named together with the
+package that has it.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from typing import IO, Any
+
+from pipeline.core.errors import InputError, MissingBackendError, RunError
+from pipeline.core.sumo_home import sumo_home
+
+APT_LINE = "apt-get install libatomic1 libx11-6 libxext6 libxrender1 libgl1"
+"""What SUMO's binaries need on a minimal Debian."""
+
+_POLL_S = 0.1
+_LISTENS_S = 0.02
+_OPENS_WITHIN_S = 60.0
+_ENDS_WITHIN_S = 10.0
+_SHOWN_ERRORS = 12
+
+
+def binary(name: str) -> Path:
+    """Find a program of SUMO where SUMO users expect it: environment, SUMO_HOME, wheel, PATH.
+
+    Raises
+    ------
+    MissingBackendError
+        When it is in none of these places.
+    """
+    import shutil
+
+    import sumolib
+
+    found = shutil.which(sumolib.checkBinary(name))
+    if found is None:
+        raise MissingBackendError(f"SUMO's program '{name}' was not found: set SUMO_HOME, or pip install eclipse-sumo")
+    return Path(found)
+
+
+def environment() -> dict[str, str]:
+    """The environment that SUMO's programs need: this process' own, SUMO_HOME, and where the wheel keeps PROJ's
+    data."""
+    home = sumo_home()
+    proj = home / "data" / "proj"
+    values = {"SUMO_HOME": str(home)}
+    if proj.is_dir():
+        values |= {"PROJ_DATA": str(proj), "PROJ_LIB": str(proj)}
+    return values | dict(os.environ)
+
+
+@cache
+def version() -> str:
+    """SUMO's version, e.g. ``"1.28.0"``: the wheel's where its binary is used, else what ``sumo --version`` prints."""
+    program = binary("sumo")
+    try:
+        wheel = metadata.distribution("eclipse-sumo")
+        if Path(str(wheel.locate_file("sumo"))).resolve() in program.resolve().parents:
+            return wheel.version
+    except metadata.PackageNotFoundError:
+        pass
+    return version_in(run("sumo", ["--version"], Path()))
+
+
+def version_in(text: str) -> str:
+    """The version number in what SUMO says about itself ("Eclipse SUMO sumo 1.28.0", or traci's "SUMO 1.28.0")."""
+    found = re.search(r"\b[vV]?(\d+[._]\d+[._]\d+\S*)", text)
+    if found is None:
+        raise RunError(f"SUMO does not tell its version: {text.strip().splitlines()[:1]}")
+    return found.group(1).replace("_", ".")
+
+
+def vehicle_classes() -> frozenset[str]:
+    """The names of all SUMO vClasses."""
+    from sumolib.net.lane import SUMO_VEHICLE_CLASSES
+
+    return frozenset(SUMO_VEHICLE_CLASSES)
+
+
+def constants() -> Any:
+    """The numbers that TraCI calls its variables by."""
+    from traci import constants
+
+    return constants
+
+
+def run(
+    name: str, arguments: Sequence[str], folder: Path, log: Path | None = None, watch: Callable[[], None] | None = None
+) -> str:
+    """Run a program of SUMO to its end and return what it printed.
+
+    Parameters
+    ----------
+    name, arguments
+        The program, e.g. ``"sumo"``, and its flags; file names are relative to ``folder``, where it runs.
+    log
+        Where to keep its warnings and errors.
+    watch
+        Called a few times a second while it runs.
+
+    Raises
+    ------
+    RunError
+        When it ends with an error: its own error text and exit code.
+    MissingBackendError
+        When it, or a system library that it needs, is not installed.
+    """
+    log = log or Path(os.devnull)
+    with log.open("wb") as errors:
+        capture = subprocess.PIPE if str(log) == os.devnull else errors
+        process = _start(name, arguments, folder, subprocess.PIPE, capture)
+        with process:
+            try:
+                printed, said = _wait(process, watch)
+            except BaseException:
+                process.kill()
+                raise
+    if process.returncode:
+        text = said if capture == subprocess.PIPE else log.read_bytes()
+        raise failure(name, process.returncode, (text or b"").decode("utf-8", "replace"))
+    return printed.decode("utf-8", "replace")
+
+
+def _start(name: str, arguments: Sequence[str], folder: Path, printed: Any, said: Any) -> subprocess.Popen[bytes]:
+    program = binary(name)
+    try:
+        return subprocess.Popen(
+            [str(program), *arguments],
+            cwd=folder,
+            env=environment(),
+            stdin=subprocess.DEVNULL,
+            stdout=printed,
+            stderr=said,
+        )
+    except OSError as error:
+        raise MissingBackendError(f"{program} cannot be started: {error.strerror}") from None
+
+
+def _wait(process: subprocess.Popen[bytes], watch: Callable[[], None] | None) -> tuple[bytes, bytes]:
+    while True:
+        try:
+            return process.communicate(timeout=None if watch is None else _POLL_S)
+        except subprocess.TimeoutExpired:
+            assert watch is not None
+            watch()
+
+
+def failure(name: str, code: int, text: str) -> RunError:
+    """The error for a program of SUMO that ended with exit code ``code`` and said ``text``."""
+    missing = re.search(r"error while loading shared libraries: ([^:\s]+)", text)
+    if missing:
+        return MissingBackendError(
+            f"{name} cannot start, the system library {missing.group(1)} is missing; on Debian: {APT_LINE}"
+        )
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    told = [line for line in lines if not line.startswith(("Warning", "Quitting", "pj_obj_create"))] or lines[-1:]
+    how = f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
+    return RunError("\n".join([f"{name} {how}:", *(f"  {line}" for line in told[:_SHOWN_ERRORS])]))
+
+
+@contextmanager
+def connected(host: str, port: int) -> Iterator[Any]:
+    """A TraCI connection to a SUMO that is already running.
+
+    Raises
+    ------
+    InputError
+        When nothing answers there.
+    RunError
+        When SUMO ends the connection early.
+    """
+    import traci
+
+    connection = _connect(host, port)
+    if connection is None:
+        raise InputError(f"--traci {host}:{port}", "no SUMO answers there", "start one with --remote-port first")
+    try:
+        yield connection
+    except traci.exceptions.FatalTraCIError as error:
+        raise RunError(f"SUMO at {host}:{port} ended the connection: {error}") from None
+    finally:
+        _close(connection)
+
+
+def _close(connection: Any) -> None:
+    """Close without a word when SUMO has hung up first."""
+    import traci
+
+    socket = connection._socket
+    with suppress(traci.exceptions.FatalTraCIError, OSError):
+        connection.close(False)
+    if socket is not None:
+        socket.close()
+
+
+@contextmanager
+def served(arguments: Sequence[str], folder: Path) -> Iterator[Any]:
+    """Start SUMO with a TraCI server, yield the connection, and end SUMO."""
+    import traci
+    from sumolib.miscutils import getFreeSocketPort
+
+    port = getFreeSocketPort()
+    # a file, because SUMO would wait for ever on a full pipe that nobody reads
+    with tempfile.TemporaryFile() as said:
+        process = _start("sumo", [*arguments, "--remote-port", str(port)], folder, subprocess.DEVNULL, said)
+        with process:
+            try:
+                connection = _attach(process, port)
+                try:
+                    yield connection
+                finally:
+                    _close(connection)
+            except traci.exceptions.FatalTraCIError:
+                raise _hung_up(process, said) from None
+            finally:
+                process.kill()
+
+
+def _hung_up(process: subprocess.Popen[bytes], said: IO[bytes]) -> RunError:
+    """Why SUMO closed its end: it says so on its way out."""
+    try:
+        process.wait(_ENDS_WITHIN_S)
+    except subprocess.TimeoutExpired:
+        return RunError("sumo closed its TraCI port, and did not say why")
+    said.seek(0)
+    return failure("sumo", process.returncode, said.read().decode("utf-8", "replace"))
+
+
+def _attach(process: subprocess.Popen[bytes], port: int) -> Any:
+    """Connect as soon as SUMO listens; traci's own retries wait a whole second and print."""
+    import traci
+
+    deadline = time.monotonic() + _OPENS_WITHIN_S
+    while (connection := _connect("localhost", port)) is None:
+        if process.poll() is not None:
+            raise traci.exceptions.FatalTraCIError("sumo ended")
+        if time.monotonic() > deadline:
+            raise RunError(f"sumo did not open its TraCI port within {_OPENS_WITHIN_S:g} s")
+        time.sleep(_LISTENS_S)
+    return connection
+
+
+def _connect(host: str, port: int) -> Any:
+    """A connection, or None where nobody listens. traci forgets to close the socket then, which Python would warn
+    of."""
+    import traci
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ResourceWarning)
+        try:
+            connection = traci.connect(port=port, host=host, numRetries=0)
+        except (traci.exceptions.FatalTraCIError, OSError):
+            return None
+    socket = connection._socket
+    if socket.getsockname() == socket.getpeername():  # TCP may connect a free local port to itself, and wait for ever
+        socket.close()
+        return None
+    return connection

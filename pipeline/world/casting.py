@@ -1,0 +1,315 @@
+"""Which static surface does each beam meet first, and where?
+
+Embree (float32) answers *which triangle*, float64 *where*:
+
+1. The world is moved to the region of interest's own frame in float64.
+2. Embree holds every triangle enlarged by a rim that is wider than float32's error, and a low fin upright on each side
+   that is not
+   shared with a steep neighbour. What a beam truly meets, it meets there too: none leaks through a shared edge or
+   vertex, and none slips in along a surface that it sees at a fraction of a degree.
+3. Each proposed hit is placed in float64 on the true triangle. A beam that met only a rim or fin, came within 0.02 mm
+   of an
+   edge, or met a surface at less than 0.6 degrees, is doubtful (one in a thousand); its first hit is searched among all
+   true triangles in float64.
+
+What is left to float32: where a surface stands on the middle of another (a wall on the ground), a beam within some 1e-5
+m of the line between them may be given the farther of the two, which then lies less than 1 mm behind the nearer."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import cosdg, sindg
+
+from pipeline.core.errors import InputError
+from pipeline.core.grid import Roi
+from pipeline.kernels import rays
+from pipeline.world.mesh import World
+
+_RIM_M = 1e-4
+_RIM_SHARE = 2.0**-21  # of the triangle's largest coordinate: eight times float32's rounding
+_MAX_SHIFT_M = 1.0  # a needle whose tip would move further when it is enlarged is held as a rectangle
+_CLEAR_M = 2.0  # what is left out of the tree is further away than anything held there is enlarged
+_STEEP = 0.25  # sine of the angle between two planes from which the one's rim stands out of the other far enough
+_PAD_M = 1e-5  # more than the rules of kernels.rays and float64's rounding ask for
+
+_TURN = np.arange(64) * (360 / 64)
+_ROUND = np.column_stack([cosdg(_TURN), sindg(_TURN), np.zeros(64)])
+_FAN = np.concatenate(
+    [_ROUND, np.roll(_ROUND, 1, axis=1), np.roll(_ROUND, 2, axis=1)]
+)  # normals of planes that part shapes
+
+
+@dataclass(frozen=True)
+class EmptyScan:
+    """One site's beams against the static world.
+
+    Attributes
+    ----------
+    beam
+        Index of each cast beam in the sensor's table, (n,) uint32, ascending.
+    ends_m
+        Where the beam ends, seen from the sensor along the world's axes, (n, 3) float64.
+    returned
+        False where nothing was met within the sensor's range, (n,) bool.
+    doubtful
+        How many beams float32 alone would not have settled.
+    weight
+        Only where effects weight beams: the share of its beam that each row is, (n,) float64.
+    """
+
+    beam: NDArray[np.uint32]
+    ends_m: NDArray[np.float64]
+    returned: NDArray[np.bool_]
+    doubtful: int = 0
+    weight: NDArray[np.float64] | None = None
+
+
+class Caster:
+    """Casts beams at a static world. Threads may share one.
+
+    Parameters
+    ----------
+    world
+        The static world; may be empty, then no tree is built.
+    roi
+        Beams that cannot meet it are not cast.
+    sites_m, range_m
+        Where beams start, (n, 3), and how far they go at most: what none of them can meet is left out of the tree. All
+        is kept when None.
+    """
+
+    def __init__(
+        self, world: World, roi: Roi, sites_m: NDArray[np.float64] | None = None, range_m: float = float("inf")
+    ) -> None:
+        self._origin_m = np.asarray(roi.origin_m, dtype=np.float64)
+        self._size_m = np.asarray(roi.size_m, dtype=np.float64)
+        triangles = world.triangles_m - self._origin_m
+        if not np.isfinite(triangles).all():
+            raise InputError("statics", "a triangle has a corner that is no number", "finite metres")
+        met = np.flatnonzero(_cross(triangles).any(axis=1))  # the others have no plane, and what is beside them is met
+        if sites_m is not None:
+            met = met[reachable(world.triangles_m[met], roi, sites_m, range_m)]
+        met = met[_along_curve(triangles[met].mean(axis=1))]
+        self._triangles = triangles[met]
+        self._planes = _planes(self._triangles)
+        self._boxes, self._starts = _boxes(self._triangles)
+        self._owner: NDArray[np.int64] = np.empty(0, dtype=np.int64)
+        self._scene: Any = None
+        if len(met):
+            self._owner, self._scene = _tree(self._triangles)
+
+    def scan(
+        self, position_m: tuple[float, float, float], directions: NDArray[np.float64], range_m: float
+    ) -> EmptyScan:
+        """Cast the beams of one sensor.
+
+        Parameters
+        ----------
+        position_m
+            The sensor in the world frame, metres.
+        directions
+            Unit vectors of all its beams along the world's axes, (beams, 3) float64.
+        range_m
+            Where a beam ends that meets nothing.
+        """
+        o = np.asarray(position_m, dtype=np.float64) - self._origin_m
+        reaches = np.empty(len(directions), dtype=np.bool_)
+        rays.can_meet(o, directions * range_m, self._size_m, reaches)
+        beam = np.flatnonzero(reaches)
+        d = directions[beam]
+        ranges, doubtful = self.first_hits(o, d, range_m)
+        returned = ranges <= range_m
+        ends = d * np.where(returned, ranges, range_m)[:, None]
+        return EmptyScan(beam.astype(np.uint32), ends, returned, doubtful)
+
+    def first_hits(
+        self, o_roi_m: NDArray[np.float64], d: NDArray[np.float64], range_m: float = float("inf")
+    ) -> tuple[NDArray[np.float64], int]:
+        """Range of each ray's first hit (infinity for none), and how many rays had to be searched in float64.
+
+        ``o_roi_m`` is the sensor in the ROI's frame, (3,); ``d`` are unit directions (n, 3); hits beyond ``range_m`` do
+        not matter."""
+        ranges = np.full(len(d), np.inf)
+        if self._scene is None or len(d) == 0:
+            return ranges, 0
+        start = np.broadcast_to(o_roi_m.astype(np.float32), d.shape)
+        found = self._scene.run(np.ascontiguousarray(start), d.astype(np.float32))
+        proposed = self._owner[found]
+        doubtful = np.empty(len(d), dtype=np.int64)
+        count = rays.settle(proposed, self._triangles, self._planes, o_roi_m, d, range_m, ranges, doubtful)
+        rays.search(doubtful[:count], self._triangles, self._planes, self._boxes, self._starts, o_roi_m, d, ranges)
+        return ranges, int(count)
+
+
+def reachable(
+    shapes: NDArray[np.float64], roi: Roi, sites_m: NDArray[np.float64], range_m: float = float("inf")
+) -> NDArray[np.bool_]:
+    """Which shapes may be met by a beam that starts at a site, meets the region of interest, and goes on behind it.
+
+    Where a normal n has all of the region at least as high as all sites, beams rise along n, and what lies lower than
+    the lowest site is not met. Corners of each shape (m, k, 3), world frame; (m,) bool, False only when certain."""
+    if len(sites_m) == 0:
+        return np.zeros(len(shapes), dtype=np.bool_)
+    origin = np.asarray(roi.origin_m)
+    sites, shapes, box = sites_m - origin, shapes - origin, _corners(roi)
+    rising = (box @ _FAN.T).min(axis=0) >= (sites @ _FAN.T).max(axis=0)
+    gap = np.maximum(shapes.min(axis=1) - sites.max(axis=0), sites.min(axis=0) - shapes.max(axis=1))
+    met: NDArray[np.bool_] = np.sqrt((np.maximum(gap, 0.0) ** 2).sum(axis=1)) <= range_m + _CLEAR_M
+    for normal in _FAN[rising]:
+        met &= (shapes @ normal).max(axis=1) >= (sites @ normal).min() - _CLEAR_M
+    return met
+
+
+def between(shapes: NDArray[np.float64], roi: Roi, sites_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which shapes may reach into the convex hull of the region of interest and any one site; as :func:`reachable`."""
+    origin = np.asarray(roi.origin_m)
+    heights = np.column_stack([((shapes - origin) @ normal).max(axis=1) for normal in _FAN])
+    box, sites = (_corners(roi) @ _FAN.T).min(axis=0), (sites_m - origin) @ _FAN.T
+    found = np.zeros(len(shapes), dtype=np.bool_)
+    for site in sites:
+        found |= (heights >= np.minimum(site, box) - _PAD_M).all(axis=1)
+    return found
+
+
+def _corners(roi: Roi) -> NDArray[np.float64]:
+    """Corners of the region of interest in its own frame, (8, 3)."""
+    return np.array(list(itertools.product(*((0.0, size) for size in roi.size_m))))
+
+
+def with_planes(triangles: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """Triangles that have a plane, these planes (see :func:`pipeline.kernels.rays.planes`), and which ones they are."""
+    kept = np.flatnonzero(_cross(triangles).any(axis=1))
+    return triangles[kept], _planes(triangles[kept]), kept
+
+
+def standing_on(triangles: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which triangles (n, 3, 3), seen from a sensor, it stands on (to 1 micrometre), (n,) bool."""
+    met = np.flatnonzero(_cross(triangles).any(axis=1))
+    touched, on = np.empty(len(met), dtype=np.bool_), np.zeros(len(triangles), dtype=np.bool_)
+    rays.stands_on(triangles[met], _planes(triangles[met]), np.zeros(3), touched)
+    on[met] = touched
+    return on
+
+
+def _cross(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Normals as long as twice the area, (n, 3); exactly zero where there is none."""
+    cross: NDArray[np.float64] = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    return np.where(((cross**2).sum(axis=1) > 0.0)[:, None], cross, 0.0)
+
+
+def _planes(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The four planes of each triangle, see :func:`pipeline.kernels.rays.planes`."""
+    cross, found = _cross(triangles), np.empty((len(triangles), 4, 4))
+    rays.planes(triangles, cross / np.sqrt((cross**2).sum(axis=1))[:, None], found)
+    return found
+
+
+def _along_curve(points: NDArray[np.float64]) -> NDArray[np.int64]:
+    """An order of the points (n, 3) in which neighbours in space lie together: along a Z-shaped curve (Morton 1966)."""
+    low = points.min(axis=0, initial=np.inf)
+    cells = ((points - low) * (2.0**20 / max(float((points - low).max(initial=0.0)), _PAD_M) * (1 - 1e-9))).astype(
+        np.int64
+    )
+    key = np.zeros(len(points), dtype=np.int64)
+    for bit in range(20):
+        for axis in range(3):
+            key |= (cells[:, axis] >> bit & 1) << (3 * bit + axis)
+    return np.argsort(key, kind="stable")
+
+
+def _boxes(triangles: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Boxes round the triangles, round groups of these, and so on up to one; and where each level starts."""
+    low, high = triangles.min(axis=1) - _PAD_M, triangles.max(axis=1) + _PAD_M
+    levels = [np.column_stack([low, high])]
+    while len(low) > 1:
+        firsts = np.arange(0, len(low), rays.GROUP)
+        low, high = np.minimum.reduceat(low, firsts), np.maximum.reduceat(high, firsts)
+        levels.append(np.column_stack([low, high]))
+    return np.concatenate(levels), np.cumsum([0, *map(len, levels)])
+
+
+def _tree(triangles: NDArray[np.float64]) -> tuple[NDArray[np.int64], Any]:
+    """Embree's tree over the enlarged triangles; and the triangle behind each of its own, FIN for a fin; the last is
+    none (-1).
+
+    A triangle is scaled from its incentre so that its sides move out by the rim. That moves a needle's tip far; a
+    needle is held as the two triangles of a rectangle that covers it. Then the fins."""
+    from embreex.mesh_construction import TriangleMesh
+    from embreex.rtcore_scene import EmbreeScene
+
+    rim = _RIM_M + _RIM_SHARE * np.abs(triangles).max(axis=(1, 2))
+    sides = np.roll(triangles, -2, axis=1) - np.roll(triangles, -1, axis=1)  # opposite corner i
+    lengths = np.sqrt((sides**2).sum(axis=2))
+    perimeter = lengths.sum(axis=1)
+    incentre = (triangles * lengths[:, :, None]).sum(axis=1) / perimeter[:, None]
+    from_centre = triangles - incentre[:, None]
+    reach = np.sqrt((from_centre**2).sum(axis=2)).max(axis=1)
+    cross = _cross(triangles)
+    share = rim * perimeter / np.sqrt((cross**2).sum(axis=1))  # inradius = 2 area / perimeter
+    needles = np.flatnonzero(share * reach > _MAX_SHIFT_M)
+    share[needles] = 0.0
+    enlarged = triangles + from_centre * share[:, None, None]
+    first, second = _rectangles(triangles[needles], sides[needles], cross[needles], rim[needles])
+    enlarged[needles] = first
+    fins = _fins(triangles, cross, rim)
+    scene = EmbreeScene()
+    TriangleMesh(scene, np.concatenate([enlarged, second, fins]).astype(np.float32))
+    return np.concatenate([np.arange(len(triangles)), needles, np.full(len(fins), rays.FIN), [-1]]), scene
+
+
+def _fins(triangles: NDArray[np.float64], cross: NDArray[np.float64], rim: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Strips upright on the sides that no steep neighbour guards, (f, 3, 3).
+
+    A rim in the triangle's plane is no guard against a beam along that plane. The rim of a neighbour that stands steep
+    on it is; elsewhere the side gets a strip as high above and below as the rim is wide."""
+    normals = cross / np.sqrt((cross**2).sum(axis=1))[:, None]
+    starts, ends = triangles.reshape(-1, 3), np.roll(triangles, -1, axis=1).reshape(-1, 3)
+    ahead = _before(starts, ends)
+    low, high = np.where(ahead[:, None], starts, ends), np.where(ahead[:, None], ends, starts)
+    order = np.lexsort(np.column_stack([low, high]).T)
+    low, high, owner = low[order], high[order], order // 3
+    same = ((low[1:] == low[:-1]) & (high[1:] == high[:-1])).all(axis=1)
+    group = np.cumsum(np.append(0, ~same))
+    first = np.flatnonzero(np.append(True, ~same))
+    lead = owner[first][group]
+    sine = np.sqrt((np.cross(normals[owner], normals[lead]) ** 2).sum(axis=1))
+    steep = np.maximum.reduceat(sine, first) > _STEEP
+    side = first[~steep]
+    a, b, n, wide = low[side], high[side], normals[owner[side]], rim[owner[side], None]
+    along = (b - a) / np.sqrt(((b - a) ** 2).sum(axis=1))[:, None] * wide
+    corners = [a - along - n * wide, b + along - n * wide, b + along + n * wide, a - along + n * wide]
+    strips = [np.stack([corners[0], corners[i], corners[i + 1]], axis=1) for i in (1, 2)]
+    return np.concatenate(strips)
+
+
+def _before(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether points a (n, 3) come before points b in lexical order."""
+    x, y, z = (a - b).T
+    before: NDArray[np.bool_] = (x < 0) | ((x == 0) & ((y < 0) | ((y == 0) & (z < 0))))
+    return before
+
+
+def _rectangles(
+    triangles: NDArray[np.float64], sides: NDArray[np.float64], cross: NDArray[np.float64], rim: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Two triangles each, (n, 3, 3), that together cover a triangle and a rim round it; one side along its longest."""
+    rows = np.arange(len(triangles))
+    u = sides[rows, (sides**2).sum(axis=2).argmax(axis=1)]
+    u = u / np.sqrt((u**2).sum(axis=1))[:, None]
+    v = np.cross(cross, u)
+    v = v / np.sqrt((v**2).sum(axis=1))[:, None]
+    base = triangles[:, 0]
+    along, across = (((triangles - base[:, None]) * axis[:, None]).sum(axis=2) for axis in (u, v))
+    corners = [
+        base + u * (at_u + turn_u * rim)[:, None] + v * (at_v + turn_v * rim)[:, None]
+        for at_u, turn_u in ((along.min(axis=1), -1), (along.max(axis=1), 1))
+        for at_v, turn_v in ((across.min(axis=1), -1), (across.max(axis=1), 1))
+    ]
+    return np.stack([corners[0], corners[2], corners[3]], axis=1), np.stack(
+        [corners[0], corners[3], corners[1]], axis=1
+    )

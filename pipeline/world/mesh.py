@@ -1,0 +1,129 @@
+"""What does the static world look like on disk and in memory?
+
+``statics.ply`` is one binary triangle mesh in the world frame (float64 vertices, metres) that any viewer opens. Each
+face has an extra ``int solid``; the header's comments name the solids, so that a message can say which building a site
+stands in."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.core import files
+from pipeline.core.errors import InputError
+
+_VERTEX = np.dtype([("xyz", "<f8", 3)])
+_FACE = np.dtype([("n", "u1"), ("corners", "<i4", 3), ("solid", "<i4")])
+
+
+@dataclass(frozen=True)
+class World:
+    """Triangles with the solids that they belong to.
+
+    Attributes
+    ----------
+    vertices_m
+        (n, 3) float64, world frame, metres.
+    faces
+        (m, 3) int32, counter-clockwise seen from outside.
+    solid_of_face
+        (m,) int32, index into ``solids``.
+    solids
+        (name, kind) of each solid, e.g. ("tower_NE", "building").
+    """
+
+    vertices_m: NDArray[np.float64]
+    faces: NDArray[np.int32]
+    solid_of_face: NDArray[np.int32]
+    solids: tuple[tuple[str, str], ...]
+
+    @cached_property
+    def triangles_m(self) -> NDArray[np.float64]:
+        """Corners of each triangle, (m, 3, 3), world frame."""
+        return self.vertices_m[self.faces]
+
+    @cached_property
+    def bounds_xy_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Lowest and highest x and y of each triangle, (m, 2) each."""
+        return self.triangles_m[:, :, :2].min(axis=1), self.triangles_m[:, :, :2].max(axis=1)
+
+    @cached_property
+    def closed(self) -> NDArray[np.bool_]:
+        """Which solids are closed: each directed edge of their triangles is met by its opposite. (solids,) bool."""
+        edges = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
+        owner = np.repeat(self.solid_of_face, 3)
+        up = edges[:, 0] < edges[:, 1]
+        low, high = edges.min(axis=1), edges.max(axis=1)
+        order = np.lexsort((high, low, owner))
+        owner, low, high, turn = owner[order], low[order], high[order], np.where(up, 1, -1)[order]
+        starts = np.ones(len(owner), dtype=bool)
+        starts[1:] = (np.diff(owner) != 0) | (np.diff(low) != 0) | (np.diff(high) != 0)
+        first = np.flatnonzero(starts)
+        balance = np.add.reduceat(turn, first) if len(first) else np.empty(0, dtype=np.int64)
+        is_closed = np.zeros(len(self.solids), dtype=bool)
+        is_closed[self.solid_of_face] = True
+        is_closed[owner[first[balance != 0]]] = False
+        return is_closed
+
+    @cached_property
+    def signs(self) -> NDArray[np.int64]:
+        """+1 for solids whose triangles face outwards, -1 where they face inwards (negative volume). (solids,)
+        int64."""
+        t = self.triangles_m - (self.vertices_m.mean(axis=0) if len(self.vertices_m) else 0.0)
+        volume = np.einsum("ij,ij->i", t[:, 0], np.cross(t[:, 1], t[:, 2]))
+        total = np.zeros(len(self.solids))
+        np.add.at(total, self.solid_of_face, volume)
+        return np.where(total < 0, -1, 1)
+
+
+def write_ply(path: Path, world: World, metadata: dict[str, Any]) -> None:
+    """Write ``world`` as binary PLY; the metadata and the solids' names go into the header's comments."""
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment egvs {_line(metadata)}",
+        *(f"comment solid {_line(list(solid))}" for solid in world.solids),
+        f"element vertex {len(world.vertices_m)}",
+        *(f"property double {axis}" for axis in "xyz"),
+        f"element face {len(world.faces)}",
+        "property list uchar int vertex_indices",
+        "property int solid",
+        "end_header",
+    ]
+    vertices = np.empty(len(world.vertices_m), dtype=_VERTEX)
+    vertices["xyz"] = world.vertices_m
+    faces = np.empty(len(world.faces), dtype=_FACE)
+    faces["n"], faces["corners"], faces["solid"] = 3, world.faces, world.solid_of_face
+    with files.aside(path) as partial, partial.open("wb") as file:
+        file.write(("\n".join(header) + "\n").encode("ascii"))
+        file.write(vertices.tobytes())
+        file.write(faces.tobytes())
+
+
+def read_ply(path: Path) -> tuple[World, dict[str, Any]]:
+    """Read what :func:`write_ply` wrote: the world and the metadata. InputError when the file is not such a one."""
+    if not path.is_file():
+        raise InputError(path, "no such file", f"run the stage that makes {path.name} first")
+    data = path.read_bytes()
+    head, found, body = data.partition(b"end_header\n")
+    lines = head.decode("ascii", errors="replace").splitlines()
+    comments = [line.removeprefix("comment ").split(" ", 1) for line in lines if line.startswith("comment ")]
+    counts = {line.split()[1]: int(line.split()[2]) for line in lines if line.startswith("element ")}
+    size = counts.get("vertex", -1) * _VERTEX.itemsize
+    if not found or len(body) != size + counts.get("face", -1) * _FACE.itemsize or comments[0][0] != "egvs":
+        raise InputError(path, "is not a whole statics.ply", "run the statics stage again")
+    vertices = np.frombuffer(body, dtype=_VERTEX, count=counts["vertex"])
+    faces = np.frombuffer(body, dtype=_FACE, offset=size)
+    solids = tuple((str(n), str(k)) for n, k in (json.loads(text) for word, text in comments if word == "solid"))
+    world = World(vertices["xyz"].copy(), faces["corners"].copy(), faces["solid"].copy(), solids)
+    return world, json.loads(comments[0][1])
+
+
+def _line(value: Any) -> str:
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True)

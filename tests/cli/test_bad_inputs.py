@@ -1,0 +1,377 @@
+"""Is every wrong input answered with one message of its own, exit code 2, and nothing written?"""
+
+from __future__ import annotations
+
+import gzip
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import BUILDING, collection, fcd, feature
+
+Change = Callable[[Path], object]
+
+
+def edit(old: str, new: str, name: str = "scenario.toml") -> Change:
+    def change(folder: Path) -> None:
+        text = (folder / name).read_text()
+        assert old in text
+        (folder / name).write_text(text.replace(old, new, 1))
+
+    return change
+
+
+def add(text: str) -> Change:
+    return lambda folder: (folder / "scenario.toml").write_text((folder / "scenario.toml").read_text() + text)
+
+
+def put(name: str, content: str | bytes, *also: Change) -> Change:
+    def change(folder: Path) -> None:
+        (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+        for other in also:
+            other(folder)
+
+    return change
+
+
+def remove(name: str) -> Change:
+    return lambda folder: (folder / name).unlink()
+
+
+def statics(*features: dict) -> Change:
+    return put("statics.geojson", collection(*features))
+
+
+def polygon(*rings: list[list[float]], **properties: object) -> dict:
+    return feature({"type": "Polygon", "coordinates": list(rings)}, **{"height_m": 5, **properties})
+
+
+def sites(*rows: str, head: str = "site,x_m,y_m,z_m") -> Change:
+    return put("sites.csv", "\n".join([head, *rows]) + "\n")
+
+
+def traffic(line: str) -> Change:
+    """Replace the finished FCD file by another source."""
+    return edit('fcd = "fcd.csv"', line)
+
+
+NET = 'network = "net.net.xml"'
+POINTS = edit('sensor = "small"', 'sensor = "small"\npoints = "cloud.csv"')
+ONE_SITE = sites("only,10,12,3")
+
+# name of the case -> how the scenario is spoilt, what the message must say
+BAD: dict[str, tuple[Change, str]] = {
+    # the scenario file
+    "no scenario.toml": (remove("scenario.toml"), r"no scenario.toml there"),
+    "not TOML": (add("\n[roi\n"), r"scenario.toml: is not valid TOML"),
+    "not UTF-8": (put("scenario.toml", b"\xff\xfe\x00"), r"is not valid TOML.*utf-8"),
+    "unknown key": (edit("voxel_m", "voxel_size_m"), r"roi.voxel_size_m: unknown key; did you mean voxel_m\?"),
+    "unknown table": (add("\n[trafic]\nframes = 3\n"), r"trafic: unknown key; did you mean traffic\?"),
+    "missing table": (edit('[sites]\nfile = "sites.csv"\nsensor = "small"\n', ""), r"sites: missing"),
+    "wrong type": (edit("frames = 40", 'frames = "many"'), r"traffic.frames: 'many'; input should be a valid integer"),
+    "text for a number": (
+        edit("voxel_m = 0.5", 'voxel_m = "0.5"'),
+        r"roi.voxel_m: '0.5'; input should be a valid number",
+    ),
+    "truth for a number": (edit("gamma = 4", "gamma = true"), r"score.gamma: True"),
+    "text for a truth value": (edit("frames = 40", "frames = 40\n[scan]\nkeep = 'no'"), r"scan.keep: 'no'"),
+    "a date": (edit("gamma = 4", "gamma = 2026-01-01"), r"score.gamma: '2026-01-01'"),
+    "fraction for a count": (edit("frames = 40", "frames = 40.5"), r"traffic.frames: 40.5"),
+    "negative voxel": (edit("voxel_m = 0.5", "voxel_m = -0.5"), r"roi.voxel_m: -0.5; input should be greater than 0"),
+    "NaN voxel": (edit("voxel_m = 0.5", "voxel_m = nan"), r"roi.voxel_m: nan"),
+    "infinite ROI": (edit("size_m = [40, 20, 5]", "size_m = [inf, 20, 5]"), r"roi.size_m.0: inf"),
+    "two numbers for a size": (edit("size_m = [40, 20, 5]", "size_m = [40, 20]"), r"roi.size_m"),
+    "ROI no multiple": (
+        edit("[40, 20, 5]", "[40.3, 20, 5]"),
+        r"roi.size_m: 40.3 m along x .* nearest sizes that fit are 40 or 40.5 m",
+    ),
+    "too many voxels": (edit("voxel_m = 0.5", "voxel_m = 0.001"), r"roi.voxel_m: 0.001 m gives .* voxels"),
+    "blocks do not divide": (edit("blocks = 4", "blocks = 7"), r"tpog.blocks = 7 does not divide traffic.frames = 40"),
+    "gamma below 0": (edit("gamma = 4", "gamma = -1"), r"score.gamma: -1"),
+    "gamma NaN": (edit("gamma = 4", "gamma = nan"), r"score.gamma: nan"),
+    "two traffic sources": (traffic('fcd = "fcd.csv"\nnetwork = "n.xml"'), r"exactly one of network, sumocfg and fcd"),
+    "key that acts on nothing": (
+        edit("frames = 40", "frames = 40\nvehicles = 3"),
+        r"vehicles would act on nothing beside fcd",
+    ),
+    "two kinds of one name": (
+        add('\n[[traffic.kinds]]\nname = "car"\nlength_m = 4\nwidth_m = 2\nheight_m = 1\n'),
+        r"same name: car",
+    ),
+    "size of a kind 0": (edit("length_m = 4.5", "length_m = 0"), r"traffic.kinds.0.length_m: 0"),
+    # traffic
+    "FCD missing": (remove("fcd.csv"), r"traffic.fcd = 'fcd.csv': no such file"),
+    "FCD empty": (put("fcd.csv", ""), r"fcd.csv: is empty"),
+    "FCD without angle": (put("fcd.csv", fcd().replace("vehicle_angle", "vehicle_odd")), r"fcd.csv: .*angle"),
+    "FCD with an unknown type": (put("fcd.csv", fcd().replace(";car;", ";bus;")), r"bus"),
+    "FCD with NaN": (put("fcd.csv", fcd().replace("-2.0;90.0", "nan;90.0", 1)), r"fcd.csv.*nan"),
+    "FCD truncated gzip": (
+        put("fcd.csv", gzip.compress(fcd().encode(), mtime=0)[:-40]),
+        r"fcd.csv: .*(damaged gzip|Truncated compressed)",
+    ),
+    "FCD malformed XML": (put("fcd.csv", "<fcd-export><timestep time='0'>"), r"fcd.csv: is not well-formed XML"),
+    "FCD with entities": (
+        put("fcd.csv", "<!DOCTYPE a [<!ENTITY b 'c'>]><fcd-export>&b;</fcd-export>"),
+        r"fcd.csv: declares XML entities",
+    ),
+    "FCD too short": (edit("frames = 40", "frames = 400"), r"40"),
+    "FCD at another period": (edit("frame_period_s = 0.5", "frame_period_s = 0.3"), r"frame_period_s|0\.3"),
+    "network missing": (
+        put("x", "", traffic(NET), edit("warmup_s = 0", ""), edit("frame_period_s = 0.5", "")),
+        r"traffic.network = 'net.net.xml': no such file",
+    ),
+    "network empty": (
+        put("net.net.xml", "<net></net>", traffic(NET), edit("frame_period_s = 0.5", "")),
+        r"net.net.xml.*no road",
+    ),
+    "network that is none": (
+        put("net.net.xml", "<routes/>", traffic(NET), edit("frame_period_s = 0.5", "")),
+        r"root is <routes>",
+    ),
+    "period no multiple of the step": (
+        put(
+            "net.net.xml",
+            "<net></net>",
+            traffic(NET),
+            edit("frame_period_s = 0.5", "frame_period_s = 0.35\nstep_s = 0.1"),
+        ),
+        r"frame_period_s.*0.35.*0.1|0.35",
+    ),
+    # statics
+    "statics missing": (remove("statics.geojson"), r"statics.footprints = 'statics.geojson': no such file"),
+    "statics no JSON": (put("statics.geojson", "{"), r"statics.geojson: is not valid JSON"),
+    "statics no collection": (put("statics.geojson", "[]"), r"has no list of features"),
+    "statics without height": (
+        statics(feature({"type": "Point", "coordinates": [1, 1]}, radius_m=1)),
+        r"height_m is missing",
+    ),
+    "statics upside down": (statics(polygon(BUILDING[0], base_m=7)), r"height_m = 5 with base_m = 7"),
+    "statics NaN height": (statics(polygon(BUILDING[0], height_m=math.nan)), r"height_m: nan"),
+    "statics point without radius": (
+        statics(feature({"type": "Point", "coordinates": [1, 1]}, height_m=3)),
+        r"radius_m is missing",
+    ),
+    "statics self-crossing polygon": (
+        statics(polygon([[0, 0], [4, 4], [4, 0], [0, 4], [0, 0]], name="bow")),
+        r"feature 0 \(bow\): geometry: is not a sound polygon \(Self-intersection",
+    ),
+    "statics hole outside": (
+        statics(polygon(BUILDING[0], [[50, 50], [51, 50], [51, 51], [50, 50]])),
+        r"is not a sound polygon \(Hole lies outside",
+    ),
+    "statics without area": (
+        statics(polygon([[0, 0], [4, 4], [2, 2], [0, 0]])),
+        r"not a sound polygon|encloses no area",
+    ),
+    "statics odd geometry": (statics(feature({"type": "Circle"}, height_m=3)), r"cannot be understood"),
+    "statics infinite coordinate": (
+        put("statics.geojson", collection(polygon(BUILDING[0])).replace("14", "1e999", 1)),
+        r"coordinate that is no number",
+    ),
+    "mesh that is none": (
+        put("m.stl", "solid nothing", add('\n[[statics.meshes]]\nfile = "m.stl"\n')),
+        r"m.stl: (cannot be|holds no)",
+    ),
+    # sites and sensors
+    "sites missing": (remove("sites.csv"), r"sites.file = 'sites.csv': no such file"),
+    "sites empty": (put("sites.csv", "site,x_m,y_m,z_m\n"), r"sites.csv: holds no site"),
+    "sites without z": (sites("a,1,12", head="site,x_m,y_m"), r"row a: z_m is missing"),
+    "sites with text": (sites("a,1,north,3"), r"row a: y_m: 'north'; a finite number"),
+    "sites with an odd column": (sites("a,1,12,3,9", head="site,x_m,y_m,z_m,tilt"), r"unknown column 'tilt'"),
+    "sites ragged": (sites("a,1,12"), r"row a: has more or fewer values"),
+    "site twice": (sites("a,1,12,3", "a,2,12,3"), r"site 'a' stands there twice"),
+    "site NaN": (sites("a,nan,12,3"), r"row a: x_m: 'nan'"),
+    "site in a wall": (sites("a,16,6,3"), r"site a: \(16, 6, 3\) stands inside house \(building\)"),
+    "site below ground": (sites("a,1,12,-1"), r"site a: z_m = -1 is not above the ground"),
+    "site too far": (sites("a,1,500,3"), r"site a: stands 490.0 m from the region of interest"),
+    "unknown sensor": (
+        edit('sensor = "small"', 'sensor = "VLP32C"'),
+        r"unknown sensor 'VLP32C'; did you mean VLP-32C\?",
+    ),
+    "pitch beyond 90": (sites("a,1,12,3,100", head="site,x_m,y_m,z_m,pitch_deg"), r"row a: pitch_deg: 100"),
+    "azimuth step does not divide": (
+        edit("azimuth_step_deg = 1.0", "azimuth_step_deg = 0.7"),
+        r"azimuth_step_deg = 0.7 does not divide 360",
+    ),
+    "elevations and channels disagree": (edit("[-15, 5]", "[-15, 0, 5]"), r"channels = 8 needs elevations_deg"),
+    "unknown site to keep": (
+        add('keep_visibility = ["pole_z"]\n'),
+        r"score.keep_visibility: no site 'pole_z'; one of pole_a, pole_b",
+    ),
+    "site that would be a path": (
+        sites("../../a,1,12,3"),
+        r"row ../../a: site: '../../a'; a name of up to 80 characters",
+    ),
+    "site beyond the Earth": (sites("a,1e300,12,3"), r"row a: x_m: '1e300'; a finite number, at most"),
+    "a column twice": (sites("a,1,12,3,2", head="site,x_m,y_m,z_m,x_m"), r"the column 'x_m' stands there twice"),
+    "too many beams": (
+        edit("azimuth_step_deg = 1.0", "azimuth_step_deg = 1e-7"),
+        r"8 rings every 1e-07 degrees are more than",
+    ),
+    "ROI beyond the Earth": (edit("center_m = [20, 0, 2.5]", "center_m = [1e300, 0, 2.5]"), r"roi.center_m.0: 1e\+300"),
+    "endless traffic": (edit("frame_period_s = 0.5", "frame_period_s = 1e12"), r"seconds of traffic: at most"),
+    "statics beyond the Earth": (
+        statics(polygon([[0, 0], [1e300, 0], [1e300, 1], [0, 0]])),
+        r"lies 1e\+300 m from the world's zero",
+    ),
+    "statics nested without end": (
+        put("statics.geojson", "[" * 200_000),
+        r"statics.geojson: (is not valid JSON|has no list)",
+    ),
+    # measured scans
+    "points from elsewhere": (
+        put("cloud.csv", "x_m,y_m,z_m\n10,500,3\n", POINTS, ONE_SITE),
+        r"none of 1 points lies on a beam",
+    ),
+    "points missing": (
+        put("sites.csv", "site,x_m,y_m,z_m\na,10,12,3\n", POINTS),
+        r"points = 'cloud.csv': no such file",
+    ),
+    "points for two sites": (put("cloud.csv", "x_m,y_m,z_m\n1,1,0\n", POINTS), r"one measured scan for 2 sites"),
+    "points without z": (put("cloud.csv", "x_m,y_m\n1,1\n", POINTS, ONE_SITE), r"cloud.csv.*z_m"),
+    "points of an unknown kind": (
+        put("cloud.abc", "1", edit('sensor = "small"', 'sensor = "small"\npoints = "cloud.abc"'), ONE_SITE),
+        r"cloud.abc.*\.pcd",
+    ),
+    "truncated PCD": (
+        put(
+            "cloud.pcd",
+            b"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 9\nHEIGHT 1\nPOINTS 9\nDATA binary\n\x00\x00",
+            edit('sensor = "small"', 'sensor = "small"\npoints = "cloud.pcd"'),
+            ONE_SITE,
+        ),
+        r"cloud.pcd",
+    ),
+}
+
+
+@pytest.mark.parametrize(("change", "message"), BAD.values(), ids=BAD.keys())
+def test_wrong_scenario_is_answered(mini: Path, tmp_path: Path, egvs, change: Change, message: str) -> None:
+    change(mini)
+    out = tmp_path / "out"
+    code, printed, said = egvs("run", mini, "--out", out)
+    assert code == 2, said
+    last = said[said.index("egvs: ") :]
+    import re
+
+    assert re.search(message, last, re.DOTALL), last
+    assert "Traceback" not in said
+    assert printed == ""
+    assert not list(out.glob(".*.partial"))
+    assert not (out / "scores.parquet").exists() or "keep_visibility" in message
+
+
+def test_every_message_is_its_own() -> None:
+    messages = [message for _, message in BAD.values()]
+    assert len(messages) >= 50
+    assert len(set(messages)) > 0.9 * len(messages)
+
+
+COMMANDS = {
+    "unknown verb": (["rum", "x"], r"No such command"),
+    "no such folder": (["run", "nowhere"], r"nowhere: no scenario.toml there"),
+    "--set without value": (["run", "{mini}", "--set", "roi.voxel_m"], r"--set roi.voxel_m: no key=value"),
+    "--set unknown": (["run", "{mini}", "--set", "roi.voxel=1"], r"roi.voxel: unknown key; did you mean voxel_m"),
+    "--set through a value": (["run", "{mini}", "--set", "seed.x=1"], r"'seed' is not a table"),
+    "--traci without port": (["traffic", "{mini}", "--traci", "here"], r"--traci: 'here'; HOST:PORT"),
+    "--cloud unknown": (["scan", "{mini}", "--cloud", "xyz"], r"--cloud: 'xyz'; ply or pcd"),
+    "stage before its inputs": (["tpog", "{mini}", "--out", "{out}"], r"trajectories.parquet|statics.ply"),
+    "verify nothing": (["verify", "{out}"], r"run.json: no such file"),
+    "jobs 0": (["run", "{mini}", "--jobs", "0"], r"--jobs"),
+    "--at no place": (["new", "{out}", "--osm", "x.osm", "--at", "here"], r"--at: 'here'; LAT,LON"),
+    "osm missing": (["new", "{out}", "--osm", "{out}.osm"], r"\.osm"),
+}
+
+
+@pytest.mark.parametrize(("arguments", "message"), COMMANDS.values(), ids=COMMANDS.keys())
+def test_wrong_command_is_answered(mini: Path, tmp_path: Path, egvs, arguments: list[str], message: str) -> None:
+    import re
+
+    code, _, said = egvs(*(a.format(mini=mini, out=tmp_path / "out") for a in arguments))
+    assert code == 2, said
+    assert re.search(message, said), said
+    assert "Traceback" not in said
+
+
+def spoil_parquet(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[-20] ^= 0xFF
+    path.write_bytes(bytes(data))
+
+
+@pytest.mark.parametrize("name", ["trajectories.parquet", "tpog.parquet", "scans.parquet", "statics.ply"])
+@pytest.mark.parametrize("how", ["truncated", "one byte", "other columns", "no file"])
+def test_a_damaged_artefact_is_named_by_the_stage_that_reads_it(
+    mini: Path, tmp_path: Path, egvs, name: str, how: str
+) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    out = tmp_path / "out"
+    for stage in ("traffic", "statics", "tpog", "scan"):
+        assert egvs(stage, mini, "--out", out)[0] == 0
+    path = out / name
+    if how == "truncated":
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    elif how == "one byte" and path.suffix == ".parquet":
+        spoil_parquet(path)
+    elif how == "other columns" and path.suffix == ".parquet":
+        pq.write_table(pa.table({"a": [1]}), path)
+    else:
+        path.unlink()
+    reader = {"trajectories.parquet": "tpog", "tpog.parquet": "score", "scans.parquet": "score", "statics.ply": "scan"}[
+        name
+    ]
+    code, _, said = egvs(reader, mini, "--out", out)
+    assert code == 2, said
+    assert name in said
+    assert "Traceback" not in said
+
+
+def metadata_of(path: Path, metadata: object) -> None:
+    """Write a Parquet file again with other metadata under the key egvs."""
+    import pyarrow.parquet as pq
+
+    table = pq.read_table(path)
+    raw = metadata if isinstance(metadata, bytes) else json.dumps(metadata).encode()
+    pq.write_table(table.replace_schema_metadata({b"egvs": raw}), path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda about: b"{", "its metadata is no JSON"),
+        (lambda about: [about], "its metadata is \\["),
+        (lambda about: about | {"schema": 99}, "schema version 99"),
+        (lambda about: about | {"grid": None}, "grid = None"),
+        (lambda about: about | {"grid": {"origin_m": [0, 0, 0], "voxel_m": 0, "shape": [1, 1, 1]}}, "grid = "),
+        (
+            lambda about: about | {"grid": {"origin_m": [0, 0, 0], "voxel_m": 1, "shape": [10**6, 10**6, 10**6]}},
+            "grid = ",
+        ),
+        (lambda about: {k: v for k, v in about.items() if k != "frames"}, "frames = None"),
+        (lambda about: about | {"frames": "many"}, "frames = 'many'"),
+        (lambda about: about | {"block_frames": 0}, "block_frames = 0"),
+    ],
+)
+def test_altered_metadata_is_named(mini: Path, tmp_path: Path, egvs, change, message: str) -> None:
+    import re
+
+    from pipeline.artefacts import tables
+
+    out = tmp_path / "out"
+    for stage in ("traffic", "statics", "tpog", "scan"):
+        assert egvs(stage, mini, "--out", out)[0] == 0
+    path = out / "tpog.parquet"
+    metadata_of(path, change(tables.read_metadata(path, "tpog")))
+    code, _, said = egvs("score", mini, "--out", out)
+    assert (code, bool(re.search(rf"tpog.parquet: .*{message}", said))) == (2, True), said
+
+
+def test_an_empty_set_of_features_is_a_world_of_ground_alone(mini: Path, tmp_path: Path, egvs) -> None:
+    (mini / "statics.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": []}))
+    code, _, said = egvs("statics", mini, "--out", tmp_path / "out")
+    assert code == 0, said

@@ -1,0 +1,544 @@
+"""Do vehicles hide what is behind them, as often as a brute-force count says?
+
+The twin below shares no code with the effect: half-spaces from rotation matrices instead of slabs, every voxel of the
+grid instead of a march, every box for every beam. It must find the same whole numbers."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+import pipeline
+from benchmarks import occlusion as benchmark
+from pipeline.artefacts import tables
+from pipeline.core import files
+from pipeline.core.errors import InputError
+from pipeline.core.grid import Grid, Roi
+from pipeline.effects.score import moving_occlusion as effect
+from pipeline.effects.score.rain import Model as RainModel
+from pipeline.effects.score.rain import Rain
+from pipeline.scoring.visibility import UNIT, Beams, Visibility
+from pipeline.sensing import crossings
+from pipeline.stages import score
+
+ON = "effects.moving_occlusion.method=frames"
+ALL = "effects.moving_occlusion.frames=all"
+INDEPENDENT = "effects.moving_occlusion.method=independent"
+GRID = Grid.over(Roi((0.0, -5.0, 0.0), (20.0, 10.0, 5.0)), 0.5)
+SHRINK, CHORD = 1e-4, 1e-6
+
+
+# The twin
+
+
+def twin_ranges(o: np.ndarray, d: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """Range (n,) at which rays from ``o`` with unit directions ``d`` enter the first of ``boxes`` (m, 8): six
+    half-spaces each."""
+    first = np.full(len(d), np.inf)
+    for x, y, z, yaw, pitch, *size in boxes:
+        about_z = np.array([[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]])
+        about_y = np.array([[math.cos(pitch), 0, -math.sin(pitch)], [0, 1, 0], [math.sin(pitch), 0, math.cos(pitch)]])
+        forward_left_up = (about_z @ about_y).T
+        normals = np.vstack([forward_left_up, -forward_left_up])
+        away = normals @ (o - [x, y, z]) - (np.array(size + size) / 2 - SHRINK)  # > 0: the sensor is outside this face
+        if (away < 0).all():
+            continue
+        t_in, t_out = np.zeros(len(d)), np.full(len(d), np.inf)
+        for rate, a in zip(normals @ d.T, away, strict=True):
+            with np.errstate(divide="ignore", invalid="ignore"):
+                t = -a / rate
+            t_in = np.where(rate < 0, np.fmax(t_in, t), t_in)
+            t_out = np.where(rate > 0, np.fmin(t_out, t), t_out)
+            t_out = np.where((rate == 0) & (a >= 0), -np.inf, t_out)
+        first = np.where(t_in < t_out, np.fmin(first, t_in), first)
+    return first
+
+
+def twin_crossings(o: np.ndarray, end: np.ndarray, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """Flat voxels that a segment crosses and the ranges of entry, sorted by range: every voxel of the grid is asked."""
+    length = math.sqrt((end**2).sum())
+    corner = (
+        np.stack(np.meshgrid(*(np.arange(n) for n in grid.shape), indexing="ij"), axis=-1).reshape(-1, 3) * grid.voxel_m
+    )
+    t0, t1 = np.zeros(len(corner)), np.full(len(corner), 1.0)
+    for a in range(3):
+        low, high = corner[:, a] - o[a], corner[:, a] + grid.voxel_m - o[a]
+        if end[a] == 0:
+            t1[~((low <= 0) & (high > 0))] = -1
+        else:
+            t0, t1 = (
+                np.maximum(t0, np.minimum(low / end[a], high / end[a])),
+                np.minimum(t1, np.maximum(low / end[a], high / end[a])),
+            )
+    met = np.flatnonzero((t1 - t0) * length > CHORD)
+    order = np.argsort(t0[met], kind="stable")
+    return met[order], t0[met][order] * length
+
+
+def twin_blocked(
+    o: np.ndarray, ends: np.ndarray, first: np.ndarray, enter: np.ndarray, frames: dict[int, np.ndarray]
+) -> np.ndarray:
+    """Frames in which each crossing is not reached."""
+    beam = np.repeat(np.arange(len(ends)), np.diff(first))
+    directions = ends / np.sqrt((ends**2).sum(axis=1))[:, None]
+    blocked = np.zeros(len(enter), dtype=np.int64)
+    for boxes in frames.values():
+        blocked += twin_ranges(o, directions, boxes)[beam] < enter
+    return blocked
+
+
+# Small scenes
+
+
+def site(x: float, y: float, z: float) -> dict[str, Any]:
+    return {"site": "a", "x_m": x, "y_m": y, "z_m": z, "sensor": "small"}
+
+
+def replay(frames: dict[int, list[list[float]]], count: int, grid: Grid = GRID) -> effect.Replay:
+    """A replay of ``count`` frames; boxes in the world frame."""
+    frame = np.array([f for f, boxes in frames.items() for _ in boxes], dtype=np.int64)
+    values = np.array([box for boxes in frames.values() for box in boxes], dtype=np.float64).reshape(-1, 8)
+    values[:, :3] -= grid.origin_m
+    return effect.Replay.of(count, frame, values)
+
+
+def listed(where: dict[str, Any], ends: Any, grid: Grid = GRID) -> crossings.Crossings:
+    """The crossings of fewer beams than one chunk holds."""
+    (found,) = crossings.listed(where, np.asarray(ends, dtype=np.float64), grid)
+    return found
+
+
+def car(
+    x: float, y: float, *, yaw: float = 0.0, pitch: float = 0.0, size: tuple[float, float, float] = (4.0, 2.0, 1.5)
+) -> list[float]:
+    return [x, y, size[2] / 2, yaw, pitch, *size]
+
+
+def random_scene(seed: int) -> tuple[np.ndarray, crossings.Crossings, dict[int, np.ndarray]]:
+    """A sensor in, above or beside random boxes, and rays of every kind with made-up crossings."""
+    draw = np.random.default_rng(seed)
+    frames = {}
+    for f in np.flatnonzero(draw.random(12) < 0.8):
+        n = int(draw.integers(1, 12))
+        centre = np.column_stack([draw.uniform(-15, 15, (n, 2)), draw.uniform(-1, 4, n)])
+        pitch = draw.choice([0.0, 0.05, -0.3, 1.2], n)
+        frames[int(f)] = np.column_stack([centre, draw.uniform(-7, 7, n), pitch, draw.uniform(0.3, 9, (n, 3))])
+    o = np.append(draw.uniform(-8, 8, 2), draw.uniform(0, 7))
+    ends = draw.normal(size=(300, 3)) * [1, 1, 0.4] * 10
+    ends[:40] = np.rint(ends[:40] / 5)  # along axes and diagonals
+    ends[40:60] = [0, 0, -8]
+    ends[60:62] = [[0, 0, 9], [-7, -0.0, 0]]
+    ends[~ends.any(axis=1)] = [1, 0, 0]
+    counts = draw.integers(0, 9, len(ends))
+    first = np.append(0, np.cumsum(counts)).astype(np.int64)
+    enter = np.concatenate([np.sort(draw.uniform(0, 25, n)) for n in counts])
+    where = site(*(o + GRID.origin_m).tolist())
+    return (
+        o,
+        crossings.Crossings(where, GRID, slice(0, 300), first, ends, np.zeros(len(enter), np.int64), enter, enter),
+        frames,
+    )
+
+
+def replay_of(frames: dict[int, np.ndarray], count: int = 12) -> effect.Replay:
+    """A replay from boxes in the grid's frame."""
+    frame = np.repeat(list(frames), [len(b) for b in frames.values()]).astype(np.int64)
+    return effect.Replay.of(count, frame, np.vstack([np.empty((0, 8)), *frames.values()]))
+
+
+@pytest.fixture
+def ran(mini: Path, tmp_path: Path) -> tuple[Path, Path]:
+    """A scenario folder and the folder of its finished, plain run."""
+    out = tmp_path / "out"
+    pipeline.run(pipeline.load(mini), out)
+    return mini, out
+
+
+def scores(folder: Path, out: Path, *overrides: str, jobs: int | None = None) -> list[float]:
+    score.run(pipeline.load(folder, overrides), out, jobs=jobs)
+    return tables.read(out / "scores.parquet", "scores")[0].column("egvs").to_pylist()
+
+
+def with_trajectories(out: Path, table: pa.Table, groups: int = 1) -> None:
+    """Put other boxes in the place of those recorded, in ``groups`` row groups of whole frames."""
+    about = tables.read_metadata(out / "trajectories.parquet", "trajectories")
+    cuts = np.searchsorted(table.column("frame").to_numpy(), np.linspace(0, about["frames"], groups + 1))
+    with tables.writer(out / "trajectories.parquet", "trajectories") as file:
+        for low, high in pairwise(cuts):
+            file.write({name: table.column(name).slice(low, high - low).to_pylist() for name in table.column_names})
+        file.describe(about)
+
+
+def trajectories(out: Path) -> pa.Table:
+    return tables.read(out / "trajectories.parquet", "trajectories")[0]
+
+
+def recorded(out: Path, grid: Grid) -> dict[int, np.ndarray]:
+    """Boxes of each frame in the grid's frame."""
+    table = trajectories(out)
+    names = ("x_m", "y_m", "z_m", "yaw_rad", "pitch_rad", "length_m", "width_m", "height_m")
+    values = np.column_stack([table.column(name).to_numpy() for name in names])
+    values[:, :3] -= grid.origin_m
+    frame = table.column("frame").to_numpy()
+    return {int(f): values[frame == f] for f in np.unique(frame)}
+
+
+# By hand
+
+
+def test_a_car_parked_in_half_of_the_frames_halves_what_is_behind_it() -> None:
+    half = replay({0: [car(10, 0.25)], 2: [car(10, 0.25)]}, 4)  # from x = 8 to 12
+    share = half.share(listed(site(0, 0.25, 1), [[20, 0, 0]]))
+    assert share.tolist() == [1.0] * 17 + [0.5] * 23  # 16 voxels before it, and the first of its own
+
+
+def test_the_nearest_of_two_cars_counts_once() -> None:
+    both = replay({0: [car(15, 0.25), car(5, 0.25)], 1: [car(15, 0.25)]}, 2)
+    share = both.share(listed(site(0, 0.25, 1), [[20, 0, 0]]))
+    assert share.tolist() == [1.0] * 7 + [0.5] * 20 + [0.0] * 13
+
+
+def test_a_beam_passes_over_under_and_beside() -> None:
+    one = replay({0: [car(10, 0)]}, 1)
+    for ends, z in (([20, 0, 0], 1.75), ([20, 0, 0], 1.5), ([20, 1.25, 0], 1.75)):
+        assert (one.share(listed(site(0, 0.25, z), [ends])) == 1).all()
+    assert (one.share(listed(site(0, 1.0, 1), [[20, 0, 0]])) == 1).all()  # along its side, to the last bit
+    assert (one.share(listed(site(0, 1.0 - 0.5e-4, 1), [[20, 0, 0]])) == 1).all()  # 0.05 mm deep
+    assert (one.share(listed(site(0, 1.0 - 2e-4, 1), [[20, 0, 0]])) == 1).sum() == 17  # 0.2 mm deep
+
+
+def test_a_face_on_a_voxel_face_hides_from_the_second_voxel_on_from_either_side() -> None:
+    one = replay({0: [car(10, 0.25)]}, 1)
+    there = one.share(listed(site(0, 0.25, 1), [[20, 0, 0]]))
+    back = one.share(listed(site(20, 0.25, 1), [[-20, 0, 0]]))
+    assert there.tolist() == back.tolist() == [1.0] * 17 + [0.0] * 23
+
+
+def test_where_a_beam_ends_at_the_very_range_of_a_voxel_that_voxel_counts() -> None:
+    stop = -(2 - SHRINK) + 10  # as the slab gives it
+    enter = np.array([stop, np.nextafter(stop, 20)])
+    ends, none = np.array([[20.0, 0, 0]]), np.zeros(2, np.int64)
+    beam = crossings.Crossings(site(0, 0.25, 1), GRID, slice(0, 1), np.array([0, 2]), ends, none, enter, enter)
+    assert replay({0: [car(10, 0.25)]}, 1).share(beam).tolist() == [1.0, 0.0]
+
+
+def test_a_raised_nose_lets_beams_pass_under_it() -> None:
+    level, raised = car(10, 0.25, size=(4, 2, 0.5)), car(10, 0.25, size=(4, 2, 0.5), pitch=0.3)
+    level[2] = raised[2] = 1.0
+    beams = listed(site(20, 0.25, 0.8), [[-20, 0, 0]])  # from the front: its nose is 0.59 m up
+    assert np.argmin(replay({0: [level]}, 1).share(beams)) == 17
+    # Lower front edge of the raised box: x = 10 + 2 cos - 0.25 (-sin) ..., z = 1 + 2 sin - 0.25 cos = 1.35; its belly
+    # falls to z = 0.8 where 1 + s sin 0.3 - 0.25 cos 0.3 = 0.8, s = 0.1314, x = 10 + s cos 0.3 + 0.25 sin 0.3 =
+    # 10.1994: voxel 20.
+    assert np.argmin(replay({0: [raised]}, 1).share(beams)) == 20
+
+
+def test_a_vehicle_round_the_sensor_is_ignored_and_counted() -> None:
+    beams = listed(site(10, 0.25, 1), [[9, 0, 0], [0, 0, -0.9], [-9, 1, 0.1]])
+    inside = replay({0: [car(10, 0.25)], 1: [car(10, 0.25), car(15, 0.25)]}, 2)
+    where = np.array([10, 0.25, 1]) - GRID.origin_m
+    assert inside.holding(where) == 2
+    assert inside.holding(where + np.array([0, 0, 0.5])) == 0  # on the roof
+    share = inside.share(beams)
+    assert share[: beams.first[1]].tolist() == [1.0] * 7 + [0.5] * 11
+    assert (share[beams.first[1] :] == 1).all()
+
+
+# Against the twin
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_random_boxes_and_rays_give_the_twins_numbers(seed: int) -> None:
+    o, rays, frames = random_scene(seed)
+    expected = twin_blocked(o, rays.ends_m, rays.first, rays.enter_m, frames)
+    found = replay_of(frames).blocked(rays)
+    assert found.tolist() == expected.tolist()
+    assert expected.any()
+
+
+def test_a_whole_run_gives_the_twins_hits(ran: tuple[Path, Path]) -> None:
+    folder, out = ran
+    settings = ("roi.voxel_m=1", "sensors.small.azimuth_step_deg=4", 'score.keep_visibility="all"', ON, ALL)
+    scenario = pipeline.load(folder, settings)
+    pipeline.run(scenario, out)
+    grid = scenario.roi.grid
+    frames = recorded(out, grid)
+    scans = tables.read(out / "scans.parquet", "scans")[0]
+    hidden = 0
+    for about in tables.read_metadata(out / "scans.parquet", "scans")["sites"]:
+        mine = scans.filter(pa.compute.equal(scans.column("site"), about["site"]))
+        ends = np.column_stack([mine.column(name).to_numpy() for name in ("dx_m", "dy_m", "dz_m")])
+        o = np.array([about["x_m"], about["y_m"], about["z_m"]]) - grid.origin_m
+        lists = [twin_crossings(o, end, grid) for end in ends]
+        first = np.append(0, np.cumsum([len(cells) for cells, _ in lists]))
+        blocked = twin_blocked(o, ends, first, np.concatenate([enter for _, enter in lists]), frames)
+        whole = np.zeros(np.prod(grid.shape), dtype=np.int64)
+        np.add.at(
+            whole, np.concatenate([cells for cells, _ in lists]), np.rint((40 - blocked) / 40 * UNIT).astype(np.int64)
+        )
+        hits = pipeline.read_visibility(out / "visibility.parquet", about["site"])
+        assert (hits.ravel() * UNIT).tolist() == whole.tolist()
+        hidden += int(blocked.sum())
+    assert hidden > 1000
+
+
+def test_independent_is_the_product_over_the_voxels_before(ran: tuple[Path, Path]) -> None:
+    folder, out = ran
+    scenario = pipeline.load(folder, ["roi.voxel_m=1"])
+    pipeline.run(scenario, out)
+    counts, grid = pipeline.read_tpog(out / "tpog.parquet").counts.ravel(), scenario.roi.grid
+    made = effect.MovingOcclusion(effect.Model(method="independent")).prepare(scenario, out)
+    draw, where = np.random.default_rng(3), site(10, 12, 3)
+    ends = np.column_stack([draw.uniform(-12, 28, 60), draw.uniform(-22, -11, 60), np.full(60, -2.9)])
+    found = listed(where, ends, grid)
+    share, darkest = made.share(found), 1.0
+    for n, end in enumerate(ends):
+        cells, _ = twin_crossings(np.array([10, 12, 3]) - grid.origin_m, end, grid)
+        free = 1.0
+        for cell, got in zip(cells, share[found.first[n] : found.first[n + 1]], strict=True):
+            assert got == pytest.approx(free, rel=1e-12)
+            free *= 1 - counts[cell] / 40
+        darkest = min(darkest, free)
+    assert darkest < 0.8
+
+
+# Limits
+
+
+def test_without_vehicles_in_reach_the_scores_are_the_plain_ones(ran: tuple[Path, Path]) -> None:
+    folder, out = ran
+    plain = tables.read(out / "scores.parquet", "scores")[0]
+    boxes = trajectories(out)
+    assert scores(folder, out, ON) < plain.column("egvs").to_pylist()
+    away = boxes.set_column(boxes.column_names.index("y_m"), "y_m", pa.compute.add(boxes.column("y_m"), 500.0))
+    for table in (away, boxes.slice(0, 0)):
+        with_trajectories(out, table)
+        for frames in ("all", "7"):
+            assert scores(folder, out, f"effects.moving_occlusion.frames={frames}") == plain.column("egvs").to_pylist()
+
+
+def test_independent_without_occupancy_changes_nothing() -> None:
+    free = effect.Independent(10, np.zeros(np.prod(GRID.shape), dtype=np.uint32))
+    assert (free.share(listed(site(-1, 0.3, 3), [[20, 1, -2], [3, 3, -3]])) == 1).all()
+
+
+def test_what_is_always_occupied_hides_everything_behind_it() -> None:
+    counts = np.zeros(GRID.shape, dtype=np.uint32)
+    counts[16] = 10
+    share = effect.Independent(10, counts.ravel()).share(listed(site(0, 0.25, 1), [[20, 0, 0]]))
+    assert share.tolist() == [1.0] * 17 + [0.0] * 23
+
+
+def test_boxes_behind_the_last_crossing_and_behind_the_sensor_hide_nothing() -> None:
+    none = replay({0: [car(18, 0.25), car(-4, 0.25), car(1, 4)]}, 1)
+    assert (none.share(listed(site(0, 0.25, 1), [[15, 0, 0]])) == 1).all()
+
+
+# Truths
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_more_vehicles_never_raise_a_share(seed: int) -> None:
+    _, rays, frames = random_scene(seed)
+    _, _, others = random_scene(seed + 100)
+    more = {
+        f: np.vstack([frames.get(f, np.empty((0, 8))), others.get(f, np.empty((0, 8)))])
+        for f in sorted({*frames, *others})
+    }
+    fewer, all_of_them = replay_of(frames).share(rays), replay_of(more).share(rays)
+    assert (all_of_them <= fewer).all()
+    assert (all_of_them < fewer).any()
+
+
+def test_all_frames_are_the_mean_of_each_and_their_order_does_not_matter() -> None:
+    _, rays, frames = random_scene(7)
+    single = [replay_of({0: boxes}, 1).blocked(rays) for boxes in frames.values()]
+    assert sum(single).tolist() == replay_of(frames).blocked(rays).tolist()
+    turned = {f: boxes[::-1] for f, boxes in zip(frames, reversed(frames.values()), strict=True)}
+    assert replay_of(turned).blocked(rays).tolist() == replay_of(frames).blocked(rays).tolist()
+
+
+def test_it_multiplies_with_rain(ran: tuple[Path, Path]) -> None:
+    folder, out = ran
+    scenario = pipeline.load(folder, [ON, ALL, "effects.rain.rate_mm_h=30"])
+    where, ends = site(1, -9, 3), np.array([[20.0, 9.0, -2.5]])
+    found = listed(where, ends, scenario.roi.grid)
+    occluded = effect.MovingOcclusion(effect.Model(frames="all")).prepare(scenario, out).share(found)
+    rain = Rain(RainModel(rate_mm_h=30)).detect(found.middle_m, None)  # type: ignore[arg-type]
+    hits = Visibility(scenario, out, scenario.roi.grid).hits(Beams(where, ends))
+    assert hits[found.cells].tolist() == np.rint(rain * occluded * UNIT).astype(np.int64).tolist()
+    assert occluded.min() < 1 > rain.max()
+
+
+def test_a_scene_that_is_moved_far_away_gives_the_same_shares() -> None:
+    far = Grid((GRID.origin_m[0] + 2.0**18, GRID.origin_m[1] - 2.0**21, 0.0), GRID.voxel_m, GRID.shape)
+    boxes, ends = {0: [car(8, 0.5, yaw=0.5)], 1: [car(12, -0.25, yaw=-1)]}, [[20, 0, 0], [19, 1, 0.125]]
+    moved = {f: [[x + 2.0**18, y - 2.0**21, *rest] for x, y, *rest in cars] for f, cars in boxes.items()}
+    here = replay(boxes, 3).share(listed(site(0, 0.25, 1), ends))
+    there = replay(moved, 3, far).share(listed(site(2.0**18, 0.25 - 2.0**21, 1), ends, far))
+    assert here.tolist() == there.tolist()
+    assert len(set(here.tolist())) == 3
+
+
+@pytest.mark.parametrize("switch", [ON, INDEPENDENT])
+def test_threads_change_no_byte(ran: tuple[Path, Path], switch: str) -> None:
+    folder, out = ran
+    digests = set()
+    for jobs in (1, 2, 3):
+        scores(folder, out, switch, jobs=jobs)
+        digests.add(files.sha256_of(out / "scores.parquet"))
+    assert len(digests) == 1
+
+
+# Which frames
+
+
+def test_frames_are_spread_evenly() -> None:
+    assert effect.replayed(10, 5).tolist() == [1, 3, 5, 7, 9]
+    assert effect.replayed(10, 1).tolist() == [5]
+    assert effect.replayed(7, 3).tolist() == [1, 3, 5]
+    assert effect.replayed(5000, 500)[[0, -1]].tolist() == [5, 4995]
+    for wanted in (0, 7, 8):
+        assert effect.replayed(7, wanted).tolist() == list(range(7))
+
+
+def test_a_subset_is_the_same_each_time_and_too_many_are_all(ran: tuple[Path, Path]) -> None:
+    folder, out = ran
+    few = scores(folder, out, "effects.moving_occlusion.frames=9")
+    assert few == scores(folder, out, "effects.moving_occlusion.frames=9")
+    whole = scores(folder, out, ON, ALL)
+    assert whole != few
+    for frames in (0, 40, 41, 500):
+        assert scores(folder, out, f"effects.moving_occlusion.frames={frames}") == whole
+    assert scores(folder, out, ON) == whole  # the default is more than this scenario records
+
+
+def test_only_row_groups_with_replayed_frames_are_read(ran: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, out = ran
+    scenario = pipeline.load(folder)
+    one = effect.MovingOcclusion(effect.Model(frames=1))
+    whole = one.prepare(scenario, out).ready
+    with_trajectories(out, trajectories(out), groups=40)
+    read: list[int] = []
+    true = tables.read_group
+    monkeypatch.setattr(tables, "read_group", lambda file, group, *more: read.append(group) or true(file, group, *more))
+    parts = one.prepare(scenario, out).ready
+    assert read == [20]
+    assert isinstance(whole, effect.Replay) and isinstance(parts, effect.Replay)
+    assert whole.values.tolist() == parts.values.tolist() and len(parts.values) == 2
+
+
+def test_boxes_beyond_the_sites_and_the_region_are_dropped(ran: tuple[Path, Path]) -> None:
+    folder, out = ran
+    boxes = trajectories(out)
+    ready = effect.MovingOcclusion(effect.Model(frames=0)).prepare(pipeline.load(folder), out).ready
+    away = boxes.set_column(boxes.column_names.index("x_m"), "x_m", pa.compute.add(boxes.column("x_m"), 80.0))
+    with_trajectories(out, pa.concat_tables([boxes, away.cast(boxes.schema)]).sort_by("frame"))
+    again = effect.MovingOcclusion(effect.Model(frames=0)).prepare(pipeline.load(folder), out).ready
+    assert isinstance(ready, effect.Replay) and isinstance(again, effect.Replay)
+    assert len(ready.frame) == len(again.frame) > 0
+
+
+def test_a_vehicle_between_a_site_and_the_region_hides(ran: tuple[Path, Path]) -> None:
+    folder, out = ran
+    plain = scores(folder, out)
+    boxes = trajectories(out)
+    columns = dict(
+        zip(("x_m", "y_m", "z_m", "length_m", "width_m", "height_m"), (10.0, 10.7, 1.5, 1.0, 1.0, 3.0), strict=True)
+    )
+    for name, value in columns.items():
+        boxes = boxes.set_column(boxes.column_names.index(name), name, pa.array([value] * len(boxes)))
+    with_trajectories(out, boxes)
+    near, other = scores(folder, out, ON)
+    assert 0 < near < 0.8 * plain[0]
+    assert 0.95 * plain[1] < other <= plain[1]
+
+
+def test_without_kept_scans_the_scores_are_the_same(ran: tuple[Path, Path]) -> None:
+    folder, out = ran
+    kept = scores(folder, out, ON)
+    (out / "scans.parquet").unlink()
+    assert scores(folder, out, ON, "scan.keep=false") == kept
+
+
+# What the stage says, and what it refuses
+
+
+def test_scores_depend_on_the_trajectories_only_when_they_are_replayed(ran: tuple[Path, Path]) -> None:
+    folder, out = ran
+    named = {"trajectories.parquet": files.sha256_of(out / "trajectories.parquet")}
+    plain = score.inputs(pipeline.load(folder), out)["files"]
+    assert score.inputs(pipeline.load(folder, [ON]), out)["files"] == plain | named
+    assert score.inputs(pipeline.load(folder, [INDEPENDENT]), out)["files"] == plain
+    assert score.inputs(pipeline.load(folder, ["effects.rain.rate_mm_h=3"]), out)["files"] == plain
+
+
+def test_all_and_zero_are_one_setting(mini: Path, tmp_path: Path) -> None:
+    assert effect.Model(frames="all") == effect.Model(frames=0)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (["method=sometimes"], "moving_occlusion.method: 'sometimes'; Input should be 'frames' or 'independent'"),
+        (["frames=-1"], "moving_occlusion.frames: -1; Input should be greater than or equal to 0"),
+        (["frames=2.5"], "moving_occlusion.frames: 2.5; Input should be a valid integer"),
+        (["frames=true"], "moving_occlusion.frames: True; Input should be a valid integer"),
+        (["frames=most"], "moving_occlusion.frames: 'most'; Input should be a valid integer"),
+        (["frame=7"], "moving_occlusion.frame: unknown key; did you mean frames?"),
+        (
+            ["method=independent", "frames=7"],
+            'moving_occlusion.frames: 7; acts on nothing with method = "independent"',
+        ),
+    ],
+)
+def test_bad_parameters_are_refused(egvs: Any, mini: Path, tmp_path: Path, settings: list[str], message: str) -> None:
+    overrides = [word for setting in settings for word in ("--set", f"effects.moving_occlusion.{setting}")]
+    code, _, err = egvs("run", mini, "--out", tmp_path / "out", *overrides)
+    assert code == 2
+    assert message in " ".join(err.split())
+
+
+def test_bad_trajectories_are_refused(ran: tuple[Path, Path]) -> None:
+    folder, out = ran
+    boxes = trajectories(out)
+    width = boxes.column_names.index("width_m")
+    flat = boxes.set_column(width, "width_m", pa.compute.multiply(boxes.column("width_m"), 0.0))
+    with_trajectories(out, flat)
+    with pytest.raises(InputError, match="width_m = 0"):
+        scores(folder, out, ON)
+    with_trajectories(out, boxes.sort_by([("frame", "descending")]))
+    with pytest.raises(InputError, match="out of order"):
+        scores(folder, out, ON)
+    (out / "trajectories.parquet").unlink()
+    with pytest.raises(InputError, match="no such file"):
+        scores(folder, out, ON)
+
+
+def test_it_shares_only_when_prepared() -> None:
+    with pytest.raises(RuntimeError, match="prepare"):
+        effect.MovingOcclusion(effect.Model()).share(listed(site(0, 0, 1), [[20, 0, 0]]))
+
+
+# The comparison
+
+
+def test_the_error_of_independent_is_reported(ran: tuple[Path, Path]) -> None:
+    folder, out = ran
+    plain, framed, independent = scores(folder, out), scores(folder, out, ON), scores(folder, out, INDEPENDENT)
+    found = benchmark.compare(pipeline.load(folder, [ON]), out)
+    rows = found["rows"]
+    assert [row["site"] for row in rows] == ["pole_a", "pole_b"]
+    assert [row["plain"] for row in rows] == plain
+    assert [row["frames"] for row in rows] == framed
+    assert [row["independent"] for row in rows] == independent
+    assert [row["error"] for row in rows] == [(i - f) / f for i, f in zip(independent, framed, strict=True)]
+    assert all(0 < i < f < p for i, f, p in zip(independent, framed, plain, strict=True))
+    assert set(found["tau"]) == {"plain, frames", "independent, frames", "independent, plain"}
+    assert all(tau in (-1.0, 1.0) for tau in found["tau"].values())

@@ -1,0 +1,449 @@
+"""Point clouds: hand-made files of every kind, exact round trips, and what is said about files that are wrong."""
+
+from __future__ import annotations
+
+import importlib.util
+import struct
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from pipeline.core.errors import InputError
+from pipeline.formats.point_clouds import read_points, write_points
+
+needs_laspy = pytest.mark.skipif(importlib.util.find_spec("laspy") is None, reason="laspy is not installed (egvs[las])")
+quick = settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+POINTS = np.array([[1 / 3, -2.5, 1e6 / 7], [4.0, 5.0, 6.0]])
+ASCII_PCD = "FIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nWIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA ascii\n1 2 3\n4 5 6\n"
+ASCII_PLY = "ply\nformat ascii 1.0\nelement vertex 2\nproperty double x\nproperty double y\nproperty double z\nend_header\n1 2 3\n4 5 6\n"
+
+
+def put(folder: Path, name: str, content: str | bytes) -> Path:
+    path = folder / name
+    path.write_bytes(content.encode("latin-1") if isinstance(content, str) else content)
+    return path
+
+
+def read(folder: Path, name: str, content: str | bytes) -> list[list[float]]:
+    points, dropped = read_points(put(folder, name, content), "sites.csv: row A")
+    assert points.dtype == np.float64
+    assert dropped == 0
+    rows: list[list[float]] = points.tolist()
+    return rows
+
+
+def pcd(fields: str, sizes: str, types: str, n: int, data: str = "binary", more: str = "") -> bytes:
+    return f"# made by hand\nFIELDS {fields}\nSIZE {sizes}\nTYPE {types}\n{more}WIDTH {n}\nHEIGHT 1\nDATA {data}\n".encode()
+
+
+def lzf(plain: bytes) -> bytes:
+    """A plain, greedy LZF packer: the twin of the module's unpacker."""
+    out, literals, at = bytearray(), bytearray(), 0
+
+    def flush() -> None:
+        for i in range(0, len(literals), 32):
+            out.extend((len(literals[i : i + 32]) - 1, *literals[i : i + 32]))
+        literals.clear()
+
+    while at < len(plain):
+        best, back = 0, 0
+        for first in range(max(0, at - 8192), at):
+            length = 0
+            while length < 264 and at + length < len(plain) and plain[first + length] == plain[at + length]:
+                length += 1
+            if length > best:
+                best, back = length, at - first - 1
+        if best < 3:
+            literals.append(plain[at])
+            at += 1
+            continue
+        flush()
+        out += bytes([min(best - 2, 7) << 5 | back >> 8, *([best - 9] if best >= 9 else []), back & 255])
+        at += best
+    flush()
+    return bytes(out)
+
+
+def packed(plain: bytes) -> bytes:
+    body = lzf(plain)
+    return struct.pack("<II", len(body), len(plain)) + body
+
+
+# --- in and out -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["a.pcd", "a.ply", "A.PCD"])
+def test_round_trip_is_exact_and_repeats_its_bytes(tmp_path: Path, name: str) -> None:
+    first, second = tmp_path / name, tmp_path / "deeper" / name
+    write_points(first, POINTS)
+    write_points(second, POINTS)
+    points, dropped = read_points(first, "")
+    assert points.tobytes() == POINTS.tobytes()
+    assert dropped == 0
+    assert first.read_bytes() == second.read_bytes()
+    assert not list(tmp_path.glob(".*"))
+
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+
+
+@quick
+@given(points=hnp.arrays(np.float64, st.tuples(st.integers(1, 20), st.just(3)), elements=finite))
+@pytest.mark.parametrize("suffix", [".pcd", ".ply"])
+def test_every_finite_float64_survives(
+    tmp_path: Path, suffix: str, points: np.ndarray[Any, np.dtype[np.float64]]
+) -> None:
+    path = tmp_path / f"a{suffix}"
+    write_points(path, points)
+    back, _ = read_points(path, "")
+    assert back.tobytes() == points.tobytes()
+
+
+@quick
+@given(points=hnp.arrays(np.float64, st.tuples(st.integers(1, 8), st.just(3)), elements=finite))
+@pytest.mark.parametrize("name", ["a.pcd", "a.ply", "a.csv"])
+def test_shortest_text_survives(tmp_path: Path, name: str, points: np.ndarray[Any, np.dtype[np.float64]]) -> None:
+    n, separator = len(points), "," if name == "a.csv" else " "
+    head = {
+        "a.pcd": ASCII_PCD[: ASCII_PCD.index("1 2 3")]
+        .replace("WIDTH 2", f"WIDTH {n}")
+        .replace("POINTS 2", f"POINTS {n}"),
+        "a.ply": ASCII_PLY[: ASCII_PLY.index("1 2 3")].replace("vertex 2", f"vertex {n}"),
+        "a.csv": "x_m,y_m,z_m\n",
+    }[name]
+    text = head + "".join(separator.join(map(repr, row)) + "\n" for row in points.tolist())
+    back, _ = read_points(put(tmp_path, name, text), "")
+    assert back.tobytes() == points.tobytes()
+
+
+def test_a_view_of_other_layout_is_written_as_what_it_shows(tmp_path: Path) -> None:
+    write_points(tmp_path / "a.pcd", np.asfortranarray(POINTS)[::-1])
+    assert read_points(tmp_path / "a.pcd", "")[0].tolist() == POINTS[::-1].tolist()
+
+
+def test_write_refuses_other_kinds_and_shapes(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"a\.xyz: is of the unknown kind '\.xyz'; one of \.pcd, \.ply"):
+        write_points(tmp_path / "a.xyz", POINTS)
+    with pytest.raises(ValueError, match=r"shape \(3, 2\)"):
+        write_points(tmp_path / "a.pcd", np.zeros((3, 2)))
+    assert not list(tmp_path.iterdir())
+
+
+# --- PCD --------------------------------------------------------------------------------------------------------------
+
+
+def test_pcd_ascii_takes_fields_in_any_order(tmp_path: Path) -> None:
+    head = pcd("rgb z y n x", "4 4 4 4 8", "U F F F F", 2, "ascii", "COUNT 1 1 1 2 1\n").decode()
+    assert read(tmp_path, "a.pcd", head + "9 3 2 0 0 1\r\n\n9\t6 5  nan inf 4.1") == [[1, 2, 3], [4.1, 5, 6]]
+
+
+def test_pcd_binary_takes_fields_of_any_type(tmp_path: Path) -> None:
+    head = pcd("_ z _ x ring y", "1 2 4 8 2 4", "U I F F U F", 2, more="COUNT 3 1 2 1 1 1\n")
+    body = struct.pack("<3xh8xdHf", -3, 0.1, 7, 2.5) + struct.pack("<3xh8xdHf", 30, 0.2, 8, 0.1)
+    assert read(tmp_path, "a.pcd", head + body) == [[0.1, 2.5, -3], [0.2, float(np.float32(0.1)), 30]]
+
+
+def test_pcd_compressed_holds_each_field_as_a_block(tmp_path: Path) -> None:
+    head = pcd("x n y z", "4 1 8 2", "F U F U", 3, "binary_compressed", "COUNT 1 2 1 1\n")
+    plain = struct.pack("<3f6B3d3H", 1, 2, 3, 0, 0, 0, 0, 0, 0, 0.1, 0.1, 0.1, 7, 7, 65535)
+    body = packed(plain)
+    assert len(body) < len(plain)
+    assert read(tmp_path, "a.pcd", head + body + b"\0" * 9) == [[1, 0.1, 7], [2, 0.1, 7], [3, 0.1, 65535]]
+
+
+def test_lzf_by_hand(tmp_path: Path) -> None:
+    """Four plain bytes; a copy of 4 from 4 back; a copy of 16 from 4 back, which runs into what it writes."""
+    body = bytes([3, 0, 0, 128, 63, 2 << 5, 3, 7 << 5, 16 - 9, 3])
+    head = pcd("x y z", "4 4 4", "F F F", 2, "binary_compressed")
+    assert read(tmp_path, "a.pcd", head + struct.pack("<II", len(body), 24) + body) == [[1, 1, 1], [1, 1, 1]]
+
+
+@quick
+@given(data=st.data())
+def test_compressed_equals_plain(tmp_path: Path, data: st.DataObject) -> None:
+    few = st.sampled_from([0.0, 1.0, -1.5]) | st.floats(width=32, allow_nan=False, allow_infinity=False)
+    points = data.draw(hnp.arrays(np.float32, st.tuples(st.integers(1, 60), st.just(3)), elements=few))
+    head = pcd("x y z", "4 4 4", "F F F", len(points), "binary_compressed")
+    assert read(tmp_path, "a.pcd", head + packed(points.T.tobytes())) == points.astype(float).tolist()
+
+
+def viewed(viewpoint: str) -> str:
+    return ASCII_PCD.replace("POINTS", f"VIEWPOINT {viewpoint}\nPOINTS")
+
+
+@pytest.mark.parametrize(
+    ("viewpoint", "expected"),
+    [
+        ("0 0 0 1 0 0 0", [[1, 2, 3], [4, 5, 6]]),
+        ("0 0 0 -1 0 0 0", [[1, 2, 3], [4, 5, 6]]),
+        ("10 20 30 1 0 0 0", [[11, 22, 33], [14, 25, 36]]),
+        ("10 20 30 0 0 0 1", [[9, 18, 33], [6, 15, 36]]),  # half a turn about z
+        ("0 0 5 0.70710678 0 0 0.70710678", [[-2, 1, 8], [-5, 4, 11]]),  # a quarter to the left: x becomes y
+        ("0 0 5 0.707 0.707 0 0", [[1, -3, 7], [4, -6, 10]]),  # a quarter about x: y becomes z; few digits
+        ("0 0 0 0.5 0.5 0.5 0.5", [[3, 1, 2], [6, 4, 5]]),  # x to y, y to z, z to x
+    ],
+)
+def test_pcd_viewpoint_brings_points_into_the_world(
+    tmp_path: Path, viewpoint: str, expected: list[list[float]]
+) -> None:
+    np.testing.assert_allclose(read(tmp_path, "a.pcd", viewed(viewpoint)), expected, rtol=0, atol=1e-12)
+
+
+def test_pcd_viewpoint_leaves_missing_returns_missing(tmp_path: Path) -> None:
+    text = viewed("1 0 0 0 0 0 1").replace("4 5 6", "inf nan 6")
+    points, dropped = read_points(put(tmp_path, "a.pcd", text), "")
+    assert (points.tolist(), dropped) == ([[0, -2, 3]], 1)
+
+
+# --- PLY, CSV, LAS ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("order", "mark"), [("little", "<"), ("big", ">")])
+@pytest.mark.parametrize(("kind", "letter"), [("double", "d"), ("float64", "d"), ("float", "f"), ("int16", "h")])
+def test_ply_binary(tmp_path: Path, order: str, mark: str, kind: str, letter: str) -> None:
+    head = (
+        f"ply\r\nformat binary_{order}_endian 1.0\r\ncomment end_header to come\r\nelement camera 1\nproperty uchar id\n"
+        f"element vertex 2\nproperty {kind} z\nproperty uchar red\nproperty {kind} y\nproperty {kind} x\n"
+        "element face 1\nproperty list uchar int vertex_indices\nend_header\r\n"
+    ).encode()
+    body = b"\7" + b"".join(
+        struct.pack(f"{mark}{letter}B2{letter}", z, 255, y, x) for x, y, z in [(1, 2, 3), (4, 5, -6)]
+    )
+    assert read(tmp_path, "a.ply", head + body + b"\3" + bytes(12)) == [[1, 2, 3], [4, 5, -6]]
+
+
+def test_ply_ascii_ignores_faces_and_what_comes_before(tmp_path: Path) -> None:
+    text = (
+        "ply\nformat ascii 1.0\nelement path 1\nproperty list uchar int way\nelement vertex 2\nproperty float x\n"
+        "property float y\nproperty uchar red\nproperty float z\nelement face 1\nproperty list uchar int vertex_indices\n"
+        "end_header\n2 0 1\n0.1 2 255 3\n4 5 0 6\n3 0 1 0\n"
+    )
+    assert read(tmp_path, "a.ply", text) == [[0.1, 2, 3], [4, 5, 6]]
+
+
+def test_csv_takes_columns_in_any_order_and_ignores_the_rest(tmp_path: Path) -> None:
+    text = '\xef\xbb\xbfname, z_m,x_m,y_m,,name\r\n"a, b",3,1, 2 ,,\xff\r\n\r\n,6e0,+4,-5.5,x,\r\n'
+    assert read(tmp_path, "a.csv", text) == [[1, 2, 3], [4, -5.5, 6]]
+
+
+def las(folder: Path, name: str, n: int = 300) -> tuple[Path, Any]:
+    import laspy
+
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales, header.offsets = [0.001, 0.001, 0.01], [4e5, 3.9e6, -7.0]
+    cloud = laspy.LasData(header)
+    whole = np.random.default_rng(7).integers(-100_000, 100_000, (n, 3))
+    cloud.X, cloud.Y, cloud.Z = whole.T
+    cloud.write(folder / name)
+    return folder / name, whole * header.scales + header.offsets
+
+
+@needs_laspy
+@pytest.mark.parametrize("name", ["a.las", "a.laz"])
+def test_las_gives_scaled_coordinates_in_float64(tmp_path: Path, name: str) -> None:
+    path, expected = las(tmp_path, name)
+    points, dropped = read_points(path, "")
+    assert points.tobytes() == expected.tobytes()
+    assert dropped == 0
+
+
+@needs_laspy
+@pytest.mark.parametrize("name", ["a.las", "a.laz"])
+def test_las_cut_anywhere_is_refused(tmp_path: Path, name: str) -> None:
+    path, _ = las(tmp_path, name)
+    whole = path.read_bytes()
+    for end in [0, 3, 100, 226, 300, 400, len(whole) // 2, len(whole) - 1]:
+        path.write_bytes(whole[:end])
+        with pytest.raises(InputError, match=rf"{name}: .*; .*a whole"):
+            read_points(path, "")
+
+
+@needs_laspy
+@pytest.mark.parametrize(
+    ("at", "value", "found"),
+    [
+        (0, b"X", "no LASF header"),
+        (100, b"\xff\xff\xff\xff", "points past the file or into itself"),  # number of variable-length records
+        (96, b"\xff\xff\xff\x7f", "points past the file or into itself"),  # where the points start
+        (104, b"\x3f", "cannot be read as LAS"),  # point format 63
+        (247, b"\x2d\x01", "holds|cannot be read"),  # 301 points
+    ],
+)
+def test_las_with_a_damaged_header_is_refused(tmp_path: Path, at: int, value: bytes, found: str) -> None:
+    path, _ = las(tmp_path, "a.las")
+    data = bytearray(path.read_bytes())
+    data[at : at + len(value)] = value
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=found):
+        read_points(path, "")
+
+
+@pytest.mark.parametrize("name", ["a.las", "a.laz"])
+def test_las_without_laspy_says_how_to_get_it(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "laspy", None)
+    with pytest.raises(InputError, match=r"needs laspy, which is not installed; pip install egvs\[las\]"):
+        read_points(put(tmp_path, name, b"LASF"), "")
+
+
+@needs_laspy
+def test_laz_without_a_backend_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import laspy
+
+    path, _ = las(tmp_path, "a.laz")
+    monkeypatch.setattr(laspy.LazBackend, "detect_available", lambda: ())
+    with pytest.raises(InputError, match=r"needs lazrs, which is not installed; pip install egvs\[las\]"):
+        read_points(path, "")
+
+
+# --- what is missing, and what is wrong -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.pcd", ASCII_PCD.replace("POINTS 2", "POINTS 4").replace("WIDTH 2", "WIDTH 4") + "nan nan nan\n1 -inf 3\n"),
+        ("a.pcd", pcd("x y z", "4 4 4", "F F F", 4)
+         + struct.pack("<9f", 1, 2, 3, 4, 5, 6, float("nan"), 0, 0) + b"\x01\0\xa0\x7f" + struct.pack("<2f", 0, 0)),
+        ("a.ply", ASCII_PLY.replace("vertex 2", "vertex 4") + "nan nan nan\n1 -inf 3\n"),
+        ("a.csv", "x_m,y_m,z_m\n1,2,3\n4,5,6\nnan,NaN,0\n1,-inf,3\n"),
+    ],
+    ids=["pcd ascii", "pcd binary, with a signalling NaN", "ply", "csv"],
+)  # fmt: skip
+def test_missing_returns_are_dropped_and_counted(tmp_path: Path, name: str, content: str | bytes) -> None:
+    points, dropped = read_points(put(tmp_path, name, content), "")
+    assert (points.tolist(), dropped) == ([[1, 2, 3], [4, 5, 6]], 2)
+
+
+BINARY = pcd("x y z", "4 4 4", "F F F", 2)
+PACKED = pcd("x y z", "4 4 4", "F F F", 2, "binary_compressed")
+BINARY_PLY = ASCII_PLY[: ASCII_PLY.index("1 2 3")].replace("ascii", "binary_little_endian")
+CSV = "x_m,y_m,z_m\n1,2,3\n"
+OTHER_COLUMNS = r"has no single column 'x_m' \(its columns: x, y_m, z_m\); a header row with x_m, y_m, z_m"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.xyz", "1 2 3", r"a\.xyz: is of the unknown kind '\.xyz'; one of \.pcd, \.ply, \.las, \.laz, \.csv"),
+        ("a", "1 2 3", r"/a: has no suffix that tells its kind; one of \.pcd"),
+        # PCD, header
+        ("a.pcd", "", r"a\.pcd: is not a whole PCD file \(no line DATA in its header\)"),
+        ("a.pcd", ASCII_PCD[:40], "is not a whole PCD file"),
+        ("a.pcd", ASCII_PCD.replace("FIELDS x y z\n", ""), "its PCD header has no line FIELDS"),
+        ("a.pcd", ASCII_PCD.replace("x y z", "x y zz"), r"has no single field 'z' \(its fields: x y zz\); x, y and z"),
+        ("a.pcd", ASCII_PCD.replace("x y z", "x x z"), "has no single field 'x'"),
+        ("a.pcd", ASCII_PCD.replace("TYPE", "COUNT 1 2 1\nTYPE"), "has no single field 'y'"),
+        ("a.pcd", ASCII_PCD.replace("8 8 8", "8 8"), "SIZE has 2 values for 3 FIELDS; one value a field"),
+        ("a.pcd", ASCII_PCD.replace("8 8 8", "8 2 8"), "field 'y' has TYPE F and SIZE 2; F of 4 or 8, I or U"),
+        ("a.pcd", ASCII_PCD.replace("8 8 8", "8 eight 8"), "the SIZE of y is 'eight'; a whole number"),
+        ("a.pcd", ASCII_PCD.replace("F F F", "F Q F"), "field 'y' has TYPE Q and SIZE 8"),
+        ("a.pcd", ASCII_PCD.replace("POINTS 2", "POINTS 3"), "POINTS is 3, but WIDTH x HEIGHT is 2; the same number"),
+        ("a.pcd", ASCII_PCD.replace("POINTS 2", "POINTS -2"), "POINTS is '-2'; a whole number"),
+        ("a.pcd", ASCII_PCD.replace("POINTS 2", "POINTS " + "9" * 5000), "POINTS is '9+'; a whole number"),
+        ("a.pcd", ASCII_PCD.replace("POINTS 2\n", "").replace("WIDTH 2\n", ""), "no line POINTS"),
+        ("a.pcd", ASCII_PCD.replace(" 2\n", " 0\n"), "holds no points, says its header; at least one return"),
+        ("a.pcd", ASCII_PCD.replace("ascii", "zip"), "DATA is 'zip'; ascii, binary or binary_compressed"),
+        ("a.pcd", viewed("0 0 0 2 0 0 0"), "VIEWPOINT is '0 0 0 2 0 0 0'; a translation and a unit quaternion"),
+        ("a.pcd", viewed("0 0 nan 1 0 0 0"), "VIEWPOINT is '0 0 nan 1 0 0 0'"),
+        ("a.pcd", viewed("0 0 0"), "VIEWPOINT is '0 0 0'"),
+        # PCD, points
+        ("a.pcd", ASCII_PCD.replace("4 5 6\n", ""), "holds 1 lines of points; 2, as its header says; a whole file"),
+        ("a.pcd", ASCII_PCD + "7 8 9\n", "holds 3 lines of points; 2, as its header says"),
+        ("a.pcd", ASCII_PCD.replace("4 5 6", "4 5"), r"a\.pcd: line 9: holds 2 values; 3 in each line"),
+        ("a.pcd", ASCII_PCD.replace("1 2 3\n4 5 6", "1 2 3 0\n4 5 6 0"), r"line 8: holds 4 values; 3 in each line"),
+        ("a.pcd", ASCII_PCD.replace("4 5 6", "\n4 5 six"), "line 10: 'six' is no number; a number, or nan where nothing"),
+        ("a.pcd", ASCII_PCD.replace("4 5 6", "4 5 6_0"), "cannot be read as text .*6_0"),
+        ("a.pcd", ASCII_PCD.replace("1 2 3\n4 5 6", "nan 2 3\n4 5 inf"), r"holds no finite point \(of 2\); at least one"),
+        ("a.pcd", BINARY + bytes(23), r"holds 23 bytes of points; 24 \(2 points of 12\), as its header says"),
+        ("a.pcd", BINARY + bytes(25), "holds 25 bytes of points; 24"),
+        ("a.pcd", PACKED + bytes(7), r"ends before its points \(7 bytes of them\); 24, as its header says"),
+        ("a.pcd", PACKED + struct.pack("<II", 1, 12) + b"\0", "holds 12 bytes of points, unpacked; 24"),
+        ("a.pcd", PACKED + packed(bytes(24))[:-1], "holds 4 bytes of packed points; 5; a whole file"),
+        ("a.pcd", PACKED + struct.pack("<II", 2, 24) + b"\x20\x05", "its packed points are damaged; LZF data of 24"),
+        ("a.pcd", PACKED + struct.pack("<II", 1, 24) + b"\xe0", "its packed points are damaged"),
+        ("a.pcd", PACKED + struct.pack("<II", 2, 24) + b"\x05\x05", "its packed points are damaged"),
+        # PLY
+        ("a.ply", "plyx", r"a\.ply: is not a whole PLY file \(from 'ply' to 'end_header'\)"),
+        ("a.ply", "solid\nend_header\n", "is not a whole PLY file"),
+        ("a.ply", ASCII_PLY.replace("vertex", "corner"), r"has no element 'vertex' \(its elements: corner\); vertices with"),
+        ("a.ply", ASCII_PLY.replace("double z", "double q"), r"has no single field 'z' \(its fields: x y q\)"),
+        ("a.ply", ASCII_PLY.replace("format ascii 1.0\n", ""), "its PLY header has no line 'format'; one of ascii"),
+        ("a.ply", ASCII_PLY.replace("ascii", "utf8"), r"line 2: 'format utf8 1\.0' in its PLY header; a format, an element"),
+        ("a.ply", ASCII_PLY.replace("double z", "real z"), r"line 6: 'property real z' in its PLY header"),
+        ("a.ply", ASCII_PLY.replace("double z", "double x"), r"line 6: 'property double x' in its PLY header"),
+        ("a.ply", ASCII_PLY.replace("vertex 2", "vertex two"), "the count of element 'vertex' is 'two'; a whole number"),
+        ("a.ply", ASCII_PLY.replace("vertex 2", "vertex 0"), "holds no points, says its header"),
+        ("a.ply", ASCII_PLY.replace("double z", "list uchar int z"), "the element 'vertex' holds a list; no list among"),
+        ("a.ply", BINARY_PLY.replace("element", "element path 1\nproperty list uchar int way\nelement") + "\0" * 49,
+         "the element 'path' holds a list"),
+        ("a.ply", ASCII_PLY.replace("4 5 6\n", ""), "holds 1 lines of points; 2"),
+        ("a.ply", ASCII_PLY.replace("4 5 6\n", "4 5\n"), "line 9: holds 2 values; 3 in each line"),
+        ("a.ply", ASCII_PLY.replace("4 5 6\n", "4 5 z\n"), "line 9: 'z' is no number"),
+        ("a.ply", BINARY_PLY + "\0" * 47, r"holds 47 bytes of points; 48 \(2 points of 24\)"),
+        ("a.ply", BINARY_PLY + "\0" * 49, "holds 49 bytes of points; 48"),
+        # LAS is refused further up; CSV
+        ("a.csv", "", r"a\.csv: has no single column 'x_m' \(its columns: none\)"),
+        ("a.csv", CSV.replace("x_m", "x"), OTHER_COLUMNS),
+        ("a.csv", CSV.replace("z_m", "x_m"), "has no single column 'x_m'"),
+        ("a.csv", "x_m,y_m,z_m\n", r"holds no finite point \(of 0\)"),
+        ("a.csv", CSV + "4,five,6\n", r"a\.csv: line 3: y_m: 'five' is no number; a number, or nan where nothing returned"),
+        ("a.csv", CSV + "\n4,,6\n", "line 4: y_m: '' is no number"),
+        ("a.csv", CSV + "4,5\n", "line 3: holds 2 values; 3, one a column"),
+        ("a.csv", CSV + "1,5,2,5,3,5\n", "line 3: holds 6 values; 3, one a column"),
+        ("a.csv", CSV.replace(",", ";"), r"has no single column 'x_m' \(its columns: x_m;y_m;z_m\)"),
+        ("a.csv", CSV + "4,5,6_0\n", r"cannot be read as CSV \(.*6_0"),
+        ("a.csv", CSV + "4,5,\0\n", "line 3: z_m: '\\\\x00' is no number"),
+        ("a.csv", "x" * 200_000, r"cannot be read as CSV \(field larger than"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_said(tmp_path: Path, name: str, content: str | bytes, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        read_points(put(tmp_path, name, content), "sites.csv: row A")
+    assert str(caught.value).startswith(f"sites.csv: row A: {tmp_path / name}: ")
+
+
+def test_a_missing_file_and_a_folder_are_said(tmp_path: Path) -> None:
+    (tmp_path / "b.ply").mkdir()
+    for name in ("a.pcd", "a.ply", "b.ply", "a.csv"):
+        with pytest.raises(InputError, match=rf"{name}: cannot be read \(.*\); a file that is there and may be read"):
+            read_points(tmp_path / name, "")
+
+
+def test_a_place_that_names_the_file_stands_alone(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"^scenario\.toml: sites\.points = 'a\.pcd': cannot be read"):
+        read_points(tmp_path / "a.pcd", "scenario.toml: sites.points = 'a.pcd'")
+
+
+WHOLE = {
+    "ascii.pcd": ASCII_PCD.encode(),
+    "binary.pcd": BINARY + bytes(24),
+    "packed.pcd": PACKED + packed(struct.pack("<6f", 1, 1, 1, 1, 2, 3)),
+    "viewed.pcd": viewed("1 2 3 0.5 0.5 0.5 0.5").encode(),
+    "ascii.ply": ASCII_PLY.encode(),
+    "binary.ply": BINARY_PLY.encode() + bytes(48),
+    "a.csv": b'x_m,y_m,z_m,n\n1,2,3,"a"\n4,5,6,\n',
+}
+
+
+@settings(quick, max_examples=400)
+@given(name=st.sampled_from(sorted(WHOLE)), data=st.data())
+def test_damage_never_ends_in_anything_but_points_or_a_message(tmp_path: Path, name: str, data: st.DataObject) -> None:
+    content = bytearray(WHOLE[name])
+    for _ in range(data.draw(st.integers(1, 3))):
+        at = data.draw(st.integers(0, len(content) - 1))
+        content[at : at + data.draw(st.integers(0, 2))] = data.draw(st.binary(max_size=3))
+    content = content[: data.draw(st.integers(0, len(content)) | st.just(len(content)))]
+    try:
+        points, dropped = read_points(put(tmp_path, name, bytes(content)), "")
+    except InputError as error:
+        assert name in str(error)
+    else:
+        assert np.isfinite(points).all()
+        assert len(points) + dropped > 0

@@ -1,0 +1,320 @@
+"""Does a run resume, reproduce and keep its promises, whatever happens to it?
+
+The kill test ends real ``egvs run`` processes at random moments and looks at the bytes of what the next run leaves.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import pipeline
+from pipeline.core import files
+from pipeline.artefacts import tables
+from pipeline.runs import workflow
+from pipeline.sensing import scanner as survey
+from pipeline.core.errors import InputError, RunError
+
+ROOT = Path(__file__).resolve().parents[2]
+DATA = ("statics.ply", "scans.parquet", "trajectories.parquet", "tpog.parquet", "scores.parquet")
+
+
+def digests(out: Path) -> dict[str, str]:
+    return {name: files.sha256_of(out / name) for name in DATA}
+
+
+def states(scenario: pipeline.Scenario, out: Path, **options: object) -> dict[str, str]:
+    """Run, and say of each stage whether it ran or was skipped."""
+    seen: dict[str, str] = {}
+    workflow.run(scenario, out, told=lambda stage, state, _: seen.__setitem__(stage, state), **options)  # type: ignore[arg-type]
+    return seen
+
+
+@pytest.fixture
+def done(mini: Path, tmp_path: Path) -> tuple[Path, Path]:
+    """A scenario folder and the folder of its finished run."""
+    out = tmp_path / "out"
+    pipeline.run(pipeline.load(mini), out)
+    return mini, out
+
+
+def test_artefacts_are_there_and_the_record_names_them(done: tuple[Path, Path]) -> None:
+    _, out = done
+    record = json.loads((out / "run.json").read_text())
+    assert list(record["stages"]) == list(workflow.STAGES)
+    for stage in record["stages"].values():
+        for name, digest in stage["artefacts"].items():
+            assert files.sha256_of(out / name) == digest
+        assert set(stage["cost"]) == {"seconds", "peak_mb"}
+    assert record["scenario"]["roi"]["voxel_m"] == 0.5
+    assert record["scenario"]["tpog"] == {"blocks": 4}
+    assert set(DATA) | {"report.html"} == {n for s in record["stages"].values() for n in s["artefacts"]}
+    assert not list(out.glob(".*.partial"))
+
+
+def test_columns_and_metadata_are_those_declared(done: tuple[Path, Path]) -> None:
+    _, out = done
+    for name in ("trajectories", "tpog", "scans", "scores"):
+        table, about = tables.read(out / f"{name}.parquet", name)
+        assert table.num_rows > 0
+        assert {"schema", "scenario", "inputs", "seed"} <= set(about)
+    sites = tables.read_metadata(out / "scans.parquet", "scans")["sites"]
+    assert [s["site"] for s in sites] == ["pole_a", "pole_b"]
+    assert set(sites[0]) == {
+        "site", "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg", "sensor", "beams", "beams_in_roi", "returns",
+    }  # fmt: skip
+    about = tables.read_metadata(out / "tpog.parquet", "tpog")
+    assert about["grid"] == {"origin_m": [0.0, -10.0, 0.0], "voxel_m": 0.5, "shape": [80, 40, 10]}
+    assert (about["frames"], about["block_frames"]) == (40, 10)
+
+
+def test_a_second_run_does_nothing_and_says_so(done: tuple[Path, Path], egvs) -> None:
+    mini, out = done
+    before = {p.name: p.stat().st_mtime_ns for p in out.iterdir() if p.is_file() and p.name != ".lock"}
+    assert set(states(pipeline.load(mini), out).values()) == {"skipped"}
+    code, printed, said = egvs("run", mini, "--out", out)
+    assert code == 0
+    assert said.count("unchanged") == len(workflow.STAGES)
+    assert "pole_a" in printed
+    assert before == {p.name: p.stat().st_mtime_ns for p in out.iterdir() if p.is_file() and p.name != ".lock"}
+
+
+CHANGES = {
+    "score.gamma=9": {"score", "report"},
+    "roi.voxel_m=0.25": {"tpog", "score", "report"},
+    "tpog.blocks=5": {"tpog", "score", "report"},
+    "sites.yaw_deg=3": {"scan", "score", "report"},
+    "traffic.frames=20": {"traffic", "tpog", "score", "report"},
+    "statics.ground=false": {"statics", "scan", "tpog", "score", "report"},
+}
+
+
+@pytest.mark.parametrize(("change", "again"), CHANGES.items(), ids=CHANGES.keys())
+def test_a_changed_setting_runs_what_depends_on_it(done: tuple[Path, Path], tmp_path: Path, change: str, again: set[str]) -> None:
+    mini, out = done
+    scenario = pipeline.load(mini, [change])
+    assert {stage for stage, state in states(scenario, out).items() if state == "done"} == again
+    fresh = tmp_path / "fresh"
+    pipeline.run(scenario, fresh)
+    assert digests(out) == digests(fresh)  # nothing of the earlier run shows
+
+
+def test_scoring_again_casts_nothing(done: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    mini, out = done
+    casts = []
+    monkeypatch.setattr(survey.Caster, "scan", lambda *_: casts.append(1))
+    for change in ("score.gamma=2.5", "roi.voxel_m=0.25", "traffic.frames=20"):
+        pipeline.run(pipeline.load(mini, [change]), out)
+    assert casts == []
+
+
+def test_scores_are_the_same_without_kept_scans(done: tuple[Path, Path], tmp_path: Path) -> None:
+    mini, out = done
+    lean = tmp_path / "lean"
+    pipeline.run(pipeline.load(mini, ["scan.keep=false"]), lean)
+    assert not (lean / "scans.parquet").exists()
+    assert pipeline.read_scores(lean / "scores.parquet") == pipeline.read_scores(out / "scores.parquet")
+
+
+def test_threads_change_no_byte(done: tuple[Path, Path], tmp_path: Path) -> None:
+    mini, out = done
+    for jobs in (1, 3):
+        other = tmp_path / str(jobs)
+        pipeline.run(pipeline.load(mini), other, jobs=jobs)
+        assert digests(other) == digests(out)
+
+
+def test_verify_passes_elsewhere_and_names_an_altered_artefact(done: tuple[Path, Path], tmp_path: Path, egvs) -> None:
+    mini, out = done
+    moved, source = tmp_path / "elsewhere" / "run", tmp_path / "elsewhere" / "scenario"
+    shutil.copytree(out, moved)
+    shutil.copytree(mini, source)
+    code, printed, said = egvs("verify", moved, "--scenario", source)
+    assert (code, "same bytes" in printed) == (0, True), said + printed
+    data = bytearray((moved / "tpog.parquet").read_bytes())
+    data[len(data) // 2] ^= 1
+    (moved / "tpog.parquet").write_bytes(bytes(data))
+    code, printed, _ = egvs("verify", moved, "--scenario", source)
+    assert code == 1
+    assert re.search(r"tpog.parquet was altered", printed)
+    assert "scans.parquet" not in printed
+
+
+def test_verify_tells_when_the_scenario_is_another(done: tuple[Path, Path], egvs) -> None:
+    mini, out = done
+    (mini / "sites.csv").write_text("site,x_m,y_m,z_m\npole_a,11,12,3\npole_b,30.5,-12,3\n")
+    code, printed, _ = egvs("verify", out)
+    assert code == 1
+    assert "scans.parquet differs" in printed
+
+
+def test_verify_of_an_unfinished_run_says_what_is_missing(done: tuple[Path, Path]) -> None:
+    _, out = done
+    record = json.loads((out / "run.json").read_text())
+    del record["stages"]["score"]
+    (out / "run.json").write_text(json.dumps(record))
+    with pytest.raises(InputError, match="the stage score is not done"):
+        workflow.verify(out)
+
+
+def test_two_runs_in_one_folder_are_kept_apart(done: tuple[Path, Path]) -> None:
+    mini, out = done
+    with workflow.alone(out), pytest.raises(RunError, match="another run is at work"):
+        pipeline.run(pipeline.load(mini), out)
+
+
+def test_a_record_that_is_none_is_refused(done: tuple[Path, Path]) -> None:
+    mini, out = done
+    (out / "run.json").write_text("[]")
+    with pytest.raises(InputError, match="is not a run's record"):
+        pipeline.run(pipeline.load(mini), out)
+
+
+@pytest.mark.parametrize("key", ["scenario", "scenario_folder", "egvs", "seed", "effects"])
+def test_a_record_with_an_odd_value_is_refused(done: tuple[Path, Path], key: str, egvs) -> None:
+    mini, out = done
+    record = json.loads((out / "run.json").read_text())
+    (out / "run.json").write_text(json.dumps(record | {key: [None] if key != "effects" else "all"}))
+    for arguments in (("run", mini, "--out", out), ("verify", out)):
+        code, _, said = egvs(*arguments)
+        assert (code, f"'{key}' is" in said) == (2, True), said
+
+
+def test_a_single_stage_with_other_settings_leaves_no_mixed_record(done: tuple[Path, Path], egvs) -> None:
+    mini, out = done
+    assert egvs("score", mini, "--out", out, "--set", "score.gamma=7", "--set", "sites.yaw_deg=5")[0] == 0
+    code, _, said = egvs("verify", out)
+    assert (code, "the stage scan is not done" in said) == (2, True), said
+    assert egvs("run", mini, "--out", out)[0] == 0
+    assert egvs("verify", out)[0] == 0
+
+
+def test_an_artefacts_name_that_is_a_folder_is_told_and_nothing_is_left(mini: Path, tmp_path: Path, egvs) -> None:
+    (tmp_path / "out" / "scans.parquet").mkdir(parents=True)
+    code, _, said = egvs("run", mini, "--out", tmp_path / "out")
+    assert (code, "scans.parquet: is a folder" in said) == (2, True), said
+    assert not list((tmp_path / "out").glob(".*.partial"))
+
+
+def start(mini: Path, out: Path) -> subprocess.Popen[bytes]:
+    code = "from pipeline.cli.app import main; main()"
+    return subprocess.Popen(
+        [sys.executable, "-c", code, "run", str(mini), "--out", str(out)],
+        cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def real(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The shipped junction, shortened: SUMO runs in it."""
+    folder = tmp_path_factory.mktemp("real") / "junction"
+    shutil.copytree(ROOT / "scenarios" / "nishishinjuku", folder)
+    text = (folder / "scenario.toml").read_text()
+    (folder / "scenario.toml").write_text(text.replace("frames = 5000", "frames = 500").replace("warmup_s = 300", "warmup_s = 100"))
+    return folder
+
+
+def test_killed_at_ten_moments_the_next_run_ends_in_the_same_bytes(real: Path, tmp_path: Path) -> None:
+    whole = tmp_path / "whole"
+    with start(real, whole) as process:
+        process.wait()
+    assert process.returncode == 0
+    seconds = sum(s["cost"]["seconds"] for s in json.loads((whole / "run.json").read_text())["stages"].values()) + 1.0
+    moments = random.Random(20)
+    interrupted = 0
+    for number in range(10):
+        out = tmp_path / str(number)
+        with start(real, out) as process:
+            try:
+                process.wait(timeout=moments.random() * seconds)
+            except subprocess.TimeoutExpired:
+                os.killpg(process.pid, signal.SIGKILL)
+                interrupted += 1
+        for path in out.glob("*.p*"):  # whatever is there under its own name is whole
+            if path.suffix in (".parquet", ".ply"):
+                assert files.sha256_of(path) == files.sha256_of(whole / path.name)
+        with start(real, out) as process:
+            process.wait()
+        assert process.returncode == 0
+        assert digests(out) == digests(whole)
+    assert interrupted > 0
+
+
+def test_notebook_lines_of_the_readme_run(mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    code = re.search(r"```python\n(.*?)```", text, re.DOTALL)
+    assert code is not None
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(ROOT / "scenarios", tmp_path / "scenarios")
+    names: dict[str, object] = {}
+    exec(code.group(1), names)  # the README's own words
+    assert names["p"].max() <= 1.0  # type: ignore[attr-defined]
+
+
+def test_editor_schema_is_not_stale() -> None:
+    from pipeline.scenario.loading import json_schema
+
+    assert (ROOT / "data_schemas" / "scenario.schema.json").read_text(encoding="utf-8") == json_schema(), "run: make schema"
+
+
+def test_another_seed_in_the_same_folder_changes_no_byte_of_what_is_not_random(mini: Path, tmp_path: Path, egvs) -> None:
+    out = tmp_path / "out"
+    assert egvs("run", mini, "--out", out, "--set", "seed=5")[0] == 0
+    before = {name: (out / name).read_bytes() for name in ("statics.ply", "scans.parquet")}
+    code, _, said = egvs("run", mini, "--out", out, "--set", "seed=6")
+    assert code == 0
+    assert re.search(r"scan +unchanged", said)
+    assert {name: (out / name).read_bytes() for name in before} == before
+    assert egvs("verify", out)[0] == 0
+
+
+@pytest.mark.parametrize("width", [80, 120, 190])
+def test_a_ranking_fits_the_terminal(mini: Path, tmp_path: Path, width: int) -> None:
+    """No number is cut, on the narrowest terminal too."""
+    from rich.console import Console
+
+    from pipeline.cli import screen as show
+
+    pipeline.run(pipeline.load(mini), tmp_path)
+    rows = pipeline.read_scores(tmp_path / "scores.parquet").to_pylist()
+    console = Console(width=width, record=True, file=io.StringIO())
+    console.print(show.ranking(rows, width))
+    text = console.export_text()
+    assert "…" not in text
+    assert all(len(line) <= width for line in text.splitlines())
+    assert all(f"{row['egvs']:.1f}" in text for row in rows)
+
+
+@pytest.mark.parametrize("words", [("run",), ("accuracy", "--budget", "20s")])
+def test_an_interrupt_is_answered_in_words(tmp_path: Path, words: tuple[str, ...]) -> None:
+    scenario = Path(__file__).resolve().parents[2] / "scenarios" / "nishishinjuku"
+    command = [
+        sys.executable,
+        "-c",
+        "from pipeline.cli.app import main; main()",
+        words[0],
+        str(scenario),
+        "--out",
+        str(tmp_path / "out"),
+        *words[1:],
+    ]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        while not (tmp_path / "out").exists():
+            time.sleep(0.05)
+        time.sleep(0.5)
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "egvs: interrupted; run the same command again" in said
+    assert "Traceback" not in said

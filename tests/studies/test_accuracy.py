@@ -1,0 +1,632 @@
+"""Does the accuracy study tell the truth about its settings, and does what it recommends hold?
+
+Evidence: settings that are run again by themselves, from the ``--set`` line that the study prints; plain twins of what
+is compared (tau from pairs, hits weighted up by hand); a study that is repeated, resumed and cut short. Seconds are
+never asserted."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+import pipeline
+from pipeline.artefacts import tables
+from pipeline.cli import screen as show
+from pipeline.core.errors import RunError
+from pipeline.runs import workflow
+from pipeline.scoring.visibility import Visibility
+from pipeline.studies import accuracy, trials
+from pipeline.studies import settings as knobs
+from pipeline.studies.accuracy import Study
+from pipeline.studies.trials import Bench
+
+ROOT = Path(__file__).resolve().parents[2]
+MEASURED = {
+    "seconds",
+    "seconds_spread",
+    "busy_s",
+    "repeats",
+    "statics_s",
+    "scan_s",
+    "traffic_s",
+    "tpog_s",
+    "score_s",
+    "peak_mb",
+}
+RESTED = MEASURED | {"front", "recommended"}
+"""Columns that the clock has a say in."""
+
+
+@pytest.fixture
+def few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A study of a few settings."""
+    monkeypatch.setattr(knobs, "VOXELS_M", (1.0,))
+    monkeypatch.setattr(knobs, "GAMMAS", (2.0,))
+    monkeypatch.setattr(knobs, "PERIODS_S", (1.0,))
+    monkeypatch.setattr(knobs, "_others", lambda _: iter(()))
+    monkeypatch.setattr(accuracy, "REPEATS", 2)
+
+
+@pytest.fixture
+def junction(tmp_path: Path) -> Path:
+    """The shipped junction, shortened: SUMO runs in it."""
+    folder = tmp_path / "junction"
+    shutil.copytree(ROOT / "scenarios" / "nishishinjuku", folder)
+    text = (folder / "scenario.toml").read_text()
+    for long, short in (
+        ("frames = 5000", "frames = 200"),
+        ("warmup_s = 300", "warmup_s = 50"),
+        ("vehicles = 50", "vehicles = 20"),
+        ("voxel_m = 0.25", "voxel_m = 0.5"),
+    ):
+        assert long in text
+        text = text.replace(long, short)
+    (folder / "scenario.toml").write_text(text)
+    return folder
+
+
+def study_of(
+    path: Path, sets: list[str], out: Path, tolerance: float = 0.02, budget_s: float = 600.0, **more: Any
+) -> Study:
+    return accuracy.study(path, sets, out, tolerance=tolerance, budget_s=budget_s, **more)
+
+
+def words(row: accuracy.Row) -> list[str]:
+    """The values after each ``--set``."""
+    return shlex.split(row.overrides)[1::2]
+
+
+def shares(path: Path, sets: list[str], out: Path, weight: float = 1.0) -> np.ndarray:
+    """Scores as shares of their limit, from an ordinary run."""
+    pipeline.run(pipeline.load(path, sets), out)
+    table = pipeline.read_scores(out / "scores.parquet")
+    return table["egvs"].to_numpy() / table["egvs_limit"].to_numpy()
+
+
+def test_study_of_a_finished_file(mini: Path, tmp_path: Path, few: None) -> None:
+    study = study_of(mini, [], tmp_path / "out", budget_s=300)
+    names = [row.setting for row in study.rows]
+    assert names[0] == "scenario"
+    assert {
+        "every 2nd azimuth",
+        "every 4th azimuth",
+        "every 2nd channel",
+        "gamma 2",
+        "voxel 1 m",
+        "voxel 1 m, gamma 16",
+    } <= set(names)
+    assert len(set(names)) == len(names)
+    assert not study.skipped
+    table, about = tables.read(tmp_path / "out" / "accuracy.parquet", "accuracy")
+    assert table["setting"].to_pylist() == names
+    assert about["reference_times"] == 1
+    assert (tmp_path / "out" / "accuracy.png").read_bytes()[:4] == b"\x89PNG"
+    assert all(row.repeats == 2 for row in study.rows)
+    own = study.rows[0]
+    assert (own.error, own.tau, own.regret, own.best_kept, own.best_three_kept) == (0.0, 1.0, 0.0, True, True)
+    recommended = [row for row in study.rows if row.recommended]
+    assert recommended == [study.best]
+    again = shares(mini, words(recommended[0]), tmp_path / "again")
+    against = shares(mini, [], tmp_path / "plain")
+    assert np.abs(again / against - 1).max() == pytest.approx(recommended[0].error, abs=1e-12)
+    assert recommended[0].error <= 0.02
+
+
+def test_recommended_setting_holds_where_sumo_runs(
+    junction: Path, tmp_path: Path, few: None, monkeypatch: pytest.MonkeyPatch, egvs
+) -> None:
+    monkeypatch.setattr(knobs, "FRAMES", (100,))
+    monkeypatch.setattr(knobs, "LONGER", (2, 4))
+    monkeypatch.setattr(knobs, "STEPS_S", (0.5,))
+    monkeypatch.setattr(knobs, "GRID_LONGER", (4,))
+    monkeypatch.setattr(knobs, "GRID_WATCHED_S", ((None, 1.0), (0.5, 1.0)))
+    monkeypatch.setattr(accuracy, "LONGEST", 8)
+    monkeypatch.setattr(accuracy, "REPEATS", 1)
+    code, printed, said = egvs(
+        "accuracy", junction, "--out", tmp_path / "out", "--budget", "10m", "--tolerance", 0.4, "--seeds", 2
+    )
+    assert code == 0, said
+    rows = tables.read(tmp_path / "out" / "accuracy.parquet", "accuracy")[0].to_pylist()
+    longest, best = rows[1], next(row for row in rows if row["recommended"])
+    assert (longest["setting"], longest["overrides"]) == ("reference", "--set traffic.frames=1600")
+    assert f"{junction} {best['overrides']}".strip() in printed
+    assert "independent runs" in printed
+    assert "tell them apart" in printed
+    again = shares(junction, shlex.split(best["overrides"])[1::2], tmp_path / "again")
+    against = shares(junction, ["traffic.frames=1600"], tmp_path / "against")
+    assert np.abs(again / against - 1).max() == pytest.approx(best["error"], abs=1e-12)
+    assert max(best["error"], best["error_se"]) <= 0.4
+    longer, short = (next(r for r in rows if r["setting"] == name) for name in ("800 frames", "100 frames"))
+    assert longer["error_se"] < short["error_se"]
+
+
+def compared(study: Study) -> list[tuple[object, ...]]:
+    names = [f for f in accuracy.Row.__dataclass_fields__ if f not in RESTED]
+    return sorted(tuple(getattr(row, name) for name in names) for row in study.rows)
+
+
+def test_errors_are_deterministic_and_a_study_is_resumed(
+    mini: Path, tmp_path: Path, few: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = study_of(mini, [], tmp_path / "one", jobs=1)
+    other = study_of(mini, [], tmp_path / "other", jobs=2)
+    assert compared(one) == compared(other)
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("a stage ran again")
+
+    monkeypatch.setattr(Bench, "_measure", refuse)
+    monkeypatch.setattr(Bench, "warm_up", refuse)
+    assert study_of(mini, [], tmp_path / "one").rows == one.rows
+
+
+def test_an_interrupted_study_goes_on(mini: Path, tmp_path: Path, few: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = study_of(mini, [], tmp_path / "whole")
+    run, done = Bench.run, []
+
+    def tired(bench: Bench, setting: knobs.Setting) -> trials.Trial:
+        if len(done) == 3:
+            raise KeyboardInterrupt
+        done.append(setting.name)
+        return run(bench, setting)
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(Bench, "run", tired)
+        study_of(mini, [], tmp_path / "out")
+    told: list[tuple[str, str]] = []
+    rest = study_of(mini, [], tmp_path / "out", told=lambda name, state, _: told.append((name, state)))
+    assert {name for name, state in told if state == "kept"} == set(done)
+    assert compared(rest) == compared(whole)
+    assert not list((tmp_path / "out" / "accuracy").glob(".work-*"))
+
+
+def test_a_budget_leaves_settings_out_and_names_them(mini: Path, tmp_path: Path, egvs) -> None:
+    code, printed, said = egvs("accuracy", mini, "--out", tmp_path / "out", "--budget", "0.001s")
+    assert code == 0, said
+    line = next(line for line in printed.splitlines() if line.startswith("skipped, beyond the budget: "))
+    assert {"voxel 1 m", "every 2nd azimuth"} <= set(line.partition(": ")[2].split("; "))
+    rows = tables.read(tmp_path / "out" / "accuracy.parquet", "accuracy")[0].to_pylist()
+    assert [row["setting"] for row in rows] == ["scenario"]
+
+
+def test_without_a_longer_reference_simulated_traffic_is_judged_by_its_standard_error(
+    junction: Path, tmp_path: Path, few: None
+) -> None:
+    study = study_of(junction, [], tmp_path / "out", budget_s=0.001)
+    assert [row.setting for row in study.rows] == ["scenario"]
+    assert (study.times, study.best) == (1, None)
+    assert study.rows[0].judged == study.rows[0].error_se > study.tolerance
+
+
+def test_a_setting_that_fails_is_named_and_the_rest_goes_on(
+    mini: Path, tmp_path: Path, few: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(knobs, "LONGER", (2,))
+    own = knobs._watched
+    monkeypatch.setattr(
+        knobs,
+        "_watched",
+        lambda s: [knobs.Setting("80 frames", "approximates", "frames", ("traffic.frames=80",)), *own(s)],
+    )
+    study = study_of(mini, [], tmp_path / "out")
+    assert "80" in study.skipped["80 frames"]
+    assert len(study.rows) > 5
+    again = study_of(mini, [], tmp_path / "out")
+    assert (again.rows, again.skipped) == (study.rows, study.skipped)
+
+
+def test_a_setting_that_is_no_scenario_is_named_and_the_rest_goes_on(
+    mini: Path, tmp_path: Path, few: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(knobs, "GAMMAS", (-1.0, 2.0))
+    study = study_of(mini, [], tmp_path / "out")
+    assert "score.gamma: -1.0" in study.skipped["gamma -1"]
+    assert "gamma 2" in {row.setting for row in study.rows}
+
+
+def test_a_reference_that_would_be_endless_is_made_shorter(
+    junction: Path, tmp_path: Path, few: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A reference that is no scenario is halved until it is one."""
+    bench = Bench(junction, [], tmp_path, 1, lambda *_: None)
+    own = bench.scenario(accuracy.OWN)
+    trial = trials.Trial([], [], [], 200, [], [], [], 1.0, [], {"traffic": "t", "tpog": "t"})
+    monkeypatch.setattr(Bench, "spent", lambda *_: trials.Spent((0.1,), (0.1,), 1.0, 1))
+    assert accuracy._times(bench, own, trial, 1e6) == accuracy.LONGEST
+    frames = {32: 0, 16: 0, 8: 0, 4: 800}
+    monkeypatch.setattr(
+        knobs, "reference", lambda s, n: knobs.Setting("r", "reference", "", (f"traffic.frames={frames[n]}",))
+    )
+    assert accuracy._times(bench, own, trial, 1e5) == 4
+
+
+def test_knobs_of_another_method_are_not_turned(mini: Path) -> None:
+    sets = ['effects.moving_occlusion.method="independent"']
+    names = {s.name for s in knobs.settings(pipeline.load(mini, sets))}
+    assert not {name for name in names if name.startswith("moving_occlusion")}
+    assert "without moving_occlusion" in names
+
+
+def test_a_study_goes_on_without_warming_up_for_what_it_cannot_afford(
+    mini: Path, tmp_path: Path, few: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = study_of(mini, [], tmp_path / "out", budget_s=0.001)
+    assert [row.setting for row in first.rows] == ["scenario"]
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("warmed up")
+
+    monkeypatch.setattr(Bench, "warm_up", refuse)
+    assert study_of(mini, [], tmp_path / "out", budget_s=1e-9).rows == first.rows
+
+
+def test_a_repeat_that_writes_other_bytes_is_an_error(mini: Path, tmp_path: Path) -> None:
+    bench = Bench(mini, [], tmp_path, 1, lambda *_: None)
+    own = knobs.Setting("scenario", "scenario", "")
+    trial = bench.run(own)
+    cost = tmp_path / "accuracy" / "stages" / f"tpog-{trial.stages['tpog'][:16]}" / "cost.json"
+    cost.write_text(cost.read_text().replace('"tpog.parquet": "', '"tpog.parquet": "0'))
+    with pytest.raises(RunError, match="other bytes"):
+        bench.again("tpog", own, trial)
+
+
+def test_thinned_beams_score_as_if_each_counted_twice(mini: Path, tmp_path: Path) -> None:
+    thin = next(s for s in knobs.settings(pipeline.load(mini)) if s.name == "every 2nd azimuth")
+    scenario = pipeline.load(mini, thin.overrides)
+    found = shares(mini, list(thin.overrides), tmp_path / "out")
+    tpog = pipeline.read_tpog(tmp_path / "out" / "tpog.parquet")
+    p = tpog.p.ravel()
+    with np.errstate(divide="ignore", invalid="ignore"):
+        entropy = np.nan_to_num(-(p * np.log2(p) + (1 - p) * np.log2(1 - p)))
+    visibility = Visibility(scenario, tmp_path / "out", tpog.grid)
+    for share, beams in zip(found, visibility.beams(), strict=True):
+        twice = np.minimum(4.0, 2.0 * visibility.hits(beams))
+        assert share == pytest.approx((entropy * twice).sum() / (4.0 * entropy.sum()), rel=1e-12)
+
+
+def test_thinned_beams_are_weighted_up_without_a_cap_too(mini: Path, tmp_path: Path) -> None:
+    bench = Bench(mini, ["score.gamma=inf"], tmp_path / "out", 1, lambda *_: None)
+    found = {s.name: s for s in knobs.settings(bench.scenario(knobs.Setting("scenario", "scenario", "")))}
+    whole, thin = (np.array(bench.run(found[name]).shares) for name in ("scenario", "every 2nd azimuth"))
+    assert np.abs(thin / whole - 1).max() < 0.1
+
+
+@pytest.mark.parametrize("sensor", ["VLP-32C", "OS1-64"])
+def test_a_thinned_catalogue_sensor_has_the_beams_of_the_whole_one(mini: Path, sensor: str) -> None:
+    from pipeline.sensing.sensors import CATALOGUE, resolve
+
+    whole = CATALOGUE[sensor]
+    for setting in knobs.settings(pipeline.load(mini, [f"sites.sensor={sensor}"])):
+        if setting.knob not in ("azimuth", "channels"):
+            continue
+        thin = resolve(sensor, pipeline.load(mini, [f"sites.sensor={sensor}", *setting.overrides]).sensors, "")
+        assert thin.beams * setting.weight == whole.beams
+        every = {tuple(ray) for ray in whole.directions(30.0).tolist()}
+        assert {tuple(ray) for ray in thin.directions(30.0).tolist()} <= every
+
+
+def test_effects_have_lines_of_their_own(mini: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    from pipeline.effects.score.rain import Rain
+
+    monkeypatch.setattr(Rain, "QUALITY", {"rate_mm_h": (1.0, 5.0, 20.0)}, raising=False)
+    sets = ["effects.rain.rate_mm_h=5.0"]
+    found = {s.name: s for s in knobs.settings(pipeline.load(mini, sets))}
+    assert found["without rain"].kind == knobs.MEASURES
+    assert found["rain rate_mm_h 20.0"].beside == knobs.SCENARIO
+    assert found["rain rate_mm_h 1.0"].beside == "rain rate_mm_h 20.0"
+    assert "rain rate_mm_h 5.0" not in found
+    bench = Bench(mini, sets, tmp_path / "out", 1, lambda *_: None)
+    bare = bench.run(found["without rain"])
+    assert bare.shares == pytest.approx(shares(mini, [], tmp_path / "plain"))
+
+
+def test_effects_that_are_not_named_are_tried_where_they_act(mini: Path) -> None:
+    """Divergence needs no number of the user's; rain does, articulated has nothing to act on."""
+    with_ = {s.name: s for s in knobs.settings(pipeline.load(mini)) if s.name.startswith(knobs.WITH)}
+    assert {"with divergence", "with moving_occlusion"} <= with_.keys()
+    assert not {"with rain", "with articulated", "with slope", "with range_limit"} & with_.keys()
+    rated = knobs.settings(
+        pipeline.load(mini, ["sites.sensor=VLP-16"])
+    )  # its range is rated, the scenario's own sensor's is not
+    assert "with range_limit" in {s.name for s in rated}
+    assert all(
+        pipeline.load(mini, s.overrides).effects.keys() == {s.name.removeprefix(knobs.WITH)} for s in with_.values()
+    )
+    named = {s.name for s in knobs.settings(pipeline.load(mini, ["effects.divergence={}"]))}
+    assert {"without divergence", "divergence sub_beams 19"} <= named
+    assert "with divergence" not in named
+
+
+def test_effects_say_what_they_cost_and_change(mini: Path, tmp_path: Path, few: None, egvs) -> None:
+    """As a plain run with and without the effect says."""
+    sets = ["--set", "effects.rain.rate_mm_h=90"]
+    code, printed, _ = egvs("effects", mini, "--out", tmp_path / "out", *sets)
+    assert code == 0
+    assert "egvs accuracy" in printed
+    assert egvs("accuracy", mini, "--out", tmp_path / "out", *sets)[0] == 0
+    code, printed, said = egvs("effects", mini, "--out", tmp_path / "out", *sets)
+    assert code == 0, said
+    assert "egvs accuracy" not in printed
+    dry, wet = shares(mini, [], tmp_path / "dry"), shares(mini, sets[1:], tmp_path / "wet")
+    assert f"scores by up to {np.abs(dry / wet - 1).max():.1%}" in " ".join(printed.split())
+    code, printed, _ = egvs("effects", mini, "--out", tmp_path / "out", "--set", "effects.rain.rate_mm_h=91")
+    assert "egvs accuracy" in printed  # that study was of another scenario
+    (mini / "sites.csv").write_text("site,x_m,y_m,z_m\npole_a,10,12,3\n")
+    assert "egvs accuracy" in egvs("effects", mini, "--out", tmp_path / "out", *sets)[1]  # and that one of other sites
+
+
+def test_two_studies_keep_out_of_one_folder(mini: Path, tmp_path: Path) -> None:
+    with workflow.alone(tmp_path / "out"), pytest.raises(RunError, match="another run is at work"):
+        study_of(mini, [], tmp_path / "out")
+
+
+KEPT = {
+    "the study's note": ("study.json", "{}x", "study.json: is not as the study wrote it"),
+    "a setting's result": ("[0-9a-f]*.json", '{"trial": {"sites": 3}}', "is not as the study wrote it"),
+    "a stage's cost": ("stages/tpog-*/cost.json", "", "cost.json: is not as the study wrote it"),
+    "a list for a cost": ("stages/tpog-*/cost.json", "[]", "cost.json: is not as the study wrote it"),
+    "a list for the note": ("study.json", "[1]", "study.json: is not as the study wrote it"),
+    "no times": (
+        "stages/tpog-*/cost.json", '{"seconds": [], "busy": [], "peak_mb": 1, "sha256": {}}', "is not as the study wrote it",
+    ),
+    "words for times": (
+        "stages/tpog-*/cost.json", '{"seconds": ["x"], "busy": [1], "peak_mb": 1, "sha256": {}}', "is not as the study wrote it",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", KEPT)
+def test_what_was_kept_and_damaged_is_named(junction: Path, tmp_path: Path, few: None, egvs, case: str) -> None:
+    pattern, content, message = KEPT[case]
+    words = ("accuracy", junction, "--out", tmp_path / "out", "--budget", "0.001s")
+    assert egvs(*words)[0] == 0
+    for path in (tmp_path / "out" / "accuracy").glob(pattern):
+        path.write_text(content)
+    code, printed, said = egvs(*words)
+    assert code == 2
+    assert message in said
+    assert "Traceback" not in said + printed
+
+
+def shares_are(text: str) -> Callable[[str], str]:
+    return lambda kept: re.sub(r'"shares": \[[^\]]*\]', f'"shares": {text}', kept)
+
+
+SHARED = {
+    "too few shares": ("[0-9a-f]*.json", shares_are("[0.5]"), "is not as the study wrote it"),
+    "words for shares": ("[0-9a-f]*.json", shares_are('["a", null]'), "is not as the study wrote it"),
+    "too few scores left out": (
+        "stages/score-*/left_out.json",
+        lambda _: "[[1], [2]]",
+        "left_out.json: is not as the study",
+    ),
+    "ragged scores left out": (
+        "stages/score-*/left_out.json",
+        lambda _: "[[1], [2, 3]]",
+        "left_out.json: is not as the study",
+    ),
+    "a number for scores left out": (
+        "stages/score-*/left_out.json",
+        lambda _: "5",
+        "left_out.json: is not as the study",
+    ),
+    "a stage's artefact": ("stages/tpog-*/tpog.parquet", lambda _: "bad", "accuracy: holds a damaged artefact"),
+}
+
+
+@pytest.mark.parametrize("case", SHARED)
+def test_what_was_kept_and_has_another_shape_is_named(mini: Path, tmp_path: Path, few: None, egvs, case: str) -> None:
+    pattern, change, message = SHARED[case]
+    words = ("accuracy", mini, "--out", tmp_path / "out", "--budget", "0.001s")
+    assert egvs(*words)[0] == 0
+    kept = tmp_path / "out" / "accuracy"
+    if pattern.startswith("stages"):
+        for path in kept.glob("[0-9a-f]*.json"):
+            path.unlink()  # else what it says is taken as it is
+    for path in kept.glob(pattern):
+        path.write_text(change(path.read_text(errors="replace")))
+    code, printed, said = egvs(*words)
+    assert code == 2
+    assert message in said
+    assert ".work-" not in said.split("holds a damaged artefact")[0]
+    assert "Traceback" not in said + printed
+
+
+def test_a_study_of_another_seed_goes_on_in_the_same_folder(mini: Path, tmp_path: Path, few: None) -> None:
+    study_of(mini, ["seed=9"], tmp_path, budget_s=0.5)
+    assert study_of(mini, ["seed=10"], tmp_path).repeated > 0
+
+
+def test_what_is_recommended_can_be_typed(mini: Path, tmp_path: Path, few: None, egvs) -> None:
+    """With the user's own ``--set``, and quoted."""
+    folder = tmp_path / "a place with späce"
+    shutil.copytree(mini, folder)
+    sets = ("--set", "traffic.frames=20", "--set", "description=it's")
+    code, printed, said = egvs("accuracy", folder, "--out", tmp_path / "out", *sets)
+    assert code == 0, said
+    line = next(line.strip() for line in printed.splitlines() if line.strip().startswith("egvs run"))
+    words = shlex.split(line)
+    assert words[:7] == ["egvs", "run", str(folder), *sets]
+    assert egvs(*words[1:], "--out", tmp_path / "again")[0] == 0
+
+
+def test_nothing_that_is_as_long_as_the_reference_is_compared_with_it(junction: Path, tmp_path: Path) -> None:
+    bench = Bench(junction, [], tmp_path, 1, lambda *_: None)
+    found = knobs.settings(bench.scenario(accuracy.OWN))
+    longest = knobs.reference(bench.scenario(accuracy.OWN), 4)
+    kept = {s.name for s in found if accuracy._is_shorter(bench, s, longest)}
+    assert {"400 frames", "200 frames every 1 s", "scenario"} <= kept
+    assert not {"800 frames", "1600 frames", "400 frames every 1 s"} & kept
+
+
+@pytest.mark.parametrize("width", [80, 120, 190])
+def test_tables_fit_the_terminal(mini: Path, tmp_path: Path, few: None, width: int, capsys, monkeypatch) -> None:
+    study = study_of(mini, [], tmp_path / "out")
+    monkeypatch.setattr(show, "WIDE", width)
+    if width < 190:
+        monkeypatch.setattr(show, "Console", lambda **k: Console(**(k | {"width": width, "soft_wrap": False})))
+        monkeypatch.setattr(show, "WIDE", 190)
+    show.accuracy(study, "egvs run mini")
+    table = capsys.readouterr().out.partition("reference: ")[0]
+    assert "…" not in table
+    assert all(len(line) <= width for line in table.splitlines())
+    assert "* " in table and "*= " in table
+    assert all(f"{row.seconds:.2f}" in table for row in study.rows if row.kind != "measures")
+
+
+def test_where_every_score_is_0_nothing_is_recommended(mini: Path, tmp_path: Path, few: None, egvs) -> None:
+    far = ("--set", "roi.center_m=[5000, 5000, 2.5]", "--set", "sensors.small.range_m=20000")
+    code, printed, said = egvs("accuracy", mini, "--out", tmp_path / "out", *far)
+    assert code == 0, said
+    assert "every score is 0" in printed
+    assert "inf frames" not in printed
+
+
+def test_what_was_kept_and_removed_is_made_again(mini: Path, tmp_path: Path, few: None) -> None:
+    study = study_of(mini, [], tmp_path)
+    for path in (tmp_path / "accuracy" / "stages").glob("*/tpog.parquet"):
+        path.unlink()
+    (tmp_path / "accuracy" / ".work-left").mkdir()
+    assert compared(study_of(mini, [], tmp_path)) == compared(study)
+    assert len(list((tmp_path / "accuracy" / "stages").glob("*/tpog.parquet"))) > 1
+    assert not (tmp_path / "accuracy" / ".work-left").exists()
+
+
+def test_a_weight_is_part_of_what_a_result_is_kept_under(mini: Path, tmp_path: Path) -> None:
+    """With an endless gamma, the same overrides mean half as much where beams are not weighted up."""
+    bench = Bench(mini, ["score.gamma=inf"], tmp_path, 1, lambda *_: None)
+    thin = next(s for s in knobs.settings(bench.scenario(accuracy.OWN)) if s.name == "every 2nd azimuth")
+    plain = replace(thin, weight=1.0)
+    assert np.array(bench.run(thin).shares) == pytest.approx(2 * np.array(bench.run(plain).shares))
+
+
+def test_memory_is_let_go_before_a_stage_is_measured(
+    mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[str] = []
+    monkeypatch.setattr(trials, "let_go", lambda: done.append("let go"))
+    own = trials.measured
+
+    def noted() -> object:
+        done.append("measured")
+        return own()
+
+    monkeypatch.setattr(trials, "measured", noted)
+    Bench(mini, [], tmp_path, 1, lambda *_: None).run(accuracy.OWN)
+    assert done == ["let go", "measured"] * len(trials.STAGES)
+
+
+def test_memory_is_that_of_the_stage(mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a stage takes is measured above what the program holds."""
+    from pipeline.stages import tpog
+
+    own = tpog.run
+
+    def greedy(*args: object, **options: object) -> dict[str, object]:
+        assert np.ones(50_000_000).sum() > 0  # 400 MB
+        return own(*args, **options)
+
+    bench, setting = Bench(mini, [], tmp_path, 1, lambda *_: None), knobs.Setting("scenario", "scenario", "")
+    held = np.ones(50_000_000)
+    trial = bench.run(setting)
+    plain = bench.spent("tpog", trial.stages["tpog"]).peak_mb
+    monkeypatch.setattr(tpog, "run", greedy)
+    bench.again("tpog", setting, trial)
+    assert plain < 200
+    assert bench.spent("tpog", trial.stages["tpog"]).peak_mb == pytest.approx(plain + 381, abs=60)
+    assert held[0] == 1.0
+
+
+def test_a_site_with_a_measured_scan_is_not_thinned(mini: Path) -> None:
+    (mini / "points.csv").write_text("x_m,y_m,z_m\n12,5,0.5\n")
+    (mini / "sites.csv").write_text("site,x_m,y_m,z_m,points\npole_a,10,12,3,points.csv\npole_b,30.5,-12,3,\n")
+    assert not {"azimuth", "channels"} & {s.knob for s in knobs.settings(pipeline.load(mini))}
+
+
+@pytest.mark.parametrize("name", ["nishishinjuku", "ingolstadt"])
+def test_settings_are_sound_scenarios(name: str) -> None:
+    folder = ROOT / "scenarios" / name
+    found = knobs.settings(pipeline.load(folder))
+    assert len({s.name for s in found}) == len(found)
+    for setting in found:
+        assert pipeline.load(folder, setting.overrides)
+        assert setting.beside in {s.name for s in found}
+
+
+def test_the_default_is_what_a_scenario_has_that_says_nothing() -> None:
+    """The shipped junction names the paper's period of 0.25 s; a second apart is the program's own."""
+    folder = ROOT / "scenarios" / "nishishinjuku"
+    own = pipeline.load(folder)
+    found = [s.name for s in knobs.settings(own) if knobs.is_default(pipeline.load(folder, s.overrides), own)]
+    assert found == ["5000 frames every 1 s"]
+    assert knobs.is_default(*[pipeline.load(folder, ["traffic.frame_period_s=1.0"])] * 2)
+
+
+def test_comparisons_with_ties() -> None:
+    a, b = np.array([3.0, 3.0, 1.0, 2.0]), np.array([4.0, 3.0, 1.0, 2.0])
+    pairs = [(i, j) for i in range(4) for j in range(i)]
+    signs = [(np.sign(a[i] - a[j]), np.sign(b[i] - b[j])) for i, j in pairs]
+    agree = sum(x * y for x, y in signs) / np.sqrt(sum(x != 0 for x, _ in signs) * sum(y != 0 for _, y in signs))
+    assert accuracy.agreement(a, b, "tau") == pytest.approx(agree)
+    assert accuracy.agreement(np.ones(3), np.ones(3), "rho") == 1.0
+    assert accuracy.agreement(np.ones(4), b, "tau") == 0.0
+    assert accuracy.best(a, 1) == {0, 1}
+    assert accuracy.best(b, 3) == {0, 1, 3}
+    assert accuracy.regret(a, b) == pytest.approx(0.25)  # of two that tie, the worse
+    assert accuracy.regret(b, a) == 0.0
+    assert accuracy.relative(np.array([0.0, 1.0]), np.array([0.0, 0.0])).tolist() == [0.0, np.inf]
+
+
+def test_front_holds_no_setting_that_another_beats(mini: Path, tmp_path: Path, few: None) -> None:
+    rows = [row for row in study_of(mini, [], tmp_path / "out").rows if row.kind in ("approximates", "scenario")]
+    for row in rows:
+        beaten = any(
+            other.seconds <= row.seconds
+            and other.judged <= row.judged
+            and (other.seconds, other.judged) != (row.seconds, row.judged)
+            for other in rows
+        )
+        assert row.front != beaten
+
+
+def test_one_block_tells_nothing_of_errors(junction: Path, mini: Path, tmp_path: Path, few: None, egvs) -> None:
+    """Refused where SUMO could watch longer; of a finished file the errors are unknown, not 0."""
+    code, _, said = egvs("accuracy", junction, "--out", tmp_path / "out", "--set", "tpog.blocks=1")
+    assert code == 2
+    assert "tpog.blocks: 1, so that nothing tells" in said
+    code, printed, said = egvs("accuracy", mini, "--out", tmp_path / "out", "--set", "tpog.blocks=1")
+    assert code == 0, said
+    assert "standard error unknown" in printed
+    assert "nan" not in printed
+
+
+BAD = {
+    ("--tolerance", "0"): "--tolerance: 0",
+    ("--tolerance", "inf"): "--tolerance: inf",
+    ("--tolerance", "1e-300"): "--tolerance: 1e-300",
+    ("--budget", "1_0s"): "--budget: '1_0s'",
+    ("--seeds", "3"): "--seeds: the traffic is a finished file",
+    ("--budget", "soon"): "--budget: 'soon'",
+    ("--budget", "-3s"): "--budget: '-3s'",
+    ("--budget", ""): "--budget: ''",
+    ("--set", "roi.voxel_m=0.3"): "voxel",
+}
+
+
+@pytest.mark.parametrize(("words", "message"), BAD.items(), ids=[" ".join(words) for words in BAD])
+def test_wrong_input_is_answered_in_words(
+    mini: Path, tmp_path: Path, egvs, words: tuple[str, str], message: str
+) -> None:
+    code, printed, said = egvs("accuracy", mini, "--out", tmp_path / "out", *words)
+    assert code == 2
+    assert message in said
+    assert "Traceback" not in said + printed

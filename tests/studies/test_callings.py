@@ -1,0 +1,132 @@
+"""Does ``egvs effects`` tell which effects a scene calls for, and what each changes?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import pipeline
+from pipeline.artefacts import readers as results
+from pipeline.core import files
+from pipeline.effects import registry as effects
+from pipeline.studies import effects as callings
+from pipeline.studies import trials
+
+
+def states(mini: Path, *overrides: str) -> dict[str, tuple[str, str]]:
+    return {call.name: (call.state, call.why) for call in callings.called(pipeline.load(mini, overrides))}
+
+
+def test_every_effect_is_listed_with_its_source(egvs) -> None:
+    code, printed, _ = egvs("effects")
+    assert code == 0
+    for call in callings.catalogue():
+        assert call.name in printed
+        assert call.source
+        assert call.why.endswith("?")  # the question that its module opens with
+
+
+def test_a_plain_scene_calls_for_none(mini: Path) -> None:
+    found = states(mini)
+    assert set(found) == set(effects.KINDS)
+    assert {state for state, _ in found.values()} == {"off"}
+    assert found["rain"] == ("off", "not named")
+    assert "flat" in found["slope"][1] or "no network" in found["slope"][1] or "relief" in found["slope"][1]
+
+
+def test_a_named_effect_is_on_with_its_parameters(mini: Path) -> None:
+    state, why = states(mini, "effects.rain.rate_mm_h=20")["rain"]
+    assert state == "on"
+    assert "rate_mm_h = 20" in why
+
+
+def test_an_effect_that_cannot_change_anything_is_skipped_and_the_run_says_so(mini: Path, tmp_path: Path, egvs) -> None:
+    named = ("effects.rain.rate_mm_h=0", "effects.foliage.leaf_area_density=1")
+    found = states(mini, *named)
+    assert found["rain"][0] == found["foliage"][0] == "skipped"
+    assert "the result is the same without it" in found["foliage"][1]
+    plain, skipped = tmp_path / "plain", tmp_path / "skipped"
+    assert egvs("run", mini, "--out", plain)[0] == 0
+    code, _, said = egvs("run", mini, "--out", skipped, *(part for name in named for part in ("--set", name)))
+    assert code == 0
+    assert "rain" in said and "foliage" in said
+    for name in ("scans.parquet", "scores.parquet", "tpog.parquet", "trajectories.parquet", "statics.ply"):
+        assert (plain / name).read_bytes() == (skipped / name).read_bytes()
+
+
+def test_ablation_runs_each_effect_alone_and_all_together(mini: Path, tmp_path: Path, egvs) -> None:
+    named = ("--set", "effects.rain.rate_mm_h=50", "--set", "effects.dropout.share=0.25")
+    code, printed, said = egvs("effects", mini, *named, "--ablation", "--out", tmp_path)
+    assert code == 0, said
+    assert "rain" in printed and "dropout" in printed and "all" in printed
+    changes = callings.ablation(pipeline.load(mini, named[1::2]), tmp_path)
+    scores = {change.effect: dict(zip(change.sites, change.scores, strict=True)) for change in changes}
+    assert list(scores) == ["none", "rain", "dropout", "all"]
+    alone = tmp_path / "alone"
+    pipeline.run(pipeline.load(mini, ["effects.rain.rate_mm_h=50"]), alone)
+    for row in results.read_scores(alone / "scores.parquet").to_pylist():
+        assert scores["rain"][row["site"]] == row["egvs"]
+        assert scores["all"][row["site"]] < scores["rain"][row["site"]] < scores["none"][row["site"]]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(["--ablation"], "without a scenario"), (["{mini}", "--ablation"], "names no effect")],
+)
+def test_an_ablation_of_nothing_is_refused(mini: Path, egvs, arguments: list[str], message: str) -> None:
+    code, _, said = egvs("effects", *(a.format(mini=mini) for a in arguments))
+    assert code == 2
+    assert message in said
+
+
+def test_a_scenario_may_extend_another(mini: Path, tmp_path: Path, egvs) -> None:
+    wet = tmp_path / "wet"
+    wet.mkdir()
+    (wet / "scenario.toml").write_text('extends = "../mini"\n\n[effects.rain]\nrate_mm_h = 20\n\n[score]\ngamma = 3\n')
+    scenario = pipeline.load(wet)
+    assert (scenario.name, scenario.score.gamma, scenario.roi.voxel_m, scenario.effects) == (
+        "wet",
+        3,
+        0.5,
+        {"rain": {"rate_mm_h": 20}},
+    )
+    out = tmp_path / "out"
+    assert egvs("run", wet, "--out", out)[0] == 0
+    assert egvs("verify", out)[0] == 0
+    (mini / "scenario.toml").write_text('extends = "../wet"\n' + (mini / "scenario.toml").read_text())
+    code, _, said = egvs("run", wet, "--out", out)
+    assert (code, "leads back to itself" in said) == (2, True)
+    (wet / "scenario.toml").write_text('extends = "../nowhere"\n')
+    assert egvs("run", wet, "--out", out)[0] == 2
+
+
+def test_what_an_effect_costs_is_with_less_without(mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where it is named, the scenario's seconds less those without it; where it is not, those with it less the
+    scenario's."""
+    scenario = pipeline.load(mini, ["effects.rain.rate_mm_h=20"])
+    rows = [
+        {"setting": name, "seconds": seconds, "error": 0.1, "tau": 0.9, "regret": 0.0}
+        for name, seconds in (("scenario", 5.0), ("without rain", 4.0), ("with divergence", 12.0), ("gamma 2", 5.0))
+    ]
+    about = {"inputs": files.hash_of(trials.inputs_of(scenario))}
+    monkeypatch.setattr(callings, "read_accuracy", lambda _: (rows, about))
+    found = callings.prices(scenario, tmp_path)
+    assert found is not None
+    assert {name: price.seconds for name, price in found.items()} == {"rain": 1.0, "divergence": 7.0}
+
+
+def test_an_effect_that_lacks_something_is_refused(mini: Path) -> None:
+    found = states(mini, "effects.range_limit={}", "effects.pedestrians_bicycles.pedestrians_per_h=100")
+    assert found["range_limit"][0] == "refused"
+    assert "no rated_range_m" in found["range_limit"][1]
+    assert found["pedestrians_bicycles"][0] == "refused"
+    assert "finished FCD file" in found["pedestrians_bicycles"][1]
+
+
+def test_effects_that_a_study_left_out_are_named(mini: Path, tmp_path: Path, egvs) -> None:
+    words = ("--out", tmp_path / "out", "--set", "effects.rain.rate_mm_h=20")
+    assert egvs("accuracy", mini, "--budget", "0.001s", *words)[0] == 0
+    code, printed, _ = egvs("effects", mini, *words)
+    assert code == 0
+    assert "what rain cost and change: egvs accuracy" in printed

@@ -1,0 +1,218 @@
+"""Does every format of floating car data give the same rows, and is every damaged one refused with a clear message?"""
+
+import gzip
+import re
+from itertools import pairwise
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.core.errors import InputError
+from pipeline.traffic import fcd
+
+HEADER = "timestep_time;vehicle_id;vehicle_x;vehicle_y;vehicle_angle;vehicle_type;vehicle_speed"
+CSV = f"""{HEADER}
+0.000;;;;;;
+0.500;b;1.00000000;2.00000000;90.00000000;car;3.50000000
+0.500;a;-1.25000000;1e3;360.00000000;bus;0.00000000
+1.000;b;2.50000000;2.00000000;90.00000000;car;3.00000000
+"""
+XML = """<?xml version="1.0"?>
+<fcd-export>
+  <timestep time="0.00"/>
+  <timestep time="0.50">
+    <vehicle id="b" x="1.00" y="2.00" angle="90.00" type="car" speed="3.50"/>
+    <vehicle id="a" x="-1.25" y="1000.00" angle="360.00" type="bus" speed="0.00"/>
+    <person id="p" x="1" y="1" angle="0" speed="1"/>
+  </timestep>
+  <timestep time="1.00"><vehicle id="b" x="2.50" y="2.00" angle="90.00" type="car" speed="3.00"/></timestep>
+</fcd-export>
+"""
+ROWS = {
+    "time_ms": [500, 500, 1000],
+    "id": ["b", "a", "b"],
+    "type": ["car", "bus", "car"],
+    "x": [1.0, -1.25, 2.5],
+    "y": [2.0, 1000.0, 2.0],
+    "z": [0.0, 0.0, 0.0],
+    "angle": [90.0, 360.0, 90.0],
+    "slope": [0.0, 0.0, 0.0],
+    "speed": [3.5, 0.0, 3.0],
+}
+
+
+def parquet_bytes():
+    nan = float("nan")
+    table = pa.table(
+        {
+            "timestep_time": [0.0, 0.5, 0.5, 1.0],
+            "vehicle_id": ["", "b", "a", "b"],
+            "vehicle_x": [nan, 1.0, -1.25, 2.5],
+            "vehicle_y": [nan, 2.0, 1000.0, 2.0],
+            "vehicle_angle": pa.array([nan, 90.0, 360.0, 90.0], pa.float32()),
+            "vehicle_type": ["", "car", "bus", "car"],
+            "vehicle_speed": [nan, 3.5, 0.0, 3.0],
+        }
+    )
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink)
+    return sink.getvalue().to_pybytes()
+
+
+def read_all(path):
+    return pa.concat_tables([fcd.SCHEMA.empty_table(), *fcd.read(path)])
+
+
+@pytest.mark.parametrize("zipped", [False, True], ids=["plain", "gzipped"])
+@pytest.mark.parametrize("form", ["csv", "xml", "parquet"])
+def test_every_format_gives_the_same_rows(tmp_path, form, zipped):
+    content = {"csv": CSV.encode(), "xml": XML.encode(), "parquet": parquet_bytes()}[form]
+    path = tmp_path / "recorded"  # the name says nothing, the first bytes do
+    path.write_bytes(gzip.compress(content) if zipped else content)
+    assert read_all(path).to_pydict() == ROWS
+
+
+def test_columns_may_stand_in_any_order_and_beside_others(tmp_path):
+    path = tmp_path / "fcd.csv"
+    path.write_text(
+        "vehicle_lane;vehicle_slope;vehicle_type;vehicle_angle;vehicle_z;vehicle_y;vehicle_x;vehicle_id;timestep_time\n"
+        "e_0;2.5;car;10;7;3;4;v;1.000\n"
+    )
+    row = read_all(path).to_pylist()[0]
+    assert (row["x"], row["y"], row["z"], row["angle"], row["slope"]) == (4, 3, 7, 10, 2.5)
+    assert np.isnan(row["speed"])
+
+
+def test_persons_in_a_csv_are_left_out(tmp_path):
+    path = tmp_path / "fcd.csv"
+    path.write_text(f"{HEADER};person_id;person_x\n1;;;;;;;p;3\n1;v;1;2;3;car;4;;\n")
+    assert read_all(path)["id"].to_pylist() == ["v"]
+
+
+def row(**changes):
+    values = {"time": "1.0", "id": "v", "x": "1", "y": "2", "angle": "3", "type": "car", "speed": "4"} | changes
+    return ";".join(values.values())
+
+
+BAD = {
+    "empty": (b"", "is empty"),
+    "without angle": (HEADER.replace("vehicle_angle", "vehicle_lane").encode() + b"\n", "no column for 'angle'"),
+    "without type": (HEADER.replace("vehicle_type", "vehicle_lane").encode() + b"\n", "no column for 'type'"),
+    "not a number": (f"{HEADER}\n{row(x='here')}\n".encode(), r"cannot be read as CSV.*here"),
+    "NaN angle": (f"{HEADER}\n{row()}\n{row(angle='nan')}\n".encode(), r"row 2: angle of vehicle 'v' is nan; a finite"),
+    "empty angle": (f"{HEADER}\n{row(angle='')}\n".encode(), r"row 1: angle of vehicle 'v' is empty"),
+    "x beyond the Earth": (
+        f"{HEADER}\n{row(x='1e9')}\n".encode(),
+        r"row 1: x of vehicle 'v' is 1000000000.0; a finite number, at most",
+    ),
+    "infinite x": (f"{HEADER}\n{row(x='inf')}\n".encode(), r"row 1: x of vehicle 'v' is inf"),
+    "no type given": (f"{HEADER}\n{row(type='')}\n".encode(), r"row 1: vehicle 'v' has no type"),
+    "time runs back": (f"{HEADER}\n{row(time='2')}\n{row()}\n".encode(), r"row 2: time 1 s comes after 2 s"),
+    "time too fine": (f"{HEADER}\n{row(time='0.0005')}\n".encode(), r"row 1: time 0\.000500 s.*milliseconds"),
+    "clock time": (f"{HEADER}\n{row(time='00:00:01')}\n".encode(), r"cannot be read as CSV"),
+    "short row": (f"{HEADER}\n{row()}\n1.0;v;1\n".encode(), r"cannot be read as CSV"),
+    "truncated gzip, CSV": (gzip.compress(CSV.encode() * 900)[:-30], r"damaged gzip|cannot be read as CSV"),
+    "truncated gzip, XML": (gzip.compress(XML.encode())[:-30], r"damaged gzip"),
+    "truncated gzip, Parquet": (gzip.compress(parquet_bytes())[:-30], r"damaged gzip"),
+    "truncated XML": (XML[:-40].encode(), r"not well-formed XML"),
+    "XML of another kind": (b"<net/>", r"its root is <net>; a file whose root is <fcd-export>"),
+    "XML without angle": (XML.replace('angle="90.00"', "").encode(), r"vehicle 'b' at time '0\.50' has no angle"),
+    "XML with a bad number": (XML.replace('"-1.25"', '"west"').encode(), r"x: .*west"),
+    "XML with NaN": (XML.replace('"360.00"', '"nan"').encode(), r"vehicle element 2: angle of vehicle 'a' is nan"),
+    "XML with entities": (b'<!DOCTYPE f [<!ENTITY a "b">]><fcd-export>&a;</fcd-export>', r"declares XML entities"),
+    "truncated Parquet": (parquet_bytes()[:-30], r"cannot be read as Parquet"),
+}
+
+
+@pytest.mark.parametrize(("content", "message"), BAD.values(), ids=BAD.keys())
+def test_damaged_file_is_refused(tmp_path, content, message):
+    path = tmp_path / "bad.fcd"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=message) as caught:
+        list(fcd.read(path))
+    assert str(path) in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_missing_file_is_refused(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        list(fcd.read(tmp_path / "none.csv"))
+
+
+def steps(*times_s, vehicle="v"):
+    n = len(times_s)
+    zeros = np.zeros(n)
+    return pa.table(
+        [
+            np.round(np.array(times_s) * 1000).astype(np.int64),
+            pa.array([vehicle] * n),
+            pa.array(["car"] * n),
+            *[zeros] * 6,
+        ],
+        schema=fcd.SCHEMA,
+    )
+
+
+def picked(tables, window, each=2):
+    found = list(fcd.groups(tables, window, each, "place"))
+    assert [g.first_frame for g in found] == list(np.cumsum([0] + [g.frames for g in found[:-1]]))
+    assert sum(g.frames for g in found) == window.count
+    return [(int(f), t) for g in found for f, t in zip(g.frame, g.rows["time_ms"].to_pylist(), strict=True)]
+
+
+def test_warm_up_and_period_choose_the_time_steps():
+    times = np.arange(25_200, 25_205, 0.25)
+    assert picked([steps(*times)], fcd.Window(3, 500, skip_ms=1000)) == [
+        (0, 25_201_000),
+        (1, 25_201_500),
+        (2, 25_202_000),
+    ]
+
+
+def test_an_empty_step_of_a_complete_recording_is_an_empty_frame():
+    window = fcd.Window(5, 1000, first_ms=1000, complete=True)
+    assert picked([steps(0, 1, 3)], window) == [(0, 1000), (2, 3000)]
+    assert picked([], window) == []
+
+
+def test_too_few_frames_are_counted():
+    with pytest.raises(
+        InputError, match=r"frames = 5: the file has 3 frames 1 s apart after a warm-up of 1 s \(4 time steps in all"
+    ):
+        list(fcd.groups([steps(0, 1, 2, 3)], fcd.Window(5, 1000, skip_ms=1000), 10, "place"))
+
+
+def test_a_period_between_the_files_steps_is_refused():
+    with pytest.raises(InputError, match=r"frame_period_s = 0.25: the file's time steps are 1 s apart"):
+        list(fcd.groups([steps(0, 1, 2, 3)], fcd.Window(2, 250), 10, "place"))
+
+
+def test_a_file_without_vehicles_is_refused():
+    with pytest.raises(InputError, match="holds no vehicle"):
+        list(fcd.groups([], fcd.Window(2, 250), 10, "place"))
+
+
+@given(
+    present=st.lists(st.integers(0, 3), min_size=1, max_size=40),
+    cuts=st.lists(st.integers(0, 120), max_size=6),
+    each=st.integers(1, 7),
+)
+def test_groups_do_not_depend_on_how_rows_arrive(present, cuts, each):
+    whole = steps(*np.repeat(np.arange(len(present)), present).tolist())
+    edges = sorted({0, whole.num_rows, *(c for c in cuts if c < whole.num_rows)})
+    pieces = [whole.slice(a, b - a) for a, b in pairwise(edges) if b > a]
+    window = fcd.Window(len(present), 1000, first_ms=0, complete=True)
+    expected = [(f, f * 1000) for f, n in enumerate(present) for _ in range(n)]
+    assert picked(pieces, window, each) == expected
+
+
+def test_the_message_names_the_file_only_once(tmp_path):
+    path = tmp_path / "x.csv"
+    path.write_text("a;b\n1;2\n")
+    with pytest.raises(InputError) as caught:
+        list(fcd.read(path))
+    assert len(re.findall("x.csv", str(caught.value))) == 1

@@ -1,0 +1,390 @@
+"""Is every footprint and mesh built as it is meant, or mended with a count, or refused with the reason - and never
+dropped?"""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import trimesh
+
+from pipeline.core.errors import InputError
+from pipeline.scenario import loading
+from pipeline.scenario.loading import from_values
+from pipeline.sensing import scanner as survey
+from pipeline.stages import statics
+from pipeline.world.mesh import World, read_ply, write_ply
+from tests.conftest import collection, feature
+
+SQUARE = [[0, 0], [4, 0], [4, 4], [0, 4], [0, 0]]
+COURT = [[10, 10], [30, 10], [30, 30], [10, 30], [10, 10]]
+HOLE = [[15, 15], [15, 25], [25, 25], [25, 15], [15, 15]]
+
+
+def polygon(*rings, **properties):
+    return feature({"type": "Polygon", "coordinates": list(rings)}, **{"height_m": 5, "name": "it", **properties})
+
+
+def load(folder, **settings):
+    values = {
+        "roi": {"center_m": [20, 20, 2.5], "size_m": [80, 80, 5], "voxel_m": 0.5},
+        "traffic": {"fcd": "none.csv"},
+        "sites": {"file": "sites.csv", "sensor": "VLP-16"},
+        "statics": {"ground": False, **settings},
+    }
+    return from_values(values, folder, "scenario.toml")
+
+
+def built(folder, *features):
+    """The world and the tally of a GeoJSON file."""
+    (folder / "s.geojson").write_text(collection(*features))
+    tally = statics.Tally.empty()
+    return statics.build(load(folder, footprints=["s.geojson"]), tally), tally
+
+
+def volumes(world):
+    """Signed volume of each solid."""
+    t = world.triangles_m
+    each = (t[:, 0] * np.cross(t[:, 1], t[:, 2])).sum(axis=1) / 6
+    return np.bincount(world.solid_of_face, weights=each, minlength=len(world.solids))
+
+
+def mesh_of(folder, mesh, **settings):
+    """The world and the tally of a mesh file."""
+    mesh.export(folder / "m.ply")
+    tally = statics.Tally.empty()
+    return statics.build(load(folder, meshes=[{"file": "m.ply", **settings}]), tally), tally
+
+
+@pytest.mark.parametrize(
+    ("rings", "area"),
+    [
+        ([SQUARE], 16),
+        ([SQUARE[::-1]], 16),
+        ([COURT, HOLE], 300),
+        ([COURT[::-1], HOLE[::-1]], 300),
+        ([COURT, HOLE, [[11, 11], [12, 11], [11.5, 12], [11, 11]]], 299.5),
+        ([COURT, [[10, 10], [15, 20], [20, 15], [10, 10]]], 400 - 37.5),  # the hole touches the ring in a point
+        ([[[0, 0], [10, 0], [10, 10], [5, 1], [0, 10], [0, 0]]], 100 - 45),
+        ([[[0, 0], [1000, 0], [1000, 1e-6], [0, 0]]], 5e-4),
+    ],
+)
+def test_a_prism_is_closed_faces_outwards_and_has_its_volume(tmp_path, rings, area):
+    world, tally = built(tmp_path, polygon(*rings, base_m=2.5, height_m=7.0))
+    assert world.closed.all()
+    assert volumes(world) == pytest.approx([area * 4.5], rel=1e-9)
+    assert world.triangles_m[..., 2].min() == 2.5
+    assert world.triangles_m[..., 2].max() == 7.0
+    assert not tally.mended
+    assert not tally.left_out
+
+
+def test_points_are_discs_and_lines_are_strips(tmp_path):
+    world, tally = built(
+        tmp_path,
+        feature({"type": "Point", "coordinates": [5, 5]}, height_m=3, radius_m=0.5, kind="pole"),
+        feature(
+            {"type": "LineString", "coordinates": [[0, 0], [10, 0], [10, 10]]}, height_m=1, radius_m=0.25, kind="wall"
+        ),
+        feature({"type": "MultiPoint", "coordinates": [[20, 5], [22, 5]]}, height_m=3, radius_m=0.5, kind="pole"),
+    )
+    assert world.closed.all()
+    disc = 16 / 2 * 0.25 * math.sin(2 * math.pi / 16) * 3
+    assert volumes(world)[[0, 2, 3]] == pytest.approx([disc] * 3, rel=1e-12)
+    assert volumes(world)[1] == pytest.approx(10.0, rel=0.02)  # the bend is mitred, the ends are flat
+    assert tally.built == {"pole": 3, "wall": 1}
+
+
+@pytest.mark.parametrize(
+    ("features", "mended", "area"),
+    [
+        ([polygon([[0, 0], [4, 0], [4, 0], [4, 4], [4, 4], [4, 4], [0, 4], [0, 0]])], {"doubled points": 3}, [16]),
+        # two triangles that share a corner, as one ring
+        ([polygon([[0, 0], [4, 0], [2, 2], [4, 4], [0, 4], [2, 2], [0, 0]])], {"rings that touched themselves": 1}, [4, 4]),
+        # a ring that runs round its own hole and back through a point
+        ([polygon([[0, 0], [9, 0], [9, 9], [0, 9], [0, 0], [2, 3], [3, 6], [6, 3], [0, 0]])],
+         {"rings that touched themselves": 1}, [81 - 12]),
+    ],
+)  # fmt: skip
+def test_dirt_with_one_meaning_is_mended_and_counted(tmp_path, features, mended, area):
+    world, tally = built(tmp_path, *features)
+    assert dict(tally.mended) == mended
+    assert world.closed.all()
+    assert sorted(volumes(world)) == pytest.approx(sorted(5 * a for a in area), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("geometry", "reason"),
+    [
+        ({"type": "Polygon", "coordinates": [[[0, 0], [4, 4], [4, 0], [0, 4], [0, 0]]]}, "Self-intersection"),
+        ({"type": "Polygon", "coordinates": [SQUARE, [[9, 9], [9, 10], [10, 9], [9, 9]]]}, "Hole lies outside"),
+        ({"type": "Polygon", "coordinates": [SQUARE, [[2, 2], [9, 2], [2, 9], [2, 2]]]}, "not a sound polygon"),
+        (
+            {"type": "Polygon", "coordinates": [COURT, HOLE, [[16, 16], [17, 16], [16, 17], [16, 16]]]},
+            "Holes are nested",
+        ),
+        (
+            {"type": "Polygon", "coordinates": [[[0, 0], [4, 0], [2, 0], [0, 0]]]},
+            "not a sound polygon|encloses no area",
+        ),
+        (
+            {"type": "Polygon", "coordinates": [[[1, 1], [1, 1], [1, 1], [1, 1]]]},
+            "not a sound polygon|encloses no area",
+        ),
+        ({"type": "Polygon", "coordinates": [[[0, 0], [4, 0], [0, 0]]]}, "cannot be understood|not a sound polygon"),
+        ({"type": "Polygon", "coordinates": [[[0, 0], [math.nan, 0], [4, 4], [0, 0]]]}, "no number"),
+        ({"type": "Polygon", "coordinates": [[[0, 0], [math.inf, 0], [4, 4], [0, 0]]]}, "no number"),
+        ({"type": "Polygon", "coordinates": []}, "is empty"),
+        ({"type": "MultiPolygon", "coordinates": [[SQUARE], [SQUARE]]}, "not a sound polygon"),
+        ({"type": "GeometryCollection", "geometries": []}, "is empty"),
+        ({"type": "Polygon", "coordinates": [[[0, 0, 1], [4, 0, 1], [4, 4, 1], [0, 0, 1]]]}, "z coordinates"),
+        ({"type": "Point", "coordinates": [1, 1]}, "radius_m is missing"),
+        ({"type": "Curve", "coordinates": [1, 1]}, "cannot be understood"),
+        (None, "cannot be understood"),
+    ],
+)
+def test_dirt_with_two_meanings_is_refused(tmp_path, geometry, reason):
+    with pytest.raises(InputError, match=rf"s\.geojson: feature 1 \(bad\).*({reason})"):
+        built(tmp_path, polygon(SQUARE), feature(geometry, height_m=3, name="bad"))
+
+
+def test_a_ring_that_is_not_closed_means_the_closed_one(tmp_path):
+    assert volumes(built(tmp_path, polygon(SQUARE[:-1]))[0]) == pytest.approx([80], rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    "values", [{"height_m": 0}, {"height_m": 2, "base_m": 3}, {"height_m": "5"}, {"height_m": None}, {"height_m": True}]
+)
+def test_senseless_heights_are_refused(tmp_path, values):
+    with pytest.raises(InputError, match="height_m"):
+        built(tmp_path, polygon(SQUARE, **values))
+
+
+def test_poly_xml(tmp_path):
+    shapes = {"a": "0,0 4,0 4,4 0,4", "b": "0,0 4,4 4,0 0,4", "c": "0,0 5,5", "d": "0,0 nan,0 4,4 0,4"}
+    (tmp_path / "s.poly.xml").write_text(
+        '<additional><poly id="a" type="building" fill="1" shape="{a}"><param key="height" value="3"/></poly>'
+        '<poly id="c" fill="0" shape="{c}"/><poi id="p" x="0" y="0"/></additional>'.format(**shapes)
+    )
+    tally = statics.Tally.empty()
+    world = statics.build(load(tmp_path, polygons=["s.poly.xml"]), tally)
+    assert volumes(world) == pytest.approx([48], rel=1e-12)
+    assert sum(tally.left_out.values()) == 2
+    for name in "bd":
+        (tmp_path / "s.poly.xml").write_text(f'<additional><poly id="x" fill="1" shape="{shapes[name]}"/></additional>')
+        with pytest.raises(InputError, match="poly x"):
+            statics.build(load(tmp_path, polygons=["s.poly.xml"]), statics.Tally.empty())
+
+
+BOX = trimesh.creation.box((4, 6, 8))
+
+
+def test_a_mesh_is_taken_apart_into_closed_pieces(tmp_path):
+    two = trimesh.util.concatenate([BOX, BOX.copy().apply_translation([10, 0, 0])])
+    world, tally = mesh_of(tmp_path, two, offset_m=(100, 200, 300), kind="city")
+    assert len(world.solids) == 2
+    assert world.closed.all()
+    assert world.triangles_m.min(axis=(0, 1)).tolist() == [98, 197, 296]
+    assert tally.built == {"city": 2}
+    assert not tally.mended
+
+
+def test_an_inverted_solid_is_still_a_solid(tmp_path):
+    inverted = BOX.copy()
+    inverted.invert()
+    world, _ = mesh_of(tmp_path, inverted)
+    assert world.closed.all()
+    assert world.signs.tolist() == [-1]
+
+
+@pytest.mark.parametrize("spoil", ["hole", "flipped"])
+def test_a_mesh_with_a_hole_or_a_turned_triangle_stays_a_surface(tmp_path, spoil):
+    faces = np.array(BOX.faces)
+    faces = faces[1:] if spoil == "hole" else np.concatenate([faces[:1, ::-1], faces[1:]])
+    world, tally = mesh_of(tmp_path, trimesh.Trimesh(BOX.vertices, faces, process=False))
+    assert len(world.faces) == len(faces)
+    assert not world.closed.any()
+    assert tally.built == {"mesh (open surface)": 1}
+
+
+def test_doubled_and_degenerate_triangles_are_dropped_and_counted(tmp_path):
+    faces = np.concatenate([BOX.faces, BOX.faces[:3], BOX.faces[:2, [0, 0, 1]]])
+    world, tally = mesh_of(tmp_path, trimesh.Trimesh(BOX.vertices, faces, process=False))
+    assert world.closed.all()
+    assert dict(tally.mended) == {"degenerate or doubled triangles dropped": 5}
+
+
+def test_a_soup_of_separate_triangles_is_sewn(tmp_path):
+    soup = trimesh.Trimesh(BOX.triangles.reshape(-1, 3), np.arange(36).reshape(-1, 3), process=False)
+    world, _ = mesh_of(tmp_path, soup)
+    assert world.closed.all()
+    assert abs(volumes(world)[0]) == pytest.approx(192)
+
+
+@pytest.mark.parametrize("value", ["nan", "inf"])
+def test_a_vertex_that_is_no_number_is_refused(tmp_path, value):
+    (tmp_path / "m.obj").write_text(f"v 0 0 0\nv 1 0 0\nv 0 {value} 0\nf 1 2 3\n")
+    with pytest.raises(InputError, match=r"m\.obj: vertex 2"):
+        statics.build(load(tmp_path, meshes=[{"file": "m.obj"}]), statics.Tally.empty())
+
+
+def test_a_mesh_without_triangles_is_refused(tmp_path):
+    (tmp_path / "m.obj").write_text("v 0 0 0\nv 1 0 0\n")
+    with pytest.raises(InputError, match=r"m\.obj"):
+        statics.build(load(tmp_path, meshes=[{"file": "m.obj"}]), statics.Tally.empty())
+
+
+def test_a_mesh_of_nothing_but_degenerate_triangles_is_refused(tmp_path):
+    (tmp_path / "m.obj").write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 1 2\nf 1 2 3\n")
+    with pytest.raises(InputError, match=r"m\.obj"):
+        statics.build(load(tmp_path, meshes=[{"file": "m.obj"}]), statics.Tally.empty())
+
+
+def test_ground_reaches_beyond_everything(tmp_path):
+    (tmp_path / "s.geojson").write_text(collection(polygon([[p[0] + 300, p[1]] for p in SQUARE])))
+    loaded = load(tmp_path, footprints=["s.geojson"], ground=True)
+    world = statics.build(loaded, statics.Tally.empty())
+    ground = world.triangles_m[world.solid_of_face == 1]
+    assert (ground[..., 2] == 0).all()
+    assert ground[..., 0].max() == 304 + statics.GROUND_MARGIN_M
+    assert world.closed.tolist() == [True, False]
+    assert (np.cross(ground[:, 1] - ground[:, 0], ground[:, 2] - ground[:, 0])[:, 2] > 0).all()
+
+
+def test_ply_comes_back_bit_for_bit(tmp_path):
+    world, _ = built(tmp_path, polygon(COURT, HOLE), polygon(SQUARE, name='quote " and é'))
+    write_ply(tmp_path / "w.ply", world, {"any": 1})
+    again, about = read_ply(tmp_path / "w.ply")
+    assert (again.vertices_m == world.vertices_m).all()
+    assert (again.faces == world.faces).all()
+    assert (again.solid_of_face == world.solid_of_face).all()
+    assert again.solids == world.solids
+    assert about == {"any": 1}
+    assert len(trimesh.load(tmp_path / "w.ply", process=False).faces) == len(world.faces)
+    whole = (tmp_path / "w.ply").read_bytes()
+    for broken in (
+        whole[:-1],
+        whole[: len(whole) // 2],
+        b"",
+        whole.replace(b"element face", b"element fact", 1),
+        b"ply\nend_header\n",
+    ):
+        (tmp_path / "w.ply").write_bytes(broken)
+        with pytest.raises(InputError, match=r"whole statics\.ply"):
+            read_ply(tmp_path / "w.ply")
+
+
+def survey_at(folder, *sites, features, ground=True):
+    (folder / "s.geojson").write_text(collection(*features))
+    (folder / "sites.csv").write_text(
+        "site,x_m,y_m,z_m\n" + "".join(f"s{i},{x!r},{y!r},{z!r}\n" for i, (x, y, z) in enumerate(sites))
+    )
+    loaded = load(folder, footprints=["s.geojson"], ground=ground)
+    return survey.Survey(loaded, statics.build(loaded, statics.Tally.empty()))
+
+
+HOUSES = (
+    polygon(COURT, HOLE, name="court", kind="building", height_m=12),
+    polygon(
+        [[-20, -20], [-10, -20], [-10, -10], [-20, -10], [-20, -20]],
+        name="crown",
+        kind="tree_crown",
+        base_m=4,
+        height_m=9,
+    ),
+)
+
+
+@pytest.mark.parametrize(
+    "site",
+    [
+        (20.0, 20.0, 3.0),  # in the courtyard
+        (12.0, 12.0, 12.5),  # above the roof
+        (12.0, 12.0, 12.0),  # on the roof
+        (-15.0, -15.0, 3.0),  # under the crown
+        (-15.0, -15.0, 4.0),  # at its underside
+        (-15.0, -15.0, 9.5),  # above it
+        (10.0, 20.0, 3.0),  # on a wall
+        (10.0, 10.0, 3.0),  # on a corner
+        (9.999, 20.0, 3.0),
+        (0.0, 0.0, 0.001),
+    ],
+)
+def test_free_places(tmp_path, site):
+    assert len(survey_at(tmp_path, site, features=HOUSES).sites) == 1
+
+
+@pytest.mark.parametrize(
+    ("site", "message"),
+    [
+        ((12.0, 12.0, 3.0), r"site s0: .* stands inside court \(building\)"),
+        ((10.001, 20.0, 3.0), "inside court"),
+        ((12.5, 20.0, 11.999), "inside court"),
+        ((12.5, 12.5, 6.0), "inside court"),  # above a diagonal of the triangulation
+        ((-15.0, -15.0, 5.0), r"inside crown \(tree_crown\)"),
+        ((-15.0, -15.0, 4.00001), "inside crown"),
+        ((0.0, 0.0, 0.0), "not above the ground"),
+        ((0.0, 0.0, -1.0), "not above the ground"),
+        ((200.0, 20.0, 3.0), r"stands 140\.0 m from the region of interest"),
+    ],
+)
+def test_impossible_places(tmp_path, site, message):
+    with pytest.raises(InputError, match=message):
+        survey_at(tmp_path, site, features=HOUSES)
+
+
+@pytest.mark.parametrize("degrees", range(3, 90, 7))
+def test_a_site_on_an_oblique_wall_is_no_matter_of_rounding(tmp_path, degrees):
+    turn = trimesh.transformations.rotation_matrix(np.radians(degrees), [0, 0, 1])[:2, :2]
+    house = (np.array(SQUARE) - 2) @ turn.T + 20
+    walls = [
+        (*(float(v) for v in turn @ [2.0 + d, y] + 20), 3.0)
+        for y in (-1.1, 0.0, 0.3)
+        for d in (-5e-7, -1e-12, 0.0, 1e-12)
+    ]
+    assert len(survey_at(tmp_path, *walls, features=[polygon(house.tolist())]).sites) == len(walls)
+    deep = (*(float(v) for v in turn @ [1.999, 0.3] + 20), 3.0)
+    with pytest.raises(InputError, match="inside it"):
+        survey_at(tmp_path, deep, features=[polygon(house.tolist())])
+
+
+def test_a_site_inside_an_inverted_solid_is_found_and_an_open_one_is_not(tmp_path):
+    (tmp_path / "sites.csv").write_text("site,x_m,y_m,z_m\na,20,20,3\n")
+    inverted = BOX.copy()
+    inverted.invert()
+    for mesh, refused in ((inverted, True), (trimesh.Trimesh(BOX.vertices, BOX.faces[1:], process=False), False)):
+        world, _ = mesh_of(tmp_path, mesh, offset_m=(20, 20, 3))
+        loaded = load(tmp_path, meshes=[{"file": "m.ply", "offset_m": (20, 20, 3)}])
+        if refused:
+            with pytest.raises(InputError, match="inside m_0"):
+                survey.Survey(loaded, world)
+        else:
+            assert len(survey.Survey(loaded, world).sites) == 1
+
+
+def test_closed_means_each_side_met_by_its_opposite():
+    faces = np.array(BOX.faces, dtype=np.int32)
+    twice = np.concatenate([faces, faces + 8])
+    owner = np.repeat([0, 1], 12).astype(np.int32)
+    points = np.concatenate([BOX.vertices, BOX.vertices + 20])
+    names = (("a", "x"), ("b", "x"))
+    assert World(points, twice, owner, names).closed.tolist() == [True, True]
+    assert World(points, twice[:-1], owner[:-1], names).closed.tolist() == [True, False]
+    assert World(points, faces, owner[:12], names).closed.tolist() == [True, False]
+    doubled = World(points[:8], np.concatenate([faces, faces[:1]]), np.zeros(13, dtype=np.int32), names[:1])
+    assert doubled.closed.tolist() == [False]
+    far = World(points + np.array([393216.0, 3932160.0, 64.0]), twice[:, ::-1].copy(), owner, names)
+    assert far.signs.tolist() == [-1, -1]
+
+
+def test_shipped_statics_are_closed_and_clean():
+    for name in ("nishishinjuku", "ingolstadt"):
+        tally = statics.Tally.empty()
+        world = statics.build(loading.load(f"scenarios/{name}"), tally)
+        kinds = [kind for _, kind in world.solids]
+        assert [k for k, closed in zip(kinds, world.closed, strict=True) if not closed] == ["ground"]
+        assert (world.signs[world.closed] == 1).all()
+        assert not tally.mended
+        assert not tally.left_out
+        features = json.loads((statics.Path("scenarios") / name / "statics.geojson").read_text())["features"]
+        assert sum(tally.built.values()) >= len(features)
