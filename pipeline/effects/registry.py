@@ -1,247 +1,69 @@
-r"""Which effects exist, and what may one do?
+"""Finds effects by name, makes them from a scenario, and resolves a scene with those that act.
 
-The plain scene has straight beams, opaque static geometry and no weather. Everything beyond it is an *effect*: a table
-``[effects.<name>]`` in the scenario, and one module of that name in this folder, imported only when it is named. An
-effect acts in one stage, in one of four ways:
-
-========== ======== ===========================================================================================
-kind       stage    what it does
-========== ======== ===========================================================================================
-expand     scan     turns a beam into weighted sub-beams; the weights of a beam add up to 1
-transmit   scan     cuts a cast beam into parts, each a share of the beam that ends elsewhere
-transmit   score    gives the share of a beam that gets as far as each voxel that it crosses
-detect     score    gives the chance that a target at a range sends a return that is noticed
-traffic    traffic  changes who moves, and how boxes are made of it
-========== ======== ===========================================================================================
-
-.. math:: hits(v) = \sum_{beams} \sum_{sub} w_{sub} \cdot transmit(beam, v) \cdot detect(range(v))
-
-Weights are expectations, not dice. Without effects each factor is 1, and hits counts beams.
+Effects are entry points of the group ``egvs.effects`` (``name = "module:Class"``): this program's own, declared in its
+``pyproject.toml``, and those of any other package. A module is imported only when its effect is named.
 """
 
 from __future__ import annotations
 
-import difflib
-import importlib
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from collections.abc import Iterable
+from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-from pydantic import ValidationError
-
-from pipeline.core.errors import InputError
-from pipeline.core.models import StrictModel
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pipeline.core.grid import Roi
-    from pipeline.scenario.models import Scenario
-    from pipeline.sensing.crossings import Crossings
-    from pipeline.sensing.sensors import Sensor
-    from pipeline.sensing.sites import Site
-    from pipeline.world.casting import EmptyScan
-    from pipeline.world.mesh import World
-
-KINDS: dict[str, tuple[str, str]] = {
-    "range_limit": ("score", "detect"),
-    "rain": ("score", "detect"),
-    "fog": ("score", "detect"),
-    "dropout": ("score", "detect"),
-    "moving_occlusion": ("score", "transmit"),
-    "divergence": ("scan", "expand"),
-    "mount_sway": ("scan", "expand"),
-    "foliage": ("scan", "transmit"),
-    "slope": ("traffic", "traffic"),
-    "articulated": ("traffic", "traffic"),
-    "pedestrians_bicycles": ("traffic", "traffic"),
-}
-"""Every effect: the stage that it acts in, and its kind. Composed in this order within a stage."""
-
-SELF_ACTING = "slope"
-"""The one effect that switches itself on, when the network has relief: leaving it out would be wrong."""
+from pipeline.core import plugins
+from pipeline.effects.base import Effect
+from pipeline.scenario.effects import GROUP, EffectParameters, EffectsModel
+from pipeline.scenario.models import Scenario
+from pipeline.sensing import sites
+from pipeline.sensing.scene import IdleEffect, Scene
+from pipeline.world.mesh import World
 
 
-class Parameters(StrictModel):
-    """Base of an effect's parameters."""
+def names() -> list[str]:
+    """Every effect that is installed: this program's own in the order in which they are composed, then others."""
+    return [*EffectsModel.OWN, *(name for name in plugins.names(GROUP) if name not in EffectsModel.OWN)]
 
 
-@dataclass(frozen=True)
-class Effect:
-    """Base of all effects.
-
-    Attributes
-    ----------
-    parameters
-        As the scenario names them, checked.
-    NAME, SOURCE
-        The effect's name, and where its model is published.
-    Model
-        The class of ``parameters``.
-    QUALITY
-        Parameters that trade time for accuracy, and values from cheap to fine; the accuracy study tries them.
-    """
-
-    parameters: Any
-    NAME: ClassVar[str]
-    SOURCE: ClassVar[str]
-    Model: ClassVar[type[Parameters]]
-    QUALITY: ClassVar[dict[str, tuple[Any, ...]]] = {}
-
-    @property
-    def reads(self) -> tuple[str, ...]:
-        """Artefacts that the effect reads beyond those that its stage reads anyway."""
-        return ()
-
-    def idle(self, scene: Scene) -> str | None:
-        """Why the effect provably cannot change the result in this scene; None when it can."""
-        del scene
-        return None
-
-    def lacks(self, scene: Scene) -> InputError | None:
-        """What a run of this scene would be refused for; None when nothing is missing."""
-        del scene
-        return None
+def effect_class(name: str) -> type[Effect[Any]]:
+    """Import one effect; InputError for one that does not exist."""
+    found: type[Effect[Any]] = plugins.load(GROUP, name)
+    return found
 
 
-@dataclass(frozen=True)
-class Scene:
-    """What an effect may look at to tell whether it is called for."""
-
-    scenario: Scenario
-    world: World
-    sites: tuple[Site, ...]
-
-
-class Detect(Effect):
-    """The chance that a return is noticed."""
-
-    def lacks(self, scene: Scene) -> InputError | None:
-        """Something that a sensor does not say."""
-        from pipeline.sensing import sensors
-
-        try:
-            for name in dict.fromkeys(site.sensor for site in scene.sites):
-                self.detect(
-                    np.ones(1), sensors.resolve(name, scene.scenario.sensors, f"{scene.scenario.file}: sensors")
-                )
-        except InputError as error:
-            return error
-        return None
-
-    def detect(self, range_m: NDArray[np.float64], sensor: Sensor) -> NDArray[np.float64]:
-        """Chance (n,), 0 to 1, for targets at ``range_m`` (n,) metres from the sensor."""
-        raise NotImplementedError
-
-
-class Expand(Effect):
-    """One beam into weighted sub-beams."""
-
-    @property
-    def copies(self) -> int:
-        """How many sub-beams a beam has."""
-        raise NotImplementedError
-
-    def expand(
-        self, directions: NDArray[np.float64], sensor: Sensor, site: Site
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
-        """Sub-beams (m, 3), unit vectors along the world's axes, of some beams ``directions`` (n, 3) of ``sensor`` as
-        it is mounted at ``site``; the row of ``directions`` that each comes from (m,), ascending, and its weight (m,);
-        the weights of one beam add up to 1."""
-        raise NotImplementedError
-
-
-class TransmitScan(Effect):
-    """What gets beyond static surfaces."""
-
-    def opaque(self, world: World) -> World:
-        """The world without what this effect lets beams through."""
-        raise NotImplementedError
-
-    def cutter(self, world: World, roi: Roi) -> Callable[[EmptyScan, Site], EmptyScan]:
-        """What cuts the scan of a site that was cast at :meth:`opaque` into weighted parts; prepared once, threads may
-        share it.
-
-        Each part is a beam from the sensor that ends where that share of the beam ends, so that the weights of a beam
-        still add up to what they were, and a voxel's hits are the share that gets as far."""
-        raise NotImplementedError
-
-
-class TransmitScore(Effect):
-    """What gets as far as a voxel."""
-
-    def prepare(self, scenario: Scenario, out: Path) -> TransmitScore:
-        """Read what :meth:`share` needs, once, before any site is scored; returns the effect that holds it."""
-        raise NotImplementedError
-
-    def share(self, crossings: Crossings) -> NDArray[np.float64]:
-        """Share (k,), 0 to 1, of its beam that gets as far as each crossing of ``crossings``; called from several
-        threads."""
-        raise NotImplementedError
-
-
-class Traffic(Effect):
-    """Who moves, and how boxes are made of it; the traffic stage knows these by name."""
-
-
-def make(name: str, parameters: dict[str, Any], place: str) -> Effect:
-    """Import one effect and check its parameters.
-
-    Raises
-    ------
-    InputError
-        For an effect that does not exist (naming the nearest), or parameters that are wrong.
-    """
-    if name not in KINDS:
-        near = difflib.get_close_matches(name, KINDS, 1, 0.4)
-        right = f"did you mean {near[0]}?" if near else f"known are {', '.join(KINDS)}"
-        raise InputError(f"{place}.{name}", "unknown effect", right)
-    kind = kind_of(name)
-    try:
-        return kind(kind.Model.of(parameters))
-    except ValidationError as error:
-        item = error.errors()[0]
-        key = ".".join(str(part) for part in item["loc"])
-        if item["type"] == "extra_forbidden":
-            known = list(kind.Model.model_fields)
-            near = difflib.get_close_matches(key, known, 1, 0.5)
-            right = f"did you mean {near[0]}?" if near else f"known here are {', '.join(known) or 'none'}"
-            raise InputError(f"{place}.{name}.{key}", "unknown key", right) from None
-        if item["type"] == "missing":
-            raise InputError(f"{place}.{name}.{key}", "missing", "this key is needed") from None
-        raise InputError(f"{place}.{name}.{key}".rstrip("."), f"{item['input']!r}", item["msg"]) from None
-
-
-def kind_of(name: str) -> type[Effect]:
-    """Import one effect."""
-    kind: type[Effect] = importlib.import_module(f"pipeline.effects.{KINDS[name][0]}.{name}").EFFECT
-    return kind
+def make(name: str, parameters: EffectParameters) -> Effect[Any]:
+    """One effect with its parameters."""
+    return effect_class(name)(parameters)
 
 
 def needs(name: str) -> list[str]:
     """The parameters of an effect that have no default."""
-    return [key for key, field in kind_of(name).Model.model_fields.items() if field.is_required()]
+    return [key for key, field in effect_class(name).Model.model_fields.items() if field.is_required()]
 
 
-def of(scenario: Scenario, stage: str) -> tuple[Effect, ...]:
-    """The effects that a scenario names and that act in ``stage``, in the order of :data:`KINDS`."""
-    place = f"{scenario.file}: effects"
-    named = [name for name, (where, _) in KINDS.items() if where == stage and name in scenario.effects]
-    return tuple(make(name, dict(scenario.effects[name]), place) for name in named)
+def named(scenario: Scenario, *stages: str) -> tuple[Effect[Any], ...]:
+    """The effects that a scenario names and that act in these stages, in the order in which they are composed."""
+    effects = (make(name, parameters) for name, parameters in scenario.effects.named.items())
+    return tuple(effect for effect in effects if effect.STAGE in stages)
 
 
-def acting(
-    scenario: Scenario, stage: str, world: World, standing: tuple[Site, ...]
-) -> tuple[tuple[Effect, ...], dict[str, str]]:
-    """The named effects of a stage that can change its result, in order; and why each other one cannot."""
-    found, scene = of(scenario, stage), Scene(scenario, world, standing)
-    reasons = {effect.NAME: effect.idle(scene) for effect in found}
-    live = tuple(effect for effect in found if reasons[effect.NAME] is None)
-    return live, {name: reason for name, reason in reasons.items() if reason is not None}
+def resolve(scenario: Scenario, world: World) -> Scene:
+    """The scene of a scenario before its static world: sites, and the effects of scan and score that can change a
+    result.
+
+    Raises
+    ------
+    InputError
+        When the sites are wrong.
+    """
+    plain = Scene(scenario, world, sites.of(scenario))
+    if not scenario.effects.named:
+        return plain
+    effects = named(scenario, "scan", "score")
+    reasons = [effect.why_idle(plain) for effect in effects]
+    live = tuple(effect for effect, why in zip(effects, reasons, strict=True) if why is None)
+    idle = (IdleEffect(effect.NAME, effect.STAGE, why) for effect, why in zip(effects, reasons, strict=True) if why)
+    return Scene(scenario, world, plain.sites, live, tuple(idle))
 
 
-def settings(effects: Iterable[Effect]) -> dict[str, Any]:
+def settings(effects: Iterable[Effect[Any]]) -> dict[str, Any]:
     """What a stage's inputs say of its effects: empty when there is none."""
     return {effect.NAME: effect.parameters.model_dump(mode="json") for effect in effects}

@@ -6,7 +6,6 @@ found relative to the folder; ``$SUMO_HOME/`` in front names a file that SUMO sh
 
 from __future__ import annotations
 
-import importlib
 import json
 import re
 import tomllib
@@ -47,10 +46,6 @@ def load(path: str | Path, overrides: Iterable[str] = ()) -> Scenario:
             )
         _lay_over(values, override)
     scenario = from_values(values, file.parent, str(file))
-    if scenario.effects:
-        registry = importlib.import_module("pipeline.effects.registry")
-        for name, parameters in scenario.effects.items():
-            registry.make(name, parameters, f"{file}: effects")
     source, idle = scenario.traffic.idle_keys()
     if idle:
         raise InputError(

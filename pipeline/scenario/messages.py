@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
@@ -14,25 +14,35 @@ from pipeline.scenario.models import Scenario
 
 def explain(error: ValidationError, place: str) -> InputError:
     """One line for each thing that is wrong: key, value, what would be right."""
-    lines = []
-    for item in error.errors():
-        key = ".".join(str(part) for part in item["loc"])
-        if item["type"] == "extra_forbidden":
-            lines.append((key, "unknown key", nearest_key(item["loc"])))
-        elif item["type"] == "missing":
-            lines.append((key, "missing", "this key is needed"))
-        elif item["type"] == "value_error":
-            lines.append((key or "scenario", str(item["ctx"]["error"]), ""))
-        else:
-            lines.append((key, f"{item['input']!r}", item["msg"][0].lower() + item["msg"][1:]))
+    lines = list(_lines(error, Scenario, ()))
     key, found, right = lines[0]
     more = "".join(f"\n{place}: {k}: {f}" + (f"; {r}" if r else "") for k, f, r in lines[1:])
     return InputError(f"{place}: {key}", found, right + more)
 
 
-def nearest_key(loc: Sequence[str | int]) -> str:
-    """What the user may have meant by an unknown key."""
-    model: type[BaseModel] | None = Scenario
+def _lines(error: ValidationError, model: type[BaseModel], above: tuple[str, ...]) -> Iterator[tuple[str, str, str]]:
+    """Key, what stands there, and what would be right, of everything that is wrong in ``model``, found under
+    ``above``."""
+    for item in error.errors():
+        key = ".".join(str(part) for part in (*above, *item["loc"]))
+        context = item.get("ctx", {})
+        if item["type"] == "extra_forbidden":
+            yield key, "unknown key", nearest_key(item["loc"], model)
+        elif item["type"] == "missing":
+            yield key, "missing", "this key is needed"
+        elif item["type"] == "value_error":
+            yield key or "scenario", str(context["error"]), ""
+        elif item["type"] == "unknown_effect":
+            yield f"{key}.{context['name']}", "unknown effect", context["right"]
+        elif item["type"] == "of_an_effect":
+            yield from _lines(context["error"], context["model"], (key, context["name"]))
+        else:
+            yield key, f"{item['input']!r}", item["msg"][0].lower() + item["msg"][1:]
+
+
+def nearest_key(loc: Sequence[str | int], top: type[BaseModel]) -> str:
+    """What the user may have meant by an unknown key of ``top``."""
+    model: type[BaseModel] | None = top
     for part in loc[:-1]:
         if model is not None and part in model.model_fields:
             model = _model_of(model.model_fields[str(part)].annotation)

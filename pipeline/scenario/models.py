@@ -1,17 +1,14 @@
-"""What does a scenario say, and is it sound?
+"""The definition of a scenario: each key with its unit in its name, its limits and its default, written once.
 
-A scenario is a folder with a ``scenario.toml`` and the files that it names. The frozen models below are its only
-definition: each key with its unit in its name, each default written once. ``data_schemas/scenario.schema.json`` is made
-from them.
-
-Steps of :func:`load`: read the TOML file, lay the ``--set`` overrides over it, validate. Files that it names are
-found relative to the folder; ``$SUMO_HOME/`` in front names a file that SUMO ships.
+A scenario is a folder with a ``scenario.toml`` and the files that it names. ``[traffic]``, ``[sensors]`` and
+``[effects]`` have modules of their own beside this one. ``data_schemas/scenario.schema.json`` is made from these
+models; :mod:`pipeline.scenario.loading` reads the file.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import (
     Field,
@@ -23,6 +20,7 @@ from pipeline.core.errors import InputError
 from pipeline.core.grid import Grid, Roi
 from pipeline.core.models import StrictModel
 from pipeline.core.sumo_home import sumo_home
+from pipeline.scenario.effects import EffectsModel
 from pipeline.scenario.sensors import SensorModel
 from pipeline.scenario.traffic import TrafficModel
 from pipeline.scenario.types import Name, Point2, Point3, Positive
@@ -151,9 +149,7 @@ class Scenario(StrictModel):
     sensors: dict[str, SensorModel] = Field(default_factory=dict)
     scan: ScanModel = ScanModel()
     score: ScoreModel = ScoreModel()
-    effects: dict[str, dict[str, Any]] = Field(
-        default_factory=dict, description="What goes beyond the plain scene; `egvs effects` prints names and parameters"
-    )
+    effects: EffectsModel = EffectsModel()
 
     _folders: tuple[Path, ...] = PrivateAttr(default=(Path(),))
 
@@ -173,7 +169,7 @@ class Scenario(StrictModel):
         """The scenario file, for messages."""
         return self.folder / FILE
 
-    def with_effects(self, effects: dict[str, dict[str, Any]]) -> Scenario:
+    def with_effects(self, effects: EffectsModel) -> Scenario:
         """The same scenario with these effects instead of its own."""
         other = self.model_copy(update={"effects": effects})
         other._folders = self._folders

@@ -1,4 +1,4 @@
-"""Which voxels does each beam of a site cross, and at which range?
+"""Lists which voxels each beam of a scan crosses, and at which range.
 
 Where effects weight beams, counting is not enough: every crossing is listed with its range, a few thousand pieces at a
 time."""
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +23,8 @@ class Crossings:
 
     Attributes
     ----------
-    site
-        What the scan's metadata says of the site.
+    sensor_m
+        Where the sensor is in the grid's frame, (3,) float64.
     grid
         The grid of the voxels.
     rows
@@ -40,7 +39,7 @@ class Crossings:
         Range from the sensor where the piece enters and leaves the voxel, (k,) float64.
     """
 
-    site: dict[str, Any]
+    sensor_m: NDArray[np.float64]
     grid: Grid
     rows: slice
     first: NDArray[np.int64]
@@ -60,10 +59,10 @@ class Crossings:
         return np.repeat(np.arange(len(self.first) - 1), np.diff(self.first))
 
 
-def listed(site: dict[str, Any], ends_m: NDArray[np.float64], grid: Grid) -> Iterator[Crossings]:
-    """All crossings of a site's beams, a few thousand beams at a time."""
-    position_m = np.array([site["x_m"], site["y_m"], site["z_m"]])
-    o = grid.to_grid_m(position_m) / grid.voxel_m
+def listed(position_m: tuple[float, float, float], ends_m: NDArray[np.float64], grid: Grid) -> Iterator[Crossings]:
+    """All crossings of the beams of a sensor at ``position_m`` (world frame), a few thousand beams at a time."""
+    sensor_m = grid.to_grid_m(np.array(position_m))
+    o = sensor_m / grid.voxel_m
     shape = np.asarray(grid.shape, dtype=np.int64)
     for start in range(0, len(ends_m), _ROWS):
         rows = slice(start, min(start + _ROWS, len(ends_m)))
@@ -75,4 +74,4 @@ def listed(site: dict[str, Any], ends_m: NDArray[np.float64], grid: Grid) -> Ite
         total = int(first[-1])
         cells, enter, leave = np.empty(total, dtype=np.int64), np.empty(total), np.empty(total)
         kernels.crossings(o, ends / grid.voxel_m, shape, grid.voxel_m, first, cells, enter, leave)
-        yield Crossings(site, grid, rows, first, ends, cells, enter, leave)
+        yield Crossings(sensor_m, grid, rows, first, ends, cells, enter, leave)

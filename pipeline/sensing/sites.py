@@ -1,4 +1,4 @@
-"""Where could a sensor stand?
+"""Places where a sensor could stand: poses, and candidate sites with names and sensors.
 
 Candidate sites come from a CSV, a GeoJSON file, or a rule (a lattice, or along lines). Each has a position in the world
 frame in metres, a pose in degrees, and a sensor; what a site does not name is taken from the scenario's ``[sites]``.
@@ -10,8 +10,8 @@ import csv
 import json
 import math
 import re
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,34 +22,72 @@ from pipeline.scenario.models import Scenario, SiteGrid, SiteLine
 from pipeline.scenario.types import FARTHEST_M
 
 _NEEDED = ("site", "x_m", "y_m", "z_m")
-_POSE = ("yaw_deg", "pitch_deg", "roll_deg")
+_ANGLES = ("yaw_deg", "pitch_deg", "roll_deg")
 _TEXTS = ("sensor", "points")
 _NAME = re.compile(r"[^/\\\x00-\x1f]{1,80}")  # becomes part of file names
 
 
 @dataclass(frozen=True)
-class Site:
-    """A candidate: position in the world frame (metres), pose (degrees), sensor, and the file of a measured scan if
-    any."""
+class Pose:
+    """Where a sensor is and how it is mounted: position in the world frame in metres, angles in degrees.
 
-    site: str
+    Roll about the sensor's x axis comes first, then pitch (nose up positive), then yaw (counter-clockwise from +x).
+    """
+
     x_m: float
     y_m: float
     z_m: float
-    yaw_deg: float
-    pitch_deg: float
-    roll_deg: float
-    sensor: str
-    points: str | None = None
+    yaw_deg: float = 0.0
+    pitch_deg: float = 0.0
+    roll_deg: float = 0.0
 
     @property
     def position_m(self) -> tuple[float, float, float]:
         """(x, y, z) in the world frame."""
         return self.x_m, self.y_m, self.z_m
 
-    def to_json(self) -> dict[str, Any]:
-        """Name, pose and sensor, as the artefacts' metadata holds them."""
-        return {key: value for key, value in asdict(self).items() if key != "points"}
+    @property
+    def angles_deg(self) -> tuple[float, float, float]:
+        """(yaw, pitch, roll)."""
+        return self.yaw_deg, self.pitch_deg, self.roll_deg
+
+
+@dataclass(frozen=True)
+class Site:
+    """A candidate: its name, pose and sensor, and the file of a measured scan if any."""
+
+    name: str
+    pose: Pose
+    sensor: str
+    points: str | None = None
+
+
+@dataclass(frozen=True)
+class ScannedSite:
+    """What artefacts hold of a site: name, pose, sensor; beams of the sensor, beams that can meet the region,
+    returns."""
+
+    name: str
+    pose: Pose
+    sensor: str
+    beams: int
+    beams_in_roi: int
+    returns: int
+
+    def to_json(self) -> dict[str, str | float | int]:
+        """As the artefacts' metadata holds it."""
+        counts = {"beams": self.beams, "beams_in_roi": self.beams_in_roi, "returns": self.returns}
+        return {"site": self.name, **asdict(self.pose), "sensor": self.sensor, **counts}
+
+    @classmethod
+    def from_json(cls, value: Mapping[str, Any], place: object) -> ScannedSite:
+        """The inverse of :meth:`to_json`; InputError naming ``place`` when it is none."""
+        try:
+            pose = Pose(**{field.name: float(value[field.name]) for field in fields(Pose)})
+            counts = (int(value[key]) for key in ("beams", "beams_in_roi", "returns"))
+            return cls(str(value["site"]), pose, str(value["sensor"]), *counts)
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(place, f"its metadata names a site {value!r} ({error!r})", "an unaltered file") from None
 
 
 def of(scenario: Scenario) -> tuple[Site, ...]:
@@ -70,9 +108,9 @@ def of(scenario: Scenario) -> tuple[Site, ...]:
     found: dict[str, Site] = {}
     for place, row in rows:
         site = _site(place, row, scenario)
-        if site.site in found:
-            raise InputError(place, f"site {site.site!r} stands there twice", "a name of its own for each site")
-        found[site.site] = site
+        if site.name in found:
+            raise InputError(place, f"site {site.name!r} stands there twice", "a name of its own for each site")
+        found[site.name] = site
     if not found:
         raise InputError(path, "holds no site", "at least one")
     keep = scenario.score.keep_visibility
@@ -91,27 +129,27 @@ def _with_points(sites: tuple[Site, ...], scenario: Scenario) -> tuple[Site, ...
     if len(sites) != 1:
         raise InputError(f"{scenario.file}: sites.points", f"one measured scan for {len(sites)} sites",
                          "a column 'points' in the sites file, or a single site")  # fmt: skip
-    return (Site(**{**asdict(sites[0]), "points": points}),)
+    return (replace(sites[0], points=points),)
 
 
 def _site(place: str, row: dict[str, Any], scenario: Scenario) -> Site:
-    unknown = sorted(set(row) - {*_NEEDED, *_POSE, *_TEXTS})
+    unknown = sorted(set(row) - {*_NEEDED, *_ANGLES, *_TEXTS})
     if unknown:
-        raise InputError(place, f"unknown column {unknown[0]!r}", f"{', '.join((*_NEEDED, *_POSE, *_TEXTS))}")
+        raise InputError(place, f"unknown column {unknown[0]!r}", f"{', '.join((*_NEEDED, *_ANGLES, *_TEXTS))}")
     for key in _NEEDED:
         if row.get(key) in (None, ""):
             raise InputError(place, f"{key} is missing", f"the columns {', '.join(_NEEDED)}")
-    values: dict[str, Any] = {"site": str(row["site"]).strip()}
-    if not _NAME.fullmatch(values["site"]):
-        raise InputError(f"{place}: site", f"{values['site'][:80]!r}", "a name of up to 80 characters without / and \\")
-    for key in (*_NEEDED[1:], *_POSE):
+    name = str(row["site"]).strip()
+    if not _NAME.fullmatch(name):
+        raise InputError(f"{place}: site", f"{name[:80]!r}", "a name of up to 80 characters without / and \\")
+    values = {}
+    for key in (*_NEEDED[1:], *_ANGLES):
         value = row.get(key)
         values[key] = _number(place, key, getattr(scenario.sites, key) if value in (None, "") else value)
     if not -90 <= values["pitch_deg"] <= 90:
         raise InputError(f"{place}: pitch_deg", f"{values['pitch_deg']:g}", "between -90 and 90, nose up positive")
-    values["sensor"] = str(row.get("sensor") or scenario.sites.sensor).strip()
-    values["points"] = str(row["points"]).strip() if row.get("points") else None
-    return Site(**values)
+    points = str(row["points"]).strip() if row.get("points") else None
+    return Site(name, Pose(**values), str(row.get("sensor") or scenario.sites.sensor).strip(), points)
 
 
 def _number(place: str, key: str, value: Any) -> float:

@@ -1,33 +1,142 @@
-"""What does every stage promise?
+"""What every stage promises, and the folder that stages work in.
 
 A stage is a module = a verb of the command line = an artefact. It has
 
-- ``NAME`` and ``ARTEFACTS``: the verb, and the files that it may write into the run's folder;
-- ``inputs(scenario, out)``: a JSON value with everything that the stage reads (settings by value, files by sha256). Two
-  runs with equal inputs write equal bytes, so a stage whose inputs did not change is skipped;
-- ``run(scenario, out, ...)``: reads files, writes files, returns a small JSON value that says what came out.
+- ``NAME`` and ``ARTEFACTS``: the verb, and the files that it may write into the run's folder; ``COMPANIONS`` where it
+  leaves more beside them;
+- ``inputs(work)``: everything that the stage reads (settings by value, files by sha256). Two runs with equal inputs
+  write equal bytes, so a stage whose inputs did not change is skipped;
+- ``run(work, inputs, ...)``: reads files, writes files, returns a small JSON value that says what came out.
 
 A stage imports no other stage.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
 
 from pipeline.artefacts import schemas
-from pipeline.core import files
+from pipeline.core import files, parallel
+from pipeline.core.progress import Progress, silent
+from pipeline.effects import registry
 from pipeline.scenario.models import Scenario
+from pipeline.sensing.scene import Scene
+from pipeline.world.mesh import World, read_ply
+
+Json = Mapping[str, Any]
+Summary = dict[str, Any]
+"""What came out of a stage, for ``run.json`` and the terminal."""
 
 
-def metadata(scenario: Scenario, inputs: dict[str, Any], **more: Any) -> dict[str, Any]:
-    """The metadata that every artefact carries.
+@dataclass(frozen=True)
+class StageInputs:
+    """Everything that a stage's artefacts depend on.
 
-    ``scenario.hash`` covers the settings that this artefact depends on, ``inputs`` also the files: a setting that the
-    stage does not read changes no byte. So those in which nothing is random pass ``seed=None``."""
-    return {
-        "schema": schemas.VERSION,
-        "scenario": {"name": scenario.name, "hash": files.hash_of(inputs.get("settings", {}))},
-        "inputs": files.hash_of(inputs),
-        "seed": scenario.seed,
-        **more,
-    }
+    Attributes
+    ----------
+    settings
+        Settings by value.
+    files
+        Files by sha256.
+    more
+        What else counts, e.g. SUMO's version.
+    code
+        Effects that act in the stage: their modules' sources count too.
+    """
+
+    settings: Json
+    files: Mapping[str, str]
+    more: Json = field(default_factory=dict)
+    code: tuple[type, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """As it is hashed."""
+        return {"settings": self.settings, "files": self.files, **self.more}
+
+
+class Stage(Protocol):
+    """A stage's module."""
+
+    NAME: str
+    ARTEFACTS: tuple[str, ...]
+
+    def inputs(self, work: Workspace) -> StageInputs:
+        """Everything that the stage reads."""
+        raise NotImplementedError
+
+    def run(self, work: Workspace, inputs: StageInputs, **options: Any) -> Summary:
+        """Read files, write files."""
+        raise NotImplementedError
+
+
+class Workspace:
+    """A run's folder while stages work there: what is read, resolved or hashed once is kept for the next stage.
+
+    Parameters
+    ----------
+    scenario, folder
+        What is run, and where its artefacts are.
+    jobs
+        Threads; one a core when None. Results do not depend on it.
+    """
+
+    def __init__(
+        self, scenario: Scenario, folder: Path, *, jobs: int | None = None, progress: Progress = silent
+    ) -> None:
+        self.scenario, self.folder, self.progress = scenario, folder, progress
+        self.threads = parallel.threads(jobs)
+        self._digests: dict[str, str] = {}
+        self._world: tuple[str, World] | None = None
+        self._scene: tuple[World, Scene] | None = None
+
+    def path(self, artefact: str) -> Path:
+        """Where an artefact is."""
+        return self.folder / artefact
+
+    def digest(self, artefact: str) -> str:
+        """The sha256 of an artefact, hashed once until :meth:`forget`; InputError when it is not there."""
+        if artefact not in self._digests:
+            self._digests[artefact] = files.sha256_of(self.path(artefact))
+        return self._digests[artefact]
+
+    def digests(self, *artefacts: str) -> dict[str, str]:
+        """The sha256 of some artefacts, by name."""
+        return {name: self.digest(name) for name in artefacts}
+
+    def forget(self, *artefacts: str) -> None:
+        """Some artefacts are about to be written anew."""
+        for name in artefacts:
+            self._digests.pop(name, None)
+
+    @property
+    def world(self) -> World:
+        """The static world as ``statics.ply`` holds it, read once."""
+        digest = self.digest("statics.ply")
+        if self._world is None or self._world[0] != digest:
+            self._world = digest, read_ply(self.path("statics.ply"))[0]
+        return self._world[1]
+
+    @property
+    def scene(self) -> Scene:
+        """The scene before that world, resolved once."""
+        world = self.world
+        if self._scene is None or self._scene[0] is not world:
+            self._scene = world, registry.resolve(self.scenario, world)
+        return self._scene[1]
+
+    def metadata(self, inputs: StageInputs, *, seeded: bool = True, **more: Any) -> dict[str, Any]:
+        """The metadata that every artefact carries.
+
+        ``scenario.hash`` covers the settings that this artefact depends on, ``inputs`` also the files: a setting that
+        the stage does not read changes no byte. So those in which nothing is random are not ``seeded``.
+        """
+        return {
+            "schema": schemas.VERSION,
+            "scenario": {"name": self.scenario.name, "hash": files.hash_of(inputs.settings)},
+            "inputs": files.hash_of(inputs.to_json()),
+            "seed": self.scenario.seed if seeded else None,
+            **more,
+        }

@@ -1,14 +1,15 @@
-"""What does each candidate site see of the static world alone?
+"""The scan stage: what each candidate site sees of the static world alone, as ``scans.parquet``.
 
-Steps: read ``statics.ply``; cast the beams of every site (or read its measured scan); write ``scans.parquet``, one row
-a beam that can meet the region of interest. The scan knows nothing of traffic, voxels or gamma, so none of these needs
-it made again.
+Steps: cast the beams of every site (or read its measured scan), :mod:`pipeline.sensing.scanner`; write one row a beam
+that can meet the region of interest. The scan knows nothing of traffic, voxels or gamma, so none of these needs it made
+again.
 
 With ``scan.keep = false`` nothing is written here, and score casts as it goes.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,35 +18,25 @@ import pyarrow as pa
 
 from pipeline.artefacts import tables
 from pipeline.core.errors import InputError
-from pipeline.core.parallel import in_order, threads
-from pipeline.core.progress import Progress, silent
-from pipeline.scenario.models import Scenario
-from pipeline.sensing import scanner as survey
-from pipeline.sensing.scanner import SiteScan, Survey
-from pipeline.stages.base import metadata
-from pipeline.world.mesh import read_ply
+from pipeline.core.parallel import in_order
+from pipeline.formats import point_clouds
+from pipeline.sensing.scanner import Scan, Scanner
+from pipeline.sensing.scene import Scene
+from pipeline.sensing.sites import ScannedSite, Site
+from pipeline.stages.base import StageInputs, Summary, Workspace
+from pipeline.stages.scan_source import SCANS, scan_inputs
 
 NAME = "scan"
-ARTEFACTS = ("scans.parquet",)
+ARTEFACTS = (SCANS,)
 
 
-def inputs(scenario: Scenario, out: Path) -> dict[str, Any]:
-    """The region of interest without its voxels, sites, sensors; the statics and the sites' files by hash."""
-    return {
-        "settings": {"keep": scenario.scan.keep, **survey.settings(scenario, out)},
-        "files": survey.file_digests(scenario, out),
-    }
+def inputs(work: Workspace) -> StageInputs:
+    """What empty scans depend on, and whether they are kept."""
+    read = scan_inputs(work)
+    return replace(read, settings={"keep": work.scenario.scan.keep, **read.settings})
 
 
-def run(
-    scenario: Scenario,
-    out: Path,
-    *,
-    jobs: int | None = None,
-    progress: Progress = silent,
-    points: tuple[str, ...] = (),
-    cloud: str = "ply",
-) -> dict[str, Any]:
+def run(work: Workspace, inputs: StageInputs, points: tuple[str, ...] = (), cloud: str = "ply") -> Summary:
     """Scan all sites and write ``scans.parquet``.
 
     Parameters
@@ -61,62 +52,72 @@ def run(
         ``sites``, ``beams`` (cast), ``returns``, ``settled_in_float64`` (beams that float32 alone left in doubt),
         ``clouds`` (files with points).
     """
-    world, _ = read_ply(out / "statics.ply")
-    surveyed = Survey(scenario, world)
-    known = [site.site for site in surveyed.sites]
+    scene = work.scene
+    known = [site.name for site in scene.sites]
     for name in points:
         if name not in known:
             raise InputError(f"--points {name}", "no such site", f"one of {', '.join(known)}")
-    clouds: list[str] = []
-    if not scenario.scan.keep:
-        (out / ARTEFACTS[0]).unlink(missing_ok=True)
-        clouds += (_write_cloud(out, surveyed.scan(site), cloud) for site in surveyed.sites if site.site in points)
-        return {"sites": len(known), "kept": False, "clouds": clouds, **_skipped(surveyed)}
-    about: list[dict[str, Any]] = []
-    doubtful = 0
-    with tables.writer(out / ARTEFACTS[0], "scans", surveyed.columns) as file:
-        for done in in_order(surveyed.scan, surveyed.sites, threads(jobs)):
-            file.write(_columns(done))
-            about.append(done.about)
-            doubtful += done.scan.doubtful
-            if done.site.site in points:
-                clouds.append(_write_cloud(out, done, cloud))
-            progress("sites", len(about), len(known))
-        file.describe(metadata(scenario, inputs(scenario, out), seed=None, sites=about))
+    scanner = Scanner(scene)
+    scanner.check(scene.sites)
+    if not work.scenario.scan.keep:
+        work.path(SCANS).unlink(missing_ok=True)
+        written = [
+            _write_cloud(work.folder, s.name, scanner.scan_site(s), cloud) for s in scene.sites if s.name in points
+        ]
+        return {"sites": len(known), "kept": False, "clouds": written, **_skipped(scene)}
+    return _write_all(work, inputs, scanner, points, cloud)
+
+
+def _write_all(work: Workspace, inputs: StageInputs, scanner: Scanner, points: tuple[str, ...], cloud: str) -> Summary:
+    scene, clouds, doubtful = work.scene, [], 0
+    about: list[ScannedSite] = []
+
+    def scan(site: Site) -> tuple[Site, Scan, ScannedSite]:
+        done = scanner.scan_site(site)
+        return site, done, done.as_site(site.name)
+
+    with tables.writer(work.path(SCANS), "scans", scanner.columns) as file:
+        for site, done, scanned in in_order(scan, scene.sites, work.threads):
+            file.write(_columns(site.name, done))
+            about.append(scanned)
+            doubtful += done.rows.doubtful
+            if site.name in points:
+                clouds.append(_write_cloud(work.folder, site.name, done, cloud))
+            work.progress("sites", len(about), len(scene.sites))
+        file.describe(work.metadata(inputs, seeded=False, sites=[site.to_json() for site in about]))
     return {
-        "sites": len(known),
+        "sites": len(about),
         "kept": True,
-        "beams": sum(a["beams_in_roi"] for a in about),
-        "returns": sum(a["returns"] for a in about),
+        "beams": sum(site.beams_in_roi for site in about),
+        "returns": sum(site.returns for site in about),
         "settled_in_float64": doubtful,
         "clouds": clouds,
-        **_skipped(surveyed),
+        **_skipped(scene),
     }
 
 
-def _skipped(surveyed: Survey) -> dict[str, Any]:
+def _skipped(scene: Scene) -> Summary:
     """What to say of effects that are named but provably change nothing; nothing when there is none."""
-    return {"skipped": [f"{name}: {why}" for name, why in surveyed.skipped.items()]} if surveyed.skipped else {}
+    skipped = scene.skipped("scan")
+    return {"skipped": skipped} if skipped else {}
 
 
-def _columns(done: SiteScan) -> dict[str, Any]:
-    ends = done.scan.ends_m
-    name = pa.DictionaryArray.from_arrays(np.zeros(len(ends), dtype=np.int32), [done.site.site])
-    columns = {
+def _columns(site: str, scan: Scan) -> dict[str, Any]:
+    ends = scan.rows.ends_m
+    name = pa.DictionaryArray.from_arrays(np.zeros(len(ends), dtype=np.int32), [site])
+    return {
         "site": name.cast(pa.string()),
-        "beam": done.scan.beam,
+        "beam": scan.rows.beam,
         "dx_m": ends[:, 0],
         "dy_m": ends[:, 1],
         "dz_m": ends[:, 2],
-        "returned": done.scan.returned,
+        "returned": scan.rows.returned,
+        "weight": scan.rows.weight,
     }
-    return columns | {"weight": done.scan.weight}
 
 
-def _write_cloud(out: Path, done: SiteScan, suffix: str) -> str:
+def _write_cloud(folder: Path, site: str, scan: Scan, suffix: str) -> str:
     """Write a site's points; the file's name."""
-    from pipeline.formats import point_clouds as clouds
-
-    name, ends = f"scan_{done.site.site}.{suffix}", done.scan.ends_m[done.scan.returned]
-    clouds.write_points(out / name, ends + np.asarray(done.site.position_m))
+    name, ends = f"scan_{site}.{suffix}", scan.rows.ends_m[scan.rows.returned]
+    point_clouds.write_points(folder / name, ends + np.asarray(scan.pose.position_m))
     return name

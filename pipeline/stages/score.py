@@ -1,17 +1,13 @@
-r"""Which site sees most of what is uncertain?
+"""The score stage: which site sees most of what is uncertain, as ``scores.parquet``.
 
-.. math:: EGVS(site) = \sum_v H(p(v)) \, \min(\gamma, hits(v))
-
-(arXiv 2504.06772, Eq. 4): ``hits`` are the beams of the site's empty scan that cross voxel v, p comes from the TPOG.
-
-Steps: read ``tpog.parquet``; read ``scans.parquet`` site by site (with ``scan.keep = false``: cast instead); march
-every beam through the grid and count; sum; rank; say how far each score may be off because the traffic was short.
-Another gamma, voxel size or TPOG needs this stage alone."""
+Steps: read ``tpog.parquet``; take the scans site by site (:mod:`pipeline.stages.scan_source`); score each
+(:mod:`pipeline.scoring.scorer`); rank; say how far each score may be off because the traffic was short. Another gamma,
+voxel size or TPOG needs this stage alone.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,56 +15,61 @@ from numpy.typing import NDArray
 
 from pipeline.artefacts import tables
 from pipeline.artefacts.readers import read_tpog
-from pipeline.core import files
 from pipeline.core.grid import Grid
-from pipeline.core.parallel import in_order, threads
-from pipeline.core.progress import Progress, silent
+from pipeline.core.parallel import in_order
+from pipeline.effects import registry
+from pipeline.effects.base import Effect
 from pipeline.kernels import march
-from pipeline.scenario.models import Scenario
-from pipeline.scoring import uncertainty, visibility
-from pipeline.scoring.egvs import EntropyField, Score
-from pipeline.scoring.visibility import Beams, Hits, Visibility
-from pipeline.sensing import scanner as survey
-from pipeline.stages.base import metadata
+from pipeline.scoring import uncertainty
+from pipeline.scoring.scorer import Scorer, SiteScore
+from pipeline.scoring.visibility import Beams, in_voxels
+from pipeline.sensing.sites import ScannedSite
+from pipeline.stages.base import StageInputs, Summary, Workspace
+from pipeline.stages.scan_source import SCANS, SiteBeams, scan_inputs, scans
 
 NAME = "score"
 ARTEFACTS = ("scores.parquet", "visibility.parquet")
-
-_POSE = ("site", "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg", "sensor")
-_COUNTS = ("beams", "beams_in_roi", "returns")
+TRAJECTORIES = "trajectories.parquet"
 
 
 @dataclass(frozen=True)
-class _Scored:
-    about: dict[str, Any]
-    score: Score
-    audit: tuple[float, float, int, int] | None
-    visible: dict[str, Any] | None
-    left_out: NDArray[np.float64] | None
+class ScoredSite:
+    """A site, its score, and what else was asked for: an audit of its beams, its hits in the voxels that it sees."""
+
+    site: ScannedSite
+    score: SiteScore
+    audit: BeamAudit | None
+    visible: dict[str, NDArray[Any]] | None
 
 
-def inputs(scenario: Scenario, out: Path) -> dict[str, Any]:
+@dataclass(frozen=True)
+class BeamAudit:
+    """The worst of some beams, see :func:`pipeline.kernels.march.audit`."""
+
+    worst_sum: float
+    longest_gap_m: float
+    misplaced_chords: int
+    voxels_visited_twice: int
+
+
+def inputs(work: Workspace) -> StageInputs:
     """Gamma and what to keep; TPOG and scans by hash (without kept scans: what a scan depends on)."""
-    named, also_read = _effects(scenario, out)
-    own = {"name": scenario.name, "score": scenario.score.model_dump(mode="json"), **named}
-    hashes = {name: files.sha256_of(out / name) for name in ("tpog.parquet", *also_read)}
+    scenario, live = work.scenario, work.scene.acting(Effect, "score")
+    settings: dict[str, Any] = {"name": scenario.name, "score": scenario.score.model_dump(mode="json")}
+    if live:
+        settings["effects"] = registry.settings(live)
+        settings["sensors"] = {name: model.model_dump(mode="json") for name, model in scenario.sensors.items()}
+    hashes = work.digests("tpog.parquet", *(name for effect in live for name in effect.reads))
+    code = tuple(type(effect) for effect in live)
     if scenario.scan.keep:
-        return {"settings": own, "files": hashes | {"scans.parquet": files.sha256_of(out / "scans.parquet")}}
-    return {
-        "settings": own | {"scan": survey.settings(scenario, out)},
-        "files": hashes | survey.file_digests(scenario, out),
-    }
+        return StageInputs(settings, hashes | work.digests(SCANS), code=code)
+    cast = scan_inputs(work)
+    return StageInputs({**settings, "scan": cast.settings}, {**hashes, **cast.files}, code=code + cast.code)
 
 
 def run(
-    scenario: Scenario,
-    out: Path,
-    *,
-    jobs: int | None = None,
-    progress: Progress = silent,
-    audit: bool = False,
-    left_out: list[list[float]] | None = None,
-) -> dict[str, Any]:
+    work: Workspace, inputs: StageInputs, audit: bool = False, left_out: list[list[float]] | None = None
+) -> Summary:
     """Score and rank all sites; write ``scores.parquet``, and ``visibility.parquet`` where sites are to be kept.
 
     Parameters
@@ -84,36 +85,35 @@ def run(
     dict
         ``sites``, ``best`` (names), ``egvs_limit``; with ``audit`` the worst case found.
     """
-    tpog = read_tpog(out / "tpog.parquet")
-    field = EntropyField.of(tpog.counts, tpog.frames, tpog.grid)
-    gamma = scenario.score.gamma
-    visible_from = Visibility(scenario, out, tpog.grid)
-    leave_out = uncertainty.LeaveOut.of(out / "tpog.parquet", tpog) if scenario.score.standard_error else None
-    scorer = _Scorer(visible_from, field, scenario, audit, leave_out)
-    done: list[_Scored] = []
-    visible: list[dict[str, Any]] = []
-    for scored in in_order(scorer.score, visible_from.beams(), threads(jobs)):
+    tpog, wanted = read_tpog(work.path("tpog.parquet")), work.scenario.score
+    leave_out = uncertainty.LeaveOut.of(work.path("tpog.parquet"), tpog) if wanted.standard_error else None
+    scorer = Scorer(work.scene, tpog, work.path(TRAJECTORIES), leave_out)
+
+    def score(scan: SiteBeams) -> ScoredSite:
+        checked = audit_beams(scan.beams, tpog.grid) if audit else None
+        if wanted.keep_visibility == "all" or scan.site.name in wanted.keep_visibility:
+            worth, hits = scorer.score_and_hits(scan.beams)
+            return ScoredSite(scan.site, worth, checked, _sparse(hits))
+        return ScoredSite(scan.site, scorer.score(scan.beams), checked, None)
+
+    done: list[ScoredSite] = []
+    for scored in in_order(score, scans(work), work.threads):
         done.append(scored)
-        if scored.visible is not None:
-            visible.append(scored.visible)
-        progress("sites", len(done), 0)
+        work.progress("sites", len(done), 0)
     if left_out is not None:
-        left_out += (d.left_out.tolist() for d in done if d.left_out is not None)
-    limit = field.limit(gamma)
-    read = inputs(scenario, out)
-    about = metadata(
-        scenario, read, gamma=gamma, grid=tpog.grid.to_json(), frames=tpog.frames, sites=[d.about for d in done]
-    )
-    _write_visibility(out / ARTEFACTS[1], visible, about)
+        left_out += (d.score.left_out.tolist() for d in done if d.score.left_out is not None)
+    sites = [d.site.to_json() for d in done]
+    about = work.metadata(inputs, gamma=wanted.gamma, grid=tpog.grid.to_json(), frames=tpog.frames, sites=sites)
+    _write_visibility(work, done, about)
     estimate = _estimate(done, leave_out)
-    columns = _columns(done, limit) | _error_columns(estimate)
-    with tables.writer(out / ARTEFACTS[0], "scores", tuple(_error_columns(estimate))) as file:
+    columns = _columns(done, scorer.limit) | _error_columns(estimate)
+    with tables.writer(work.path(ARTEFACTS[0]), "scores", tuple(_error_columns(estimate))) as file:
         file.write(columns)
         file.describe(about)
-    best = [d.about["site"] for d, rank in zip(done, columns["rank"], strict=True) if rank == 1]
-    summary: dict[str, Any] = {"sites": len(done), "best": best, "egvs_limit": limit}
-    if visible_from.skipped:
-        summary["skipped"] = [f"{name}: {reason}" for name, reason in visible_from.skipped.items()]
+    best = [d.site.name for d, rank in zip(done, columns["rank"], strict=True) if rank == 1]
+    summary: Summary = {"sites": len(done), "best": best, "egvs_limit": scorer.limit}
+    if skipped := work.scene.skipped(NAME):
+        summary["skipped"] = skipped
     if estimate is not None:
         summary |= uncertainty.in_words(estimate, tpog.frames)
     if audit:
@@ -121,41 +121,22 @@ def run(
     return summary
 
 
-class _Scorer:
-    """Scores one site after another, on any thread."""
-
-    def __init__(
-        self, visible: Visibility, field: EntropyField, scenario: Scenario, audit: bool, leave_out: uncertainty.LeaveOut | None
-    ) -> None:
-        self._visibility, self._field, self._audit, self._leave_out = visible, field, audit, leave_out
-        self._gamma, self._keep = scenario.score.gamma, scenario.score.keep_visibility
-
-    def score(self, beams: Beams) -> _Scored:
-        name, unit = beams.site["site"], self._visibility.unit
-        hits = self._visibility.hits(beams)
-        visible = self._visible(name, hits, unit) if self._keep == "all" or name in self._keep else None
-        found = audit(beams, self._field.grid) if self._audit else None
-        left_out = self._leave_out.scores(hits, self._gamma, unit) if self._leave_out is not None else None
-        return _Scored(beams.site, self._field.score(hits, self._gamma, unit), found, visible, left_out)
-
-    def _visible(self, site: str, hits: Hits, unit: int) -> dict[str, Any]:
-        flat = np.flatnonzero(hits)
-        ix, iy, iz = (axis.astype(np.int32) for axis in np.unravel_index(flat, self._field.grid.shape))
-        return {"site": [site] * len(flat), "ix": ix, "iy": iy, "iz": iz, "hits": hits[flat] / unit}
+def _sparse(hits: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
+    """The voxels that are crossed, in order."""
+    ix, iy, iz = np.nonzero(hits)
+    index = {"ix": ix.astype(np.int32), "iy": iy.astype(np.int32), "iz": iz.astype(np.int32)}
+    return {**index, "hits": hits[ix, iy, iz]}
 
 
-def audit(beams: Beams, grid: Grid) -> tuple[float, float, int, int]:
+def audit_beams(beams: Beams, grid: Grid) -> BeamAudit:
     """Check each beam of a site, see :func:`pipeline.kernels.march.audit`."""
-    o, d, shape = visibility.in_voxels(beams, grid)
-    found: tuple[float, float, int, int] = march.audit(
-        o, d, shape, grid.voxel_m, np.zeros(int(np.prod(grid.shape)), dtype=np.uint32)
-    )
-    return found
+    o, d, shape = in_voxels(beams, grid)
+    return BeamAudit(*march.audit(o, d, shape, grid.voxel_m, np.zeros(int(np.prod(grid.shape)), dtype=np.uint32)))
 
 
-def _columns(done: list[_Scored], limit: float) -> dict[str, Any]:
-    scores = np.array([d.score.egvs for d in done])
-    columns: dict[str, Any] = {name: [d.about[name] for d in done] for name in (*_POSE, *_COUNTS)}
+def _columns(done: list[ScoredSite], limit: float) -> dict[str, Any]:
+    scores, sites = np.array([d.score.egvs for d in done]), [d.site.to_json() for d in done]
+    columns: dict[str, Any] = {name: [site[name] for site in sites] for name in sites[0]} if sites else {}
     return columns | {
         "egvs": scores,
         "egvs_limit": np.full(len(done), limit),
@@ -164,11 +145,11 @@ def _columns(done: list[_Scored], limit: float) -> dict[str, Any]:
     }
 
 
-def _estimate(done: list[_Scored], leave_out: uncertainty.LeaveOut | None) -> uncertainty.Estimate | None:
+def _estimate(done: list[ScoredSite], leave_out: uncertainty.LeaveOut | None) -> uncertainty.Estimate | None:
     """What leaving blocks out says of all sites; None when it is not asked for, or there is one block only."""
     if leave_out is None:
         return None
-    return uncertainty.Estimate.of(np.array([d.left_out for d in done]).reshape(len(done), -1), leave_out.frames)
+    return uncertainty.Estimate.of(np.array([d.score.left_out for d in done]).reshape(len(done), -1), leave_out.frames)
 
 
 def _error_columns(estimate: uncertainty.Estimate | None) -> dict[str, Any]:
@@ -178,41 +159,28 @@ def _error_columns(estimate: uncertainty.Estimate | None) -> dict[str, Any]:
     return {"egvs_se": estimate.se, "egvs_bias": estimate.bias, "beats_next": uncertainty.beats_next(estimate)}
 
 
-def _effects(scenario: Scenario, out: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Settings of the effects that act in this stage, with the sensors that they ask; the artefacts that only they
-    read."""
-    live, _ = visibility.acting(scenario, out)
-    if not live:
-        return {}, ()
-    from pipeline.effects import registry as effects
-
-    sensors = {name: model.model_dump(mode="json") for name, model in scenario.sensors.items()}
-    return {"effects": effects.settings(live), "sensors": sensors}, tuple(
-        name for effect in live for name in effect.reads
-    )
-
-
 def ranks(scores: NDArray[np.float64]) -> NDArray[np.uint32]:
     """1 for the highest score; equal scores share a rank, and the next one is left out for each that shares."""
     return np.array([1 + np.sum(scores > score) for score in scores], dtype=np.uint32)
 
 
-def _worst(audits: list[tuple[float, float, int, int]]) -> dict[str, float]:
-    """The worst case over all sites, see :func:`pipeline.kernels.march.audit`."""
-    sums, gaps, misplaced, doubled = zip(*audits, strict=True)
+def _worst(audits: list[BeamAudit]) -> dict[str, float]:
+    """The worst case over all sites."""
     return {
-        "worst_sum": max(sums),
-        "longest_gap_m": max(gaps),
-        "misplaced_chords": sum(misplaced),
-        "voxels_visited_twice": sum(doubled),
+        "worst_sum": max(audit.worst_sum for audit in audits),
+        "longest_gap_m": max(audit.longest_gap_m for audit in audits),
+        "misplaced_chords": sum(audit.misplaced_chords for audit in audits),
+        "voxels_visited_twice": sum(audit.voxels_visited_twice for audit in audits),
     }
 
 
-def _write_visibility(path: Path, visible: list[dict[str, Any]], about: dict[str, Any]) -> None:
-    if not visible:
+def _write_visibility(work: Workspace, done: list[ScoredSite], about: dict[str, Any]) -> None:
+    path = work.path(ARTEFACTS[1])
+    kept = [(scored.site.name, scored.visible) for scored in done if scored.visible is not None]
+    if not kept:
         path.unlink(missing_ok=True)
         return
     with tables.writer(path, "visibility") as file:
-        for columns in visible:
-            file.write(columns)
+        for site, columns in kept:
+            file.write({"site": [site] * len(columns["hits"]), **columns})
         file.describe(about)

@@ -20,17 +20,19 @@ there. Where a maker does not say which it means, 1/e^2 is taken."""
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 from scipy.special import cosdg, sindg
 
-from pipeline.effects.registry import Expand, Parameters, Scene
+from pipeline.effects.base import Expand
+from pipeline.scenario.effects import DivergenceParameters, EffectParameters
 from pipeline.sensing import sensors
+from pipeline.sensing.scene import Scene
 from pipeline.sensing.sensors import Sensor
-from pipeline.sensing.sites import Site
+from pipeline.sensing.sites import Pose
 
 # Rings of each rule: (s, weight of the ring, sub-beams on it, azimuth of the first in degrees).
 _ROOT = math.sqrt(3.0)
@@ -46,22 +48,12 @@ _RINGS: dict[int, tuple[tuple[float, float, int, float], ...]] = {
 _Angle = Annotated[float, Field(ge=0, le=100)]
 
 
-class Model(Parameters):
-    """Parameters of ``[effects.divergence]``."""
-
-    sub_beams: Annotated[Literal[1, 7, 19], Field(description="Sub-beams a beam; 1 is the plain beam")] = 7
-    divergence_mrad: Annotated[
-        tuple[_Angle, _Angle] | None,
-        Field(description="Full angles across and along the elevation, 1/e^2, in place of the sensors' own"),
-    ] = None
-
-
-class Divergence(Expand):
+class Divergence(Expand[DivergenceParameters]):
     """A beam as a cone of weighted sub-beams."""
 
     NAME: ClassVar[str] = "divergence"
     SOURCE: ClassVar[str] = "Gaussian beam (Siegman 1986); cubature E2r2 5-1 of Stroud (1971)"
-    Model: ClassVar[type[Parameters]] = Model
+    Model: ClassVar[type[EffectParameters]] = DivergenceParameters
     QUALITY: ClassVar[dict[str, tuple[Any, ...]]] = {"sub_beams": (7, 19)}
 
     @property
@@ -69,14 +61,14 @@ class Divergence(Expand):
         """As asked for."""
         return int(self.parameters.sub_beams)
 
-    def idle(self, scene: Scene) -> str | None:
+    def why_idle(self, scene: Scene) -> str | None:
         """A single sub-beam, or a cone without width, is the plain beam."""
         if self.parameters.sub_beams == 1:
             return "sub_beams is 1"
-        cast = [site for site in scene.sites if site.points is None]
+        cast = scene.cast_sites
         if not cast:
             return "all scans are measured"
-        known = {s.sensor: sensors.resolve(s.sensor, scene.scenario.sensors, f"site {s.site}") for s in cast}
+        known = {site.sensor: scene.sensor(site.sensor, f"site {site.name}") for site in cast}
         return None if any(any(self.angles_mrad(sensor)) for sensor in known.values()) else "divergence_mrad is 0"
 
     def angles_mrad(self, sensor: Sensor) -> tuple[float, float]:
@@ -85,14 +77,14 @@ class Divergence(Expand):
         return across, along
 
     def expand(
-        self, directions: NDArray[np.float64], sensor: Sensor, site: Site
+        self, directions: NDArray[np.float64], sensor: Sensor, pose: Pose
     ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
         """Sub-beams in the sensor's own azimuth and elevation, the middle one of each beam first and unchanged."""
         offsets, weights = nodes(self.parameters.sub_beams)
         across, along = (1e-3 * angle for angle in self.angles_mrad(sensor))
         if across == along == 0.0:
             offsets, weights = nodes(1)
-        sideways, upwards = _frame(directions, sensors.rotation(site.yaw_deg, site.pitch_deg, site.roll_deg))
+        sideways, upwards = _frame(directions, sensors.rotation(*pose.angles_deg))
         rays = np.empty((len(directions), len(weights), 3))
         rays[:, 0] = directions
         for i, (a, e) in enumerate(offsets[1:], start=1):
@@ -123,6 +115,3 @@ def _frame(
     sideways = np.where(upright[:, None], rotation[:, 1], sideways / np.where(upright, 1.0, size)[:, None])
     upwards: NDArray[np.float64] = np.cross(directions, sideways)
     return sideways, upwards
-
-
-EFFECT = Divergence

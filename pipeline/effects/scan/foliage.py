@@ -28,16 +28,17 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from pipeline.core.grid import Roi
-from pipeline.effects.registry import Parameters, Scene, TransmitScan
+from pipeline.effects.base import TransmitScan
 from pipeline.kernels import foliage as kernels
-from pipeline.sensing.sites import Site
+from pipeline.scenario.effects import EffectParameters, FoliageParameters
+from pipeline.sensing.scene import Scene
+from pipeline.sensing.sites import Pose
 from pipeline.world import casting as raycast
 from pipeline.world.casting import EmptyScan
 from pipeline.world.mesh import World
@@ -49,28 +50,14 @@ SEASONS = {"summer": 1.0, "autumn": 0.7, "winter": 0.35}
 """Share of the summer's optical depth."""
 
 
-class Model(Parameters):
-    """Parameters of ``[effects.foliage]``."""
-
-    leaf_area_density: Annotated[
-        float, Field(ge=0, le=1e15, description="Leaf area a volume of crown in summer, m2/m3; 0.5 is thin, 2 is dense")
-    ] = 1.0
-    season: Annotated[
-        Literal["summer", "autumn", "winter"] | Annotated[float, Field(ge=0, le=1)],
-        Field(description="Or the share of the summer's optical depth, 0 to 1"),
-    ] = "summer"
-    projection: Annotated[float, Field(gt=0, le=1, description="G, mean projection of a unit of leaf area")] = 0.5
-    step_m: Annotated[float, Field(ge=0.01, le=100, description="Longest step in which a crown is cut")] = 2.0
-
-
-class Foliage(TransmitScan):
+class Foliage(TransmitScan[FoliageParameters]):
     """Porous tree crowns."""
 
     NAME: ClassVar[str] = "foliage"
     SOURCE: ClassVar[str] = (
         "Beer-Lambert with G = 1/2 (Ross 1981); winter's share chosen near Heisler 1986, Urban Ecology 9"
     )
-    Model: ClassVar[type[Parameters]] = Model
+    Model: ClassVar[type[EffectParameters]] = FoliageParameters
     QUALITY: ClassVar[dict[str, tuple[Any, ...]]] = {"step_m": (2.0, 0.5, 0.1)}
 
     def extinction_per_m(self) -> float:
@@ -79,12 +66,12 @@ class Foliage(TransmitScan):
         share = SEASONS[season] if isinstance(season, str) else season
         return float(self.parameters.projection * share * self.parameters.leaf_area_density)
 
-    def idle(self, scene: Scene) -> str | None:
+    def why_idle(self, scene: Scene) -> str | None:
         """Without a crown that a beam can meet before it has left the region of interest.
 
         A crown without leaves returns nothing, so it must not be met behind the region either.
         """
-        world, cast = scene.world, [site.position_m for site in scene.sites if site.points is None]
+        world, cast = scene.world, [site.pose.position_m for site in scene.cast_sites]
         faces = _of_crowns(world)
         if not faces.any():
             return "there is no closed tree crown"
@@ -100,7 +87,7 @@ class Foliage(TransmitScan):
         stays = ~_of_crowns(world)
         return replace(world, faces=world.faces[stays], solid_of_face=world.solid_of_face[stays])
 
-    def cutter(self, world: World, roi: Roi) -> Callable[[EmptyScan, Site], EmptyScan]:
+    def cutter(self, world: World, roi: Roi) -> Callable[[EmptyScan, Pose], EmptyScan]:
         """Cuts beams into parts that end within leaves, and one that goes on; ``returned`` holds for all that end in
         leaves."""
         if self.extinction_per_m() == 0:
@@ -108,10 +95,10 @@ class Foliage(TransmitScan):
         crowns = _crowns(world, roi)
         size, origin = np.asarray(roi.size_m), np.asarray(roi.origin_m)
 
-        def cut(scan: EmptyScan, site: Site) -> EmptyScan:
+        def cut(scan: EmptyScan, pose: Pose) -> EmptyScan:
             far = np.sqrt((scan.ends_m**2).sum(axis=1))
             d, weight = scan.ends_m / far[:, None], _weights(scan)
-            o = np.asarray(site.position_m) - origin
+            o = np.asarray(pose.position_m) - origin
             rows, shares, at_m = kernels.cut(
                 o, d, far, weight, size, *crowns, self.extinction_per_m(), self.parameters.step_m
             )
@@ -165,6 +152,3 @@ def _crowns(
     radius = 0.5 * np.sqrt(((high - low) ** 2).sum(axis=1)) + 1e-3  # wider than the rules of kernels.rays
     balls = np.column_stack([0.5 * (low + high), radius**2])
     return np.append(starts, len(triangles)).astype(np.int64), balls, triangles, planes
-
-
-EFFECT = Foliage

@@ -16,16 +16,17 @@ to guess."""
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 from scipy.special import cosdg, sindg
 
-from pipeline.effects.registry import Expand, Parameters, Scene
+from pipeline.effects.base import Expand
+from pipeline.scenario.effects import EffectParameters, MountSwayParameters
+from pipeline.sensing.scene import Scene
 from pipeline.sensing.sensors import Sensor
-from pipeline.sensing.sites import Site
+from pipeline.sensing.sites import Pose
 
 _ROOT = math.sqrt(6.0)
 _HERMITE: dict[int, tuple[tuple[float, float], ...]] = {
@@ -40,21 +41,12 @@ _HERMITE: dict[int, tuple[tuple[float, float], ...]] = {
 """Nodes and weights for a Gaussian of standard deviation 1, by their number on one axis."""
 
 
-class Model(Parameters):
-    """Parameters of ``[effects.mount_sway]``."""
-
-    tilt_deg: Annotated[
-        float, Field(ge=0, le=10, description="Standard deviation of the tilt about each horizontal axis")
-    ]
-    samples: Annotated[Literal[1, 4, 9, 16], Field(description="Poses that are averaged; 1 is the pole at rest")] = 4
-
-
-class MountSway(Expand):
+class MountSway(Expand[MountSwayParameters]):
     """A pose averaged over a tilt distribution."""
 
     NAME: ClassVar[str] = "mount_sway"
     SOURCE: ClassVar[str] = "Gaussian tilt (assumed); Gauss-Hermite rule (Abramowitz and Stegun 1964, 25.4.46)"
-    Model: ClassVar[type[Parameters]] = Model
+    Model: ClassVar[type[EffectParameters]] = MountSwayParameters
     QUALITY: ClassVar[dict[str, tuple[Any, ...]]] = {"samples": (4, 9, 16)}
 
     @property
@@ -62,19 +54,19 @@ class MountSway(Expand):
         """One a pose."""
         return int(self.parameters.samples)
 
-    def idle(self, scene: Scene) -> str | None:
+    def why_idle(self, scene: Scene) -> str | None:
         """A pole at rest is the plain one."""
         if self.parameters.tilt_deg == 0:
             return "tilt_deg is 0"
         if self.parameters.samples == 1:
             return "samples is 1"
-        return "all scans are measured" if all(site.points is not None for site in scene.sites) else None
+        return "all scans are measured" if not scene.cast_sites else None
 
     def expand(
-        self, directions: NDArray[np.float64], sensor: Sensor, site: Site
+        self, directions: NDArray[np.float64], sensor: Sensor, pose: Pose
     ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
         """Each beam once for each pose."""
-        del sensor, site
+        del sensor, pose
         tilts, weights = nodes(self.parameters.samples if self.parameters.tilt_deg > 0 else 1)
         rays = np.empty((len(directions), len(weights), 3))
         for i, (about_x, about_y) in enumerate(tilts * self.parameters.tilt_deg):
@@ -102,6 +94,3 @@ def tilted(directions: NDArray[np.float64], about_x_deg: float, about_y_deg: flo
         directions * cosdg(angle) + np.cross(axis, directions) * sindg(angle) + axis * along * (1.0 - cosdg(angle))
     )
     return turned
-
-
-EFFECT = MountSway

@@ -10,30 +10,25 @@ or weather is better named as such."""
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
-from pipeline.effects.registry import Detect, Parameters, Scene
+from pipeline.effects.base import Detect
+from pipeline.scenario.effects import DropoutParameters, EffectParameters
+from pipeline.sensing.scene import Scene
 from pipeline.sensing.sensors import Sensor
 
 
-class Model(Parameters):
-    """Parameters of ``[effects.dropout]``."""
-
-    share: Annotated[float, Field(ge=0, le=1, description="Share of the returns that are lost")]
-
-
-class Dropout(Detect):
+class Dropout(Detect[DropoutParameters]):
     """A constant share of returns lost."""
 
     NAME: ClassVar[str] = "dropout"
     SOURCE: ClassVar[str] = "Dosovitskiy et al. 2017 (CARLA), dropoff_general_rate, as an expectation"
-    Model: ClassVar[type[Parameters]] = Model
+    Model: ClassVar[type[EffectParameters]] = DropoutParameters
 
-    def idle(self, scene: Scene) -> str | None:
+    def why_idle(self, scene: Scene) -> str | None:
         """Nothing is lost when the share is nothing."""
         del scene
         return "share is 0" if self.parameters.share == 0 else None
@@ -42,6 +37,3 @@ class Dropout(Detect):
         """1 - share."""
         del sensor
         return np.full(len(range_m), 1.0 - self.parameters.share)
-
-
-EFFECT = Dropout

@@ -27,38 +27,25 @@ return loses more. Homogeneous fog; single scattering; wavelengths from 400 to 1
 from __future__ import annotations
 
 import math
-from typing import Annotated, ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
-from pipeline.effects.registry import Detect, Parameters
+from pipeline.effects.base import Detect
+from pipeline.scenario.effects import EffectParameters, FogParameters
 from pipeline.sensing.sensors import Sensor
 
 _GREEN_NM = 550.0
 _MODELS_CONTRAST = 0.02
 
 
-class Model(Parameters):
-    """Parameters of ``[effects.fog]``."""
-
-    visibility_m: Annotated[float, Field(gt=0, description="How far one sees; fog is below 1000, dense fog below 200")]
-    model: Annotated[
-        Literal["kim", "kruse"], Field(description="How the exponent of the wavelength follows from the visibility")
-    ] = "kim"
-    contrast: Annotated[
-        float,
-        Field(gt=0, lt=1, description="At which visibility_m was measured; 0.05 for the meteorological optical range"),
-    ] = _MODELS_CONTRAST
-
-
-class Fog(Detect):
+class Fog(Detect[FogParameters]):
     """Two-way extinction by fog."""
 
     NAME: ClassVar[str] = "fog"
     SOURCE: ClassVar[str] = "Kim, McArthur and Korevaar 2001, Proc. SPIE 4214; Kruse et al. 1962"
-    Model: ClassVar[type[Parameters]] = Model
+    Model: ClassVar[type[EffectParameters]] = FogParameters
 
     def extinction_per_m(self, wavelength_nm: float) -> float:
         """Extinction coefficient in nepers a metre."""
@@ -87,6 +74,3 @@ def _kim(visibility_km: float) -> float:
     if visibility_km > 1:
         return 0.16 * visibility_km + 0.34
     return max(visibility_km - 0.5, 0.0)
-
-
-EFFECT = Fog

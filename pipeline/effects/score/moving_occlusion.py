@@ -37,51 +37,29 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field, ValidationInfo, field_validator
-from pydantic_core import PydanticCustomError
+from pydantic import BeforeValidator, Field
 
 from pipeline.artefacts import tables
-from pipeline.artefacts.readers import read_tpog
+from pipeline.artefacts.boxes import FrameBoxes, read_boxes
+from pipeline.artefacts.readers import Tpog
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Grid
-from pipeline.effects.registry import Parameters, TransmitScore
+from pipeline.effects.base import TransmitScore
 from pipeline.kernels import boxes as box_kernels
 from pipeline.kernels import occlusion as kernels
-from pipeline.scenario.models import Scenario
-from pipeline.sensing import sites
+from pipeline.scenario.effects import EffectParameters, MovingOcclusionParameters
 from pipeline.sensing.crossings import Crossings
+from pipeline.sensing.scene import Scene
 
 _BOX = ("x_m", "y_m", "z_m", "yaw_rad", "pitch_rad", "length_m", "width_m", "height_m")
 _SMALLEST_M = 10 * box_kernels.SHRINK_M
-_TRAJECTORIES, _SCANS, _TPOG = "trajectories.parquet", "scans.parquet", "tpog.parquet"
+_SENSORS_KEPT = 16
 
 Count = Annotated[int, Field(ge=0, strict=True), BeforeValidator(lambda given: 0 if given == "all" else given)]
-
-
-class Model(Parameters):
-    """Parameters of ``[effects.moving_occlusion]``."""
-
-    method: Annotated[
-        Literal["frames", "independent"],
-        Field(description="Replay recorded frames, or take the TPOG's voxels as independent"),
-    ] = "frames"
-    frames: Annotated[
-        Count,
-        Field(
-            description='Recorded frames that are replayed, evenly spaced; 0 or "all" (or more than there are): all of them'
-        ),
-    ] = 500
-
-    @field_validator("frames")
-    @classmethod
-    def _acts(cls, frames: int, info: ValidationInfo) -> int:
-        if info.data.get("method") == "independent":
-            raise PydanticCustomError("idle", 'acts on nothing with method = "independent"; remove it')
-        return frames
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +81,7 @@ class Replay:
     values: NDArray[np.float64]
     low: NDArray[np.float64]
     high: NDArray[np.float64]
+    _between: dict[tuple[Grid, bytes], Replay] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, frames: int, frame: NDArray[np.int64], values: NDArray[np.float64]) -> Replay:
@@ -111,10 +90,19 @@ class Replay:
         kernels.bounds(values, low, high)
         return cls(frames, frame, values, low, high)
 
-    def between(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> Replay:
-        """Without the boxes that lie wholly outside the upright box from ``low`` to ``high``."""
-        near = ((self.high >= low) & (self.low <= high)).all(axis=1)
-        return Replay(self.frames, self.frame[near], self.values[near], self.low[near], self.high[near])
+    def between(self, sensor_m: NDArray[np.float64], grid: Grid) -> Replay:
+        """Without the boxes that lie wholly outside the upright box round the region of interest and a sensor, (3,) in
+        the grid's frame: those hide nothing from it. What was asked for last is kept, since beams come in pieces."""
+        key = (grid, sensor_m.tobytes())
+        kept = self._between.get(key)
+        if kept is None:
+            corners = np.array([np.zeros(3), grid.roi.size_m, sensor_m])
+            near = ((self.high >= corners.min(axis=0)) & (self.low <= corners.max(axis=0))).all(axis=1)
+            kept = Replay(self.frames, self.frame[near], self.values[near], self.low[near], self.high[near])
+            if len(self._between) >= _SENSORS_KEPT:
+                self._between.clear()
+            self._between[key] = kept
+        return kept
 
     def holding(self, sensor_m: NDArray[np.float64]) -> int:
         """How many boxes (one a frame each) hold a sensor, given in the grid's frame (3,); they are ignored for it."""
@@ -127,6 +115,7 @@ class Replay:
 
     def blocked(self, crossings: Crossings) -> NDArray[np.int64]:
         """Frames in which the beam does not get as far as each crossing, (k,) int64."""
+        between = self.between(crossings.sensor_m, crossings.grid)
         row = np.flatnonzero(np.diff(crossings.first))
         ends = crossings.ends_m[row]
         run = np.hypot(ends[:, 0], ends[:, 1])
@@ -138,8 +127,8 @@ class Replay:
             slope = ends[:, 2] / run
         blocked = np.zeros(len(crossings.cells), dtype=np.int64)
         kernels.count_blocked(
-            _sensor_m(crossings.site, crossings.grid), directions, azimuth[order], slope, row, crossings.first, crossings.enter_m,
-            self.frame, self.values, self.low, self.high, blocked,
+            crossings.sensor_m, directions, azimuth[order], slope, row, crossings.first, crossings.enter_m,
+            between.frame, between.values, between.low, between.high, blocked,
         )  # fmt: skip
         return blocked
 
@@ -159,12 +148,12 @@ class Independent:
 
 
 @dataclass(frozen=True)
-class MovingOcclusion(TransmitScore):
+class MovingOcclusion(TransmitScore[MovingOcclusionParameters]):
     """Vehicles hide what is behind them."""
 
     NAME: ClassVar[str] = "moving_occlusion"
     SOURCE: ClassVar[str] = "doi:10.1177/03611981251327575 (frames); Julian, Karaman, Rus 2014 (independent)"
-    Model: ClassVar[type[Parameters]] = Model
+    Model: ClassVar[type[EffectParameters]] = MovingOcclusionParameters
     QUALITY: ClassVar[dict[str, tuple[Any, ...]]] = {"frames": (50, 500, 0)}
 
     ready: Replay | Independent | None = field(default=None, compare=False, repr=False)
@@ -172,25 +161,22 @@ class MovingOcclusion(TransmitScore):
     @property
     def reads(self) -> tuple[str, ...]:
         """Trajectories, when they are replayed."""
-        return (_TRAJECTORIES,) if self.parameters.method == "frames" else ()
+        return ("trajectories.parquet",) if self.parameters.method == "frames" else ()
 
-    def prepare(self, scenario: Scenario, out: Path) -> MovingOcclusion:
-        """Read the boxes of the frames that are replayed, or the TPOG."""
+    def prepare(self, scene: Scene, tpog: Tpog, trajectories: Path | None) -> MovingOcclusion:
+        """Read the boxes of the frames that are replayed, or take the TPOG's counts."""
+        del scene
         if self.parameters.method == "independent":
-            tpog = read_tpog(out / _TPOG)
             return replace(self, ready=Independent(tpog.frames, tpog.counts.ravel().astype(np.uint32)))
-        grid = Grid.from_json(tables.read_metadata(out / _TPOG, "tpog")["grid"])
-        low, high = _between(scenario, out, grid)
-        return replace(self, ready=read_replay(out / _TRAJECTORIES, grid, self.parameters.frames, low, high))
+        if trajectories is None:
+            raise InputError("effects.moving_occlusion", "no trajectories to replay", 'method = "independent"')
+        return replace(self, ready=read_replay(trajectories, tpog.grid, self.parameters.frames))
 
     def share(self, crossings: Crossings) -> NDArray[np.float64]:
         """Share of the beam that gets as far as each crossing."""
         if self.ready is None:
             raise RuntimeError("moving_occlusion: prepare() returns the effect that can share()")
         return self.ready.share(crossings)
-
-
-EFFECT = MovingOcclusion
 
 
 def replayed(recorded: int, wanted: int) -> NDArray[np.int64]:
@@ -201,64 +187,9 @@ def replayed(recorded: int, wanted: int) -> NDArray[np.int64]:
     return (2 * np.arange(wanted, dtype=np.int64) + 1) * recorded // (2 * wanted)
 
 
-def read_replay(path: Path, grid: Grid, wanted: int, low: NDArray[np.float64], high: NDArray[np.float64]) -> Replay:
-    """Boxes of the replayed frames that meet the upright box from ``low`` to ``high`` (grid's frame), one row group at
-    a time.
-
-    Raises
-    ------
-    InputError
-        For a file that is corrupt or out of order, or a box that is none.
-    """
-    with tables.reader(path, "trajectories") as (file, about):
-        chosen = replayed(int(about["frames"]), wanted)
-        parts, last = [Replay.of(len(chosen), np.empty(0, dtype=np.int64), np.empty((0, 8)))], -1
-        column = file.schema_arrow.get_field_index("frame")
-        for group in range(file.num_row_groups):
-            if not _may_hold(file.metadata.row_group(group).column(column).statistics, chosen):
-                continue
-            table = tables.read_group(file, group, path, ["frame", *_BOX])
-            frame = table.column("frame").to_numpy().astype(np.int64)
-            if len(frame) and (np.any(np.diff(frame) < 0) or frame[0] < last):
-                raise InputError(path, f"frames are out of order near frame {frame[0]}", "rows sorted by frame")
-            last = int(frame[-1]) if len(frame) else last
-            mine = np.isin(frame, chosen)
-            values = np.column_stack([table.column(name).to_numpy()[mine] for name in _BOX])
-            _check(path, frame[mine], values)
-            values[:, :3] = grid.to_grid_m(values[:, :3])
-            parts.append(Replay.of(len(chosen), frame[mine], values).between(low, high))
-    arrays = [np.concatenate([getattr(part, name) for part in parts]) for name in ("frame", "values", "low", "high")]
-    return Replay(len(chosen), *arrays)
-
-
-def _may_hold(statistics: Any, chosen: NDArray[np.int64]) -> bool:
-    """Whether a row group may hold one of the chosen frames; yes where the file does not say which it holds."""
-    if statistics is None or not statistics.has_min_max:
-        return True
-    return bool(np.searchsorted(chosen, statistics.min) < np.searchsorted(chosen, statistics.max, side="right"))
-
-
-def _check(path: Path, frame: NDArray[np.int64], values: NDArray[np.float64]) -> None:
-    sound = np.isfinite(values).all(axis=1) & (values[:, 5:8] >= _SMALLEST_M).all(axis=1)
-    if not sound.all():
-        bad = int(np.flatnonzero(~sound)[0])
-        shown = ", ".join(f"{name} = {value:g}" for name, value in zip(_BOX, values[bad], strict=True))
-        raise InputError(
-            f"{path}: frame {frame[bad]}", f"a box with {shown}", f"finite values, sizes of at least {_SMALLEST_M} m"
-        )
-
-
-def _between(scenario: Scenario, out: Path, grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The upright box round the region of interest and all sensors, in the grid's frame: what lies outside hides
-    nothing."""
-    if scenario.scan.keep:
-        where = tables.read_metadata(out / _SCANS, "scans")["sites"]
-    else:
-        where = [site.to_json() for site in sites.of(scenario)]
-    corners = [np.zeros(3), np.asarray(grid.roi.size_m), *(_sensor_m(site, grid) for site in where)]
-    return np.min(corners, axis=0), np.max(corners, axis=0)
-
-
-def _sensor_m(site: dict[str, Any], grid: Grid) -> NDArray[np.float64]:
-    """Where a site's sensor stands in the grid's frame, (3,) metres."""
-    return grid.to_grid_m(np.array([site["x_m"], site["y_m"], site["z_m"]]))
+def read_replay(path: Path, grid: Grid, wanted: int) -> Replay:
+    """Boxes of the replayed frames in the grid's frame; InputError for a file that is corrupt or out of order."""
+    chosen = replayed(int(tables.read_metadata(path, "trajectories")["frames"]), wanted)
+    parts = [FrameBoxes(np.empty(0, dtype=np.int64), np.empty((0, 8))), *read_boxes(path, grid, chosen)]
+    frame, values = (np.concatenate([getattr(part, name) for part in parts]) for name in ("frame", "values"))
+    return Replay.of(len(chosen), frame, values)

@@ -29,13 +29,14 @@ wet surfaces or windows."""
 from __future__ import annotations
 
 import math
-from typing import Annotated, ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
-from pipeline.effects.registry import Detect, Parameters, Scene
+from pipeline.effects.base import Detect
+from pipeline.scenario.effects import EffectParameters, RainParameters
+from pipeline.sensing.scene import Scene
 from pipeline.sensing.sensors import Sensor
 
 _NEPERS_PER_DB = math.log(10) / 10
@@ -48,26 +49,16 @@ _POWER_LAWS = {
 """k in dB/km and beta, for a rain rate in mm/h."""
 
 
-class Model(Parameters):
-    """Parameters of ``[effects.rain]``."""
-
-    rate_mm_h: Annotated[float, Field(ge=0, le=300, description="Rain rate; 2 is light, 10 moderate, 50 violent")]
-    law: Annotated[
-        Literal["japan", "france", "itu2025", "goodin"],
-        Field(description="Which power law; the module's table says whose"),
-    ] = "japan"
-
-
-class Rain(Detect):
+class Rain(Detect[RainParameters]):
     """Two-way extinction by rain."""
 
     NAME: ClassVar[str] = "rain"
     SOURCE: ClassVar[str] = (
         "ITU-R P.1814, power law k R^beta; the default pair is that of Marshall and Palmer's drops (1948)"
     )
-    Model: ClassVar[type[Parameters]] = Model
+    Model: ClassVar[type[EffectParameters]] = RainParameters
 
-    def idle(self, scene: Scene) -> str | None:
+    def why_idle(self, scene: Scene) -> str | None:
         """Without rain nothing is lost."""
         del scene
         return "rate_mm_h is 0" if self.parameters.rate_mm_h == 0 else None
@@ -82,6 +73,3 @@ class Rain(Detect):
         del sensor
         share: NDArray[np.float64] = np.exp(-2 * self.extinction_per_m() * range_m)
         return share
-
-
-EFFECT = Rain

@@ -27,54 +27,31 @@ chances are multiplied: the joint loss of power is not put to one threshold."""
 from __future__ import annotations
 
 import math
-from typing import Annotated, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 from scipy.special import cosdg, ndtr
 
 from pipeline.core.errors import InputError
-from pipeline.effects.registry import Detect, Parameters, Scene
-from pipeline.sensing import sensors
+from pipeline.effects.base import Detect
+from pipeline.scenario.effects import EffectParameters, RangeLimitParameters
+from pipeline.sensing.scene import Scene
 from pipeline.sensing.sensors import Sensor
 
 
-class Model(Parameters):
-    """Parameters of ``[effects.range_limit]``."""
-
-    reflectivity: Annotated[
-        float,
-        Field(
-            gt=0,
-            description="Of the targets, diffuse; a dark vehicle 0.1, a white one 0.8, a retroreflector far above 1",
-        ),
-    ] = 0.1
-    incidence_deg: Annotated[
-        float, Field(ge=0, lt=90, description="Angle between the beam and the target's normal")
-    ] = 0.0
-    softness: Annotated[float, Field(ge=0, description="Spread of the logarithm of power; 0: all up to the limit")] = (
-        0.3
-    )
-    rated_range_m: Annotated[float | None, Field(gt=0, description="Instead of each sensor's own")] = None
-    rated_reflectivity: Annotated[float | None, Field(gt=0, description="Instead of each sensor's own")] = None
-
-
-class RangeLimit(Detect):
+class RangeLimit(Detect[RangeLimitParameters]):
     """The power law of a return, against the sensor's threshold."""
 
     NAME: ClassVar[str] = "range_limit"
     SOURCE: ClassVar[str] = "Höfle and Pfeifer 2007 (power law); the sensor's datasheet (threshold)"
-    Model: ClassVar[type[Parameters]] = Model
+    Model: ClassVar[type[EffectParameters]] = RangeLimitParameters
 
-    def idle(self, scene: Scene) -> str | None:
+    def why_idle(self, scene: Scene) -> str | None:
         """A hard limit beyond the reach of every beam takes nothing; a measured scan's reach is not known."""
         if self.parameters.softness > 0 or any(site.points is not None for site in scene.sites):
             return None
-        known = {
-            site.sensor: sensors.resolve(site.sensor, scene.scenario.sensors, f"site {site.site}")
-            for site in scene.sites
-        }
+        known = scene.used_sensors
         beyond = all(self.limit_m(sensor) > sensor.range_m * (1 + 1e-9) for sensor in known.values())
         return "every beam ends before the limit" if beyond else None
 
@@ -105,6 +82,3 @@ class RangeLimit(Detect):
         with np.errstate(divide="ignore", over="ignore"):  # at the sensor itself the power is without bound
             chance: NDArray[np.float64] = ndtr(2 * np.log(limit_m / range_m) / softness)
         return chance
-
-
-EFFECT = RangeLimit

@@ -1,0 +1,164 @@
+r"""What an effect is: its name, source and parameters, and the one thing that it does.
+
+The plain scene has straight beams, opaque static geometry and no weather. Everything beyond it is an *effect*: a table
+``[effects.<name>]`` in the scenario, and one module, imported only when it is named. An effect acts in one stage, in
+one of these ways:
+
+============= ======== ========================================================================================
+base class    stage    what it does
+============= ======== ========================================================================================
+Expand        scan     turns a beam into weighted sub-beams; the weights of a beam add up to 1
+TransmitScan  scan     cuts a cast beam into parts, each a share of the beam that ends elsewhere
+TransmitScore score    gives the share of a beam that gets as far as each voxel that it crosses
+Detect        score    gives the chance that a target at a range sends a return that is noticed
+Traffic       traffic  changes who moves, and how boxes are made of it
+============= ======== ========================================================================================
+
+.. math:: hits(v) = \sum_{beams} \sum_{sub} w_{sub} \cdot transmit(beam, v) \cdot detect(range(v))
+
+Weights are expectations, not dice. Without effects each factor is 1, and hits counts beams.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.artefacts.readers import Tpog
+from pipeline.core.errors import InputError
+from pipeline.core.grid import Roi
+from pipeline.scenario.effects import EffectParameters
+from pipeline.sensing.crossings import Crossings
+from pipeline.sensing.scene import Scene
+from pipeline.sensing.sensors import Sensor
+from pipeline.sensing.sites import Pose
+from pipeline.world.casting import EmptyScan
+from pipeline.world.mesh import World
+
+P = TypeVar("P", bound=EffectParameters)
+
+
+@dataclass(frozen=True)
+class Effect(Generic[P]):
+    """Base of all effects.
+
+    Attributes
+    ----------
+    parameters
+        As the scenario names them, checked.
+    NAME, SOURCE
+        The effect's name, and where its model is published.
+    STAGE, KIND
+        Where it acts and how; the base classes below set them.
+    Model
+        The class of ``parameters``.
+    QUALITY
+        Parameters that trade time for accuracy, and values from cheap to fine; the accuracy study tries them.
+    """
+
+    parameters: P
+    NAME: ClassVar[str]
+    SOURCE: ClassVar[str]
+    STAGE: ClassVar[str]
+    KIND: ClassVar[str]
+    Model: ClassVar[type[EffectParameters]]
+    QUALITY: ClassVar[dict[str, tuple[Any, ...]]] = {}
+
+    def why_idle(self, scene: Scene) -> str | None:
+        """Why the effect provably cannot change the result in this scene; None when it can."""
+        del scene
+        return None
+
+    def refusal(self, scene: Scene) -> InputError | None:
+        """What a run of this scene would be refused for; None when nothing is missing."""
+        del scene
+        return None
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """Artefacts that the effect reads beyond those that its stage reads anyway."""
+        return ()
+
+
+class Expand(Effect[P]):
+    """One beam into weighted sub-beams."""
+
+    STAGE: ClassVar[str] = "scan"
+    KIND: ClassVar[str] = "expand"
+
+    @property
+    def copies(self) -> int:
+        """How many sub-beams a beam has."""
+        raise NotImplementedError
+
+    def expand(
+        self, directions: NDArray[np.float64], sensor: Sensor, pose: Pose
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+        """See :meth:`pipeline.sensing.scene.BeamExpander.expand`."""
+        raise NotImplementedError
+
+
+class TransmitScan(Effect[P]):
+    """What gets beyond static surfaces."""
+
+    STAGE: ClassVar[str] = "scan"
+    KIND: ClassVar[str] = "transmit"
+
+    def opaque(self, world: World) -> World:
+        """The world without what this effect lets beams through."""
+        raise NotImplementedError
+
+    def cutter(self, world: World, roi: Roi) -> Callable[[EmptyScan, Pose], EmptyScan]:
+        """See :meth:`pipeline.sensing.scene.BeamCutter.cutter`."""
+        raise NotImplementedError
+
+
+class TransmitScore(Effect[P]):
+    """What gets as far as a voxel."""
+
+    STAGE: ClassVar[str] = "score"
+    KIND: ClassVar[str] = "transmit"
+
+    def prepare(self, scene: Scene, tpog: Tpog, trajectories: Path | None) -> TransmitScore[P]:
+        """Read what :meth:`share` needs, once, before any site is scored; returns the effect that holds it.
+
+        ``trajectories`` is ``trajectories.parquet``; None where there is none, which is refused by an effect that reads
+        it (:attr:`reads`)."""
+        raise NotImplementedError
+
+    def share(self, crossings: Crossings) -> NDArray[np.float64]:
+        """Share (k,), 0 to 1, of its beam that gets as far as each crossing of ``crossings``; called from several
+        threads."""
+        raise NotImplementedError
+
+
+class Detect(Effect[P]):
+    """The chance that a return is noticed."""
+
+    STAGE: ClassVar[str] = "score"
+    KIND: ClassVar[str] = "detect"
+
+    def refusal(self, scene: Scene) -> InputError | None:
+        """Something that a sensor does not say."""
+        try:
+            for sensor in scene.used_sensors.values():
+                self.detect(np.ones(1), sensor)
+        except InputError as error:
+            return error
+        return None
+
+    def detect(self, range_m: NDArray[np.float64], sensor: Sensor) -> NDArray[np.float64]:
+        """Chance (n,), 0 to 1, for targets at ``range_m`` (n,) metres from the sensor."""
+        raise NotImplementedError
+
+
+class Traffic(Effect[P]):
+    """Who moves, and how boxes are made of it."""
+
+    STAGE: ClassVar[str] = "traffic"
+    KIND: ClassVar[str] = "traffic"

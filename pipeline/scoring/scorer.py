@@ -1,0 +1,97 @@
+r"""Scores empty scans against a Traffic Probabilistic Occupancy Grid.
+
+.. math:: EGVS(site) = \sum_v H(p(v)) \, \min(\gamma, hits(v))
+
+(arXiv 2504.06772, Eq. 4): ``hits`` are the beams of the empty scan that cross voxel v, p comes from the TPOG. The sum
+is that of :mod:`pipeline.scoring.egvs`, hits are those of :mod:`pipeline.scoring.visibility`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.artefacts.readers import Tpog
+from pipeline.scoring.egvs import EntropyField
+from pipeline.scoring.uncertainty import LeaveOut
+from pipeline.scoring.visibility import Beams, Hits, Visibility
+from pipeline.sensing.scanner import Scan
+from pipeline.sensing.scene import Scene
+
+
+@dataclass(frozen=True)
+class SiteScore:
+    """What a scan is worth.
+
+    Attributes
+    ----------
+    egvs
+        The score in bits.
+    entropy_seen
+        Share of the TPOG's entropy in voxels crossed at least once.
+    left_out
+        The score of all frames, then with each group of blocks left out, (1 + k,) float64, see
+        :class:`pipeline.scoring.uncertainty.LeaveOut`; None where that was not asked for.
+    """
+
+    egvs: float
+    entropy_seen: float
+    left_out: NDArray[np.float64] | None = None
+
+
+class Scorer:
+    """Scores one scan after another. Threads may share one; it pickles to what it was built from.
+
+    Parameters
+    ----------
+    scene
+        As the scans were taken in; its scenario says gamma.
+    tpog
+        Occupancy by traffic.
+    trajectories
+        ``trajectories.parquet``, only for effects that replay traffic.
+    leave_out
+        Groups of blocks that are left out in turn, for standard errors.
+    """
+
+    def __init__(
+        self, scene: Scene, tpog: Tpog, trajectories: Path | None = None, leave_out: LeaveOut | None = None
+    ) -> None:
+        self._built_from = (scene, tpog, trajectories, leave_out)
+        self._leave_out, self._gamma = leave_out, scene.scenario.score.gamma
+        self.field = EntropyField.of(tpog.counts, tpog.frames, tpog.grid)
+        self._visibility = Visibility(scene, tpog, trajectories)
+
+    def __reduce__(self) -> tuple[type[Scorer], tuple[Scene, Tpog, Path | None, LeaveOut | None]]:
+        return Scorer, self._built_from
+
+    @property
+    def limit(self) -> float:
+        """The most that any scan could reach: the same sum with gamma in every voxel."""
+        return self.field.limit(self._gamma)
+
+    def score(self, scan: Scan | Beams) -> SiteScore:
+        """The score of one scan."""
+        return self._worth(self._visibility.borrowed_hits(_beams(scan)))
+
+    def score_and_hits(self, scan: Scan | Beams) -> tuple[SiteScore, NDArray[np.float64]]:
+        """The score of one scan, and the beams that cross each voxel, (nx, ny, nz) float64."""
+        hits = self._visibility.borrowed_hits(_beams(scan))
+        return self._worth(hits), (hits / self._visibility.unit).reshape(self.field.grid.shape)
+
+    def hits(self, scan: Scan | Beams) -> NDArray[np.float64]:
+        """Beams that cross each voxel, (nx, ny, nz) float64; whole numbers unless an effect weights beams."""
+        hits = self._visibility.borrowed_hits(_beams(scan))
+        return (hits / self._visibility.unit).reshape(self.field.grid.shape)
+
+    def _worth(self, hits: Hits) -> SiteScore:
+        unit = self._visibility.unit
+        found = self.field.score(hits, self._gamma, unit)
+        left_out = self._leave_out.scores(hits, self._gamma, unit) if self._leave_out is not None else None
+        return SiteScore(found.egvs, found.entropy_seen, left_out)
+
+
+def _beams(scan: Scan | Beams) -> Beams:
+    return Beams.of(scan) if isinstance(scan, Scan) else scan
