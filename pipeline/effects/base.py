@@ -21,24 +21,28 @@ Weights are expectations, not dice. Without effects each factor is 1, and hits c
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipeline.artefacts.readers import Tpog
 from pipeline.core.errors import InputError
-from pipeline.core.grid import Roi
 from pipeline.scenario.effects import EffectParameters
-from pipeline.sensing.crossings import Crossings
-from pipeline.sensing.scene import Scene
-from pipeline.sensing.sensors import Sensor
-from pipeline.sensing.sites import Pose
-from pipeline.world.casting import EmptyScan
-from pipeline.world.mesh import World
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from pipeline.artefacts.readers import Tpog
+    from pipeline.core.grid import Roi
+    from pipeline.sensing.crossings import Crossings
+    from pipeline.sensing.scene import Scene
+    from pipeline.sensing.sensors import Sensor
+    from pipeline.sensing.sites import Pose
+    from pipeline.world.casting import EmptyScan
+    from pipeline.world.mesh import World
 
 P = TypeVar("P", bound=EffectParameters)
 

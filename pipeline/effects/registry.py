@@ -1,4 +1,4 @@
-"""Finds effects by name, makes them from a scenario, and resolves a scene with those that act.
+"""Finds effects by name and makes those that a scenario names.
 
 Effects are entry points of the group ``egvs.effects`` (``name = "module:Class"``): this program's own, declared in its
 ``pyproject.toml``, and those of any other package. A module is imported only when its effect is named.
@@ -13,9 +13,6 @@ from pipeline.core import plugins
 from pipeline.effects.base import Effect
 from pipeline.scenario.effects import GROUP, EffectParameters, EffectsModel
 from pipeline.scenario.models import Scenario
-from pipeline.sensing import sites
-from pipeline.sensing.scene import IdleEffect, Scene
-from pipeline.world.mesh import World
 
 
 def names() -> list[str]:
@@ -43,25 +40,6 @@ def named(scenario: Scenario, *stages: str) -> tuple[Effect[Any], ...]:
     """The effects that a scenario names and that act in these stages, in the order in which they are composed."""
     effects = (make(name, parameters) for name, parameters in scenario.effects.named.items())
     return tuple(effect for effect in effects if effect.STAGE in stages)
-
-
-def resolve(scenario: Scenario, world: World) -> Scene:
-    """The scene of a scenario before its static world: sites, and the effects of scan and score that can change a
-    result.
-
-    Raises
-    ------
-    InputError
-        When the sites are wrong.
-    """
-    plain = Scene(scenario, world, sites.of(scenario))
-    if not scenario.effects.named:
-        return plain
-    effects = named(scenario, "scan", "score")
-    reasons = [effect.why_idle(plain) for effect in effects]
-    live = tuple(effect for effect, why in zip(effects, reasons, strict=True) if why is None)
-    idle = (IdleEffect(effect.NAME, effect.STAGE, why) for effect, why in zip(effects, reasons, strict=True) if why)
-    return Scene(scenario, world, plain.sites, live, tuple(idle))
 
 
 def settings(effects: Iterable[Effect[Any]]) -> dict[str, Any]:

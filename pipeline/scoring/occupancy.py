@@ -63,7 +63,7 @@ def count_blocks(
         steps[:] = 0
         while True:
             here = int(np.searchsorted(batch.frame, end))
-            near = _in_reach(batch.values[:here], grid)
+            near = near_grid(batch.values[:here], grid)
             met += int(near.sum())
             boxes.count_boxes(batch.frame[:here][near], batch.values[:here][near], shape, grid.voxel_m, steps, seen)
             batch = FrameBoxes(batch.frame[here:], batch.values[here:])
@@ -77,7 +77,7 @@ def count_blocks(
         yield np.ascontiguousarray(steps[:-1].transpose(1, 2, 0)), met
 
 
-def _in_reach(values: NDArray[np.float64], grid: Grid) -> NDArray[np.bool_]:
+def near_grid(values: NDArray[np.float64], grid: Grid) -> NDArray[np.bool_]:
     """Boxes whose circumscribed ball meets the grid."""
     reach = 0.5 * np.sqrt((values[:, 5:8] ** 2).sum(axis=1))
     centre, size = values[:, :3], np.asarray(grid.roi.size_m)

@@ -1,6 +1,6 @@
 """What is scanned and scored, resolved once: the static world, the candidate sites, their sensors, the live effects.
 
-A scene is built by :func:`pipeline.effects.registry.resolve` and passed on; whoever needs one of its parts takes it
+A scene is built by :func:`pipeline.effects.scenes.resolve` and passed on; whoever needs one of its parts takes it
 from here instead of reading a file again. It can be sent to another process.
 """
 
@@ -8,18 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, Protocol, TypeVar, runtime_checkable
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, ClassVar, Protocol, TypeVar, runtime_checkable
 
 from pipeline.core.grid import Roi
 from pipeline.scenario.models import Scenario
 from pipeline.sensing import sensors
 from pipeline.sensing.sensors import Sensor
 from pipeline.sensing.sites import Pose, Site
-from pipeline.world.casting import EmptyScan
-from pipeline.world.mesh import World
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from pipeline.world.casting import EmptyScan
+    from pipeline.world.mesh import World
 
 
 class LiveEffect(Protocol):

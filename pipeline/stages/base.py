@@ -13,19 +13,17 @@ A stage imports no other stage.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from pipeline.artefacts import schemas
 from pipeline.core import files, parallel
 from pipeline.core.progress import Progress, silent
-from pipeline.effects import registry
 from pipeline.scenario.models import Scenario
-from pipeline.sensing.scene import Scene
-from pipeline.world.mesh import World, read_ply
 
+T = TypeVar("T")
 Json = Mapping[str, Any]
 Summary = dict[str, Any]
 """What came out of a stage, for ``run.json`` and the terminal."""
@@ -89,8 +87,7 @@ class Workspace:
         self.scenario, self.folder, self.progress = scenario, folder, progress
         self.threads = parallel.threads(jobs)
         self._digests: dict[str, str] = {}
-        self._world: tuple[str, World] | None = None
-        self._scene: tuple[World, Scene] | None = None
+        self._remembered: dict[str, tuple[tuple[str, ...], Any]] = {}
 
     def path(self, artefact: str) -> Path:
         """Where an artefact is."""
@@ -111,21 +108,13 @@ class Workspace:
         for name in artefacts:
             self._digests.pop(name, None)
 
-    @property
-    def world(self) -> World:
-        """The static world as ``statics.ply`` holds it, read once."""
-        digest = self.digest("statics.ply")
-        if self._world is None or self._world[0] != digest:
-            self._world = digest, read_ply(self.path("statics.ply"))[0]
-        return self._world[1]
-
-    @property
-    def scene(self) -> Scene:
-        """The scene before that world, resolved once."""
-        world = self.world
-        if self._scene is None or self._scene[0] is not world:
-            self._scene = world, registry.resolve(self.scenario, world)
-        return self._scene[1]
+    def remember(self, what: str, artefacts: tuple[str, ...], make: Callable[[], T]) -> T:
+        """What ``make`` gives, made once for as long as the artefacts that it is made from stay what they are."""
+        made_from = tuple(self.digest(name) for name in artefacts)
+        if what not in self._remembered or self._remembered[what][0] != made_from:
+            self._remembered[what] = made_from, make()
+        value: T = self._remembered[what][1]
+        return value
 
     def metadata(self, inputs: StageInputs, *, seeded: bool = True, **more: Any) -> dict[str, Any]:
         """The metadata that every artefact carries.

@@ -24,7 +24,7 @@ from pipeline.sensing.scanner import Scan, Scanner
 from pipeline.sensing.scene import Scene
 from pipeline.sensing.sites import ScannedSite, Site
 from pipeline.stages.base import StageInputs, Summary, Workspace
-from pipeline.stages.scan_source import SCANS, scan_inputs
+from pipeline.stages.scene import SCANS, scan_inputs, scene_of
 
 NAME = "scan"
 ARTEFACTS = (SCANS,)
@@ -52,7 +52,7 @@ def run(work: Workspace, inputs: StageInputs, points: tuple[str, ...] = (), clou
         ``sites``, ``beams`` (cast), ``returns``, ``settled_in_float64`` (beams that float32 alone left in doubt),
         ``clouds`` (files with points).
     """
-    scene = work.scene
+    scene = scene_of(work)
     known = [site.name for site in scene.sites]
     for name in points:
         if name not in known:
@@ -69,7 +69,7 @@ def run(work: Workspace, inputs: StageInputs, points: tuple[str, ...] = (), clou
 
 
 def _write_all(work: Workspace, inputs: StageInputs, scanner: Scanner, points: tuple[str, ...], cloud: str) -> Summary:
-    scene, clouds, doubtful = work.scene, [], 0
+    scene, clouds, doubtful = scene_of(work), [], 0
     about: list[ScannedSite] = []
 
     def scan(site: Site) -> tuple[Site, Scan, ScannedSite]:

@@ -25,7 +25,8 @@ from pipeline.scoring.scorer import Scorer, SiteScore
 from pipeline.scoring.visibility import Beams, in_voxels
 from pipeline.sensing.sites import ScannedSite
 from pipeline.stages.base import StageInputs, Summary, Workspace
-from pipeline.stages.scan_source import SCANS, SiteBeams, scan_inputs, scans
+from pipeline.stages.scan_source import SiteBeams, scans
+from pipeline.stages.scene import SCANS, scan_inputs, scene_of
 
 NAME = "score"
 ARTEFACTS = ("scores.parquet", "visibility.parquet")
@@ -54,7 +55,7 @@ class BeamAudit:
 
 def inputs(work: Workspace) -> StageInputs:
     """Gamma and what to keep; TPOG and scans by hash (without kept scans: what a scan depends on)."""
-    scenario, live = work.scenario, work.scene.acting(Effect, "score")
+    scenario, live = work.scenario, scene_of(work).acting(Effect, "score")
     settings: dict[str, Any] = {"name": scenario.name, "score": scenario.score.model_dump(mode="json")}
     if live:
         settings["effects"] = registry.settings(live)
@@ -87,7 +88,7 @@ def run(
     """
     tpog, wanted = read_tpog(work.path("tpog.parquet")), work.scenario.score
     leave_out = uncertainty.LeaveOut.of(work.path("tpog.parquet"), tpog) if wanted.standard_error else None
-    scorer = Scorer(work.scene, tpog, work.path(TRAJECTORIES), leave_out)
+    scorer = Scorer(scene_of(work), tpog, work.path(TRAJECTORIES), leave_out)
 
     def score(scan: SiteBeams) -> ScoredSite:
         checked = audit_beams(scan.beams, tpog.grid) if audit else None
@@ -112,7 +113,7 @@ def run(
         file.describe(about)
     best = [d.site.name for d, rank in zip(done, columns["rank"], strict=True) if rank == 1]
     summary: Summary = {"sites": len(done), "best": best, "egvs_limit": scorer.limit}
-    if skipped := work.scene.skipped(NAME):
+    if skipped := scene_of(work).skipped(NAME):
         summary["skipped"] = skipped
     if estimate is not None:
         summary |= uncertainty.in_words(estimate, tpog.frames)

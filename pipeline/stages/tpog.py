@@ -16,6 +16,7 @@ from pipeline.artefacts.boxes import read_boxes
 from pipeline.core.errors import InputError
 from pipeline.scoring.occupancy import count_blocks, static_voxels
 from pipeline.stages.base import StageInputs, Summary, Workspace
+from pipeline.stages.world import world_of
 
 NAME = "tpog"
 ARTEFACTS = ("tpog.parquet",)
@@ -47,7 +48,7 @@ def run(work: Workspace, inputs: StageInputs) -> Summary:
         raise InputError(
             f"{scenario.file}: tpog.blocks", f"{blocks} does not divide the {frames} frames recorded", "a divisor"
         )
-    filled = static_voxels(work.world, grid)
+    filled = static_voxels(world_of(work), grid)
     block_frames, in_roi, ever = frames // blocks, 0, np.zeros(grid.shape, dtype=np.bool_)
     with tables.writer(work.path(ARTEFACTS[0]), "tpog") as file:
         counted = count_blocks(read_boxes(source, grid), grid, block_frames, blocks)

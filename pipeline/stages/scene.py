@@ -1,0 +1,39 @@
+"""The scene of a run's folder, resolved once, and what empty scans of it depend on."""
+
+from __future__ import annotations
+
+from pipeline.core import files
+from pipeline.effects import registry, scenes
+from pipeline.effects.base import Effect
+from pipeline.sensing.scene import Scene
+from pipeline.stages.base import StageInputs, Workspace
+from pipeline.stages.world import STATICS, world_of
+
+SCANS = "scans.parquet"
+
+
+def scene_of(work: Workspace) -> Scene:
+    """The scene before the static world, resolved once."""
+    return work.remember("scene", (STATICS,), lambda: scenes.resolve(work.scenario, world_of(work)))
+
+
+def scan_inputs(work: Workspace) -> StageInputs:
+    """What empty scans depend on: the region of interest without its voxels, sites, sensors, effects; files by hash."""
+    scenario, scene = work.scenario, scene_of(work)
+    live = scene.acting(Effect, "scan")
+    settings = {
+        "name": scenario.name,
+        "roi": [scene.roi.origin_m, scene.roi.size_m],
+        "ground": scenario.statics.ground,
+        "sites": scenario.sites.model_dump(mode="json"),
+        "sensors": {name: model.model_dump(mode="json") for name, model in scenario.sensors.items()},
+    }
+    if live:
+        settings["effects"] = registry.settings(live)
+    hashes = work.digests(STATICS)
+    if scenario.sites.file is not None:
+        hashes[scenario.sites.file] = files.sha256_of(scenario.find(scenario.sites.file, "sites.file"))
+    for site in scene.sites:
+        if site.points is not None:
+            hashes[site.points] = files.sha256_of(scenario.find(site.points, f"site {site.name}: points"))
+    return StageInputs(settings, hashes, code=tuple(type(effect) for effect in live))
