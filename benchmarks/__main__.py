@@ -23,12 +23,14 @@ from rich.table import Table
 
 import pipeline
 from benchmarks import casting, others, savings, stability
+from benchmarks.scenes import run_stage
 from pipeline.artefacts.readers import read_tpog
 from pipeline.core.parallel import in_order
+from pipeline.effects import scenes
 from pipeline.kernels import march
-from pipeline.scoring.egvs import EntropyField
+from pipeline.scoring.scorer import Scorer
 from pipeline.scoring.visibility import Beams, Visibility, in_voxels
-from pipeline.sensing import scanner as survey
+from pipeline.sensing.scanner import Scanner
 from pipeline.sensing.sites import Site
 from pipeline.stages import tpog
 from pipeline.world.mesh import read_ply
@@ -84,7 +86,7 @@ def whole_run(folder: Path) -> tuple[list[tuple[str, str, str, bool]], float]:
     )
     took, peak = egvs("run", str(SCENARIO), "--out", str(folder / "run"))
     record = json.loads((folder / "run" / "run.json").read_text())
-    sumo = record["stages"]["traffic"]["said"]["sumo_seconds"]
+    sumo = record["stages"]["traffic"]["summary"]["sumo_seconds"]
     helped = statistics.median(egvs("--help")[0] for _ in range(5))
     allowed = 2 * sumo + 3
     return [
@@ -103,7 +105,7 @@ def whole_run(folder: Path) -> tuple[list[tuple[str, str, str, bool]], float]:
 def occupancy(folder: Path, sumo: float) -> list[tuple[str, str, str, bool]]:
     """From trajectories.parquet to tpog.parquet."""
     scenario = pipeline.load(SCENARIO)
-    took = seconds(lambda: tpog.run(scenario, folder / "run"))
+    took = seconds(lambda: run_stage(tpog, scenario, folder / "run"))
     share = took / sumo
     return [("tpog, 5000 frames x 50 vehicles", f"{took:.3f} s = {share:.1%} of SUMO's time", "20 %", share < 0.20)]
 
@@ -111,33 +113,30 @@ def occupancy(folder: Path, sumo: float) -> list[tuple[str, str, str, bool]]:
 def sites(folder: Path) -> list[tuple[str, str, str, bool]]:
     """Scan and score, site by site: from the static world and the TPOG in memory to a score."""
     scenario, run = pipeline.load(SCENARIO), folder / "run"
-    world, _ = read_ply(run / "statics.ply")
+    scene = scenes.resolve(scenario, read_ply(run / "statics.ply")[0])
     counted = read_tpog(run / "tpog.parquet")
-    field = EntropyField.of(counted.counts, counted.frames, counted.grid)
-    surveyed = survey.Survey(scenario, world)
-    visibility = Visibility(scenario, run, counted.grid)
-    beams = {site: Beams(scan.about, scan.scan.ends_m) for site in surveyed.sites for scan in [surveyed.scan(site)]}
+    scanner, scorer, visibility = Scanner(scene), Scorer(scene, counted), Visibility(scene, counted)
+    beams = {site: Beams.of(scanner.scan_site(site)) for site in scene.sites}
     hits = np.zeros(int(np.prod(counted.grid.shape)), dtype=np.uint32)
 
     def score_one(site: Site) -> float:
-        found = surveyed.scan(site)
-        return field.score(visibility.hits(Beams(found.about, found.scan.ends_m)), 10.0).egvs
+        return scorer.score(scanner.scan_site(site)).egvs
 
     def march_one(site: Site) -> None:
         o, d, shape = in_voxels(beams[site], counted.grid)
         hits.fill(0)
         march.count_hits(o, d, shape, counted.grid.voxel_m, hits)
 
-    whole = statistics.median(seconds(lambda site=site: score_one(site)) for site in surveyed.sites)
-    part = statistics.median(seconds(lambda site=site: march_one(site)) for site in surveyed.sites)
+    whole = statistics.median(seconds(lambda site=site: score_one(site)) for site in scene.sites)
+    part = statistics.median(seconds(lambda site=site: march_one(site)) for site in scene.sites)
     times: dict[str, list[float]] = {"1": [], "2": [], "bare": [], "plain": []}
     for _ in range(REPEATS):
         for threads in (1, 2):
             times[str(threads)].append(
-                once(lambda threads=threads: list(in_order(score_one, surveyed.sites * 4, threads)))
+                once(lambda threads=threads: list(in_order(score_one, scene.sites * 4, threads)))
             )
-        times["bare"].append(once(lambda: [march_one(site) for site in surveyed.sites]))
-        times["plain"].append(once(lambda: [visibility.hits(beams[site]) for site in surveyed.sites]))
+        times["bare"].append(once(lambda: [march_one(site) for site in scene.sites]))
+        times["plain"].append(once(lambda: [visibility.borrowed_hits(beams[site]) for site in scene.sites]))
     gain = statistics.median(a / b for a, b in zip(times["1"], times["2"], strict=True))
     extra = statistics.median(a / b for a, b in zip(times["plain"], times["bare"], strict=True))
     return [

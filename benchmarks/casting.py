@@ -37,7 +37,7 @@ def _work(name: str) -> tuple[dict[str, Callable[[], Any]], int, int]:
     TriangleMesh(bare, caster._triangles.astype(np.float32))
     jobs = []
     for site in sites.of(scenario):
-        sensor = sensors.resolve(site.sensor, scenario.sensors, site.site)
+        sensor = sensors.resolve(site.sensor, scenario.sensors, site.name)
         directions = sensor.directions(site.yaw_deg, site.pitch_deg, site.roll_deg)
         position = np.asarray(site.position_m)
         d = directions[caster.scan(site.position_m, directions, sensor.range_m).beam]

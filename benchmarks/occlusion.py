@@ -20,11 +20,13 @@ from scipy.stats import kendalltau
 
 import pipeline
 from pipeline.artefacts.readers import read_tpog
-from pipeline.core.grid import Grid
-from pipeline.effects.score.moving_occlusion import Replay
+from pipeline.effects.score.moving_occlusion import read_replay
+from pipeline.scenario.effects import EffectsModel
 from pipeline.scenario.models import Scenario
-from pipeline.scoring.egvs import EntropyField
-from pipeline.scoring.visibility import Visibility
+from pipeline.scoring.scorer import Scorer
+from pipeline.stages.base import Workspace
+from pipeline.stages.scan_source import scans
+from pipeline.stages.scene import scene_of
 from pipeline.stages.score import ranks
 
 Compared = dict[str, Any]
@@ -77,26 +79,21 @@ def compare(scenario: Scenario, out: Path, *, frames: int = 500) -> Compared:
 def scored(scenario: Scenario, out: Path, parameters: dict[str, Any] | None) -> Setting:
     """Scores of all sites with ``[effects.moving_occlusion]`` as given (None: without); kernels are compiled
     beforehand."""
-    others = {name: given for name, given in scenario.effects.items() if name != "moving_occlusion"}
-    changed = scenario.model_copy(
-        update={"effects": others | ({} if parameters is None else {"moving_occlusion": parameters})}
-    )
-    tpog = read_tpog(out / "tpog.parquet")
-    field = EntropyField.of(tpog.counts, tpog.frames, tpog.grid)
-    visibility = Visibility(changed, out, tpog.grid)
-    beams = list(visibility.beams())
-    visibility.hits(beams[0])
+    others = scenario.effects.without("moving_occlusion").model_dump()
+    wanted = others if parameters is None else {**others, "moving_occlusion": parameters}
+    work = Workspace(scenario.with_effects(EffectsModel.of(wanted)), out)
+    tpog, trajectories, found = read_tpog(out / "tpog.parquet"), out / "trajectories.parquet", list(scans(work))
+    scorer = Scorer(scene_of(work), tpog, trajectories)
+    scorer.score(found[0].beams)
     start = time.perf_counter()
-    egvs = [field.score(visibility.hits(site), scenario.score.gamma, visibility.unit).egvs for site in beams]
-    took = (time.perf_counter() - start) / len(beams)
-    ignored = [_ignored(visibility, site.site, tpog.grid) for site in beams]
-    return Setting([site.site["site"] for site in beams], np.array(egvs), took, ignored)
-
-
-def _ignored(visibility: Visibility, site: dict[str, Any], grid: Grid) -> int:
-    position = grid.to_grid_m(np.array([site["x_m"], site["y_m"], site["z_m"]]))
-    replays = (getattr(effect, "ready", None) for effect in visibility._effects)
-    return sum(replay.holding(position) for replay in replays if isinstance(replay, Replay))
+    egvs = [scorer.score(scan.beams).egvs for scan in found]
+    took = (time.perf_counter() - start) / len(found)
+    occlusion = work.scenario.effects.moving_occlusion
+    ignored = [0] * len(found)
+    if occlusion is not None and occlusion.method == "frames":
+        replay = read_replay(trajectories, tpog.grid, occlusion.frames)
+        ignored = [replay.holding(tpog.grid.to_grid_m(np.array(scan.site.pose.position_m))) for scan in found]
+    return Setting([scan.site.name for scan in found], np.array(egvs), took, ignored)
 
 
 def _error(found: float, true: float) -> float | None:

@@ -14,7 +14,6 @@ interleaved; processor seconds are medians, as multiples of ours; of the sites' 
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,13 +24,17 @@ import numba
 import numpy as np
 
 import pipeline
+from benchmarks.scenes import recorded_boxes
 from benchmarks.stability import medians, textbook, touching
+from pipeline.artefacts.boxes import FrameBoxes
 from pipeline.core.grid import Grid
 from pipeline.kernels import boxes, march
 from pipeline.scoring.egvs import EntropyField
-from pipeline.sensing import scanner as survey
-from pipeline.sensing.scanner import Survey
-from pipeline.stages import statics, tpog, traffic
+from pipeline.scoring.occupancy import static_voxels
+from pipeline.sensing.scanner import Scanner
+from pipeline.sensing.scene import Scene
+from pipeline.sensing.sites import Site
+from pipeline.world.casting import Caster
 from pipeline.world.mesh import World
 
 SCENARIO = Path(__file__).resolve().parent.parent / "scenarios" / "nishishinjuku"
@@ -145,14 +148,14 @@ def centres(frame, values, shape, voxel_m, counts, seen):
                         counts[ix, iy, iz] += 1
 
 
-def by_centre(batch: tpog.Boxes, grid: Grid) -> Any:
+def by_centre(batch: FrameBoxes, grid: Grid) -> Any:
     """Frames in which each voxel's centre is in a box, (nx, ny, nz) int32."""
     counts, seen = np.zeros(grid.shape, np.int32), np.full(grid.shape, -1, np.int64)
     centres(batch.frame, batch.values, np.asarray(grid.shape, np.int64), grid.voxel_m, counts, seen)
     return counts
 
 
-def by_boxes(batch: tpog.Boxes, grid: Grid, kernels: Any = boxes) -> Any:
+def by_boxes(batch: FrameBoxes, grid: Grid, kernels: Any = boxes) -> Any:
     """The same by ``kernels``: ours, or those of boxes that touch."""
     nx, ny, nz = grid.shape
     steps, seen = np.zeros((nz + 1, nx, ny), np.int32), np.full((3, nx, ny), -1, np.int64)
@@ -197,35 +200,33 @@ def by_embree(triangles: Any) -> Callable[[Any, Any, float], Any]:
 
 
 @dataclass
-class Scene:
+class Junction:
     """The shipped junction, with the occupancy of a few hundred frames."""
 
     grid: Grid
     gamma: float
     world: World
-    surveyed: Survey
-    batch: tpog.Boxes
+    scene: Scene
+    batch: FrameBoxes
     static: Any
 
     @classmethod
-    def shipped(cls) -> Scene:
+    def shipped(cls) -> Junction:
         """Statics built, traffic simulated."""
         scenario = pipeline.load(SCENARIO, [f"traffic.frames={FRAMES}"])
-        grid, world = scenario.roi.grid, statics.build(scenario, statics.Tally.empty())
-        with tempfile.TemporaryDirectory() as temporary:
-            traffic.run(scenario, Path(temporary))
-            read = list(tpog._read(Path(temporary) / "trajectories.parquet", grid))
-        frame, values = np.concatenate([b.frame for b in read]), np.concatenate([b.values for b in read])
-        near = tpog._in_reach(values, grid)
-        batch = tpog.Boxes(frame[near], values[near])
-        return cls(
-            grid, scenario.score.gamma, world, survey.Survey(scenario, world), batch, tpog.static_voxels(world, grid)
-        )
+        grid, scene = scenario.roi.grid, pipeline.build_scene(scenario)
+        filled = static_voxels(scene.world, grid)
+        return cls(grid, scenario.score.gamma, scene.world, scene, recorded_boxes(scenario), filled)
 
     @property
-    def sites(self) -> list[Any]:
+    def sites(self) -> list[Site]:
         """The sites that are compared."""
-        return [site for site in self.surveyed.sites if site.site in SITES]
+        return [site for site in self.scene.sites if site.name in SITES]
+
+    def scans(self) -> list[tuple[Site, Any]]:
+        """Each of these sites, and where its beams end."""
+        scanner = Scanner(self.scene)
+        return [(site, scanner.scan_site(site).rows.ends_m) for site in self.sites]
 
     @property
     def shape(self) -> Any:
@@ -234,7 +235,7 @@ class Scene:
 
     def start(self, site: Any) -> Any:
         """Where a sensor is, in voxels of the grid's frame."""
-        return self.grid.to_grid_m(np.asarray(site.position_m)) / self.grid.voxel_m
+        return self.grid.to_grid_m(np.asarray(site.pose.position_m)) / self.grid.voxel_m
 
     def hits(self, site: Any, ends_m: Any, way: March = march.count_hits) -> Any:
         """Beams in each voxel, flat."""
@@ -270,12 +271,12 @@ def _row(what: str, ratio: float, errors: list[tuple[float, float, float]], scor
     return what, f"{ratio:.3g} x", f"{voxels:.2%} of voxels wrong", told, f"EGVS {off}"
 
 
-def march_rows(scene: Scene) -> list[Row]:
+def march_rows(junction: Junction) -> list[Row]:
     """(a), (b), (c): the march of all beams of the sites."""
-    scans = [(site, scene.surveyed.scan(site).scan.ends_m) for site in scene.sites]
-    field = scene.field(by_boxes(scene.batch, scene.grid))
-    jobs = [(scene.start(site), np.ascontiguousarray(ends / scene.grid.voxel_m)) for site, ends in scans]
-    shape, voxel_m, room = scene.shape, scene.grid.voxel_m, np.zeros(int(scene.shape.prod()), np.uint32)
+    scans = junction.scans()
+    field = junction.field(by_boxes(junction.batch, junction.grid))
+    jobs = [(junction.start(site), np.ascontiguousarray(ends / junction.grid.voxel_m)) for site, ends in scans]
+    shape, voxel_m, room = junction.shape, junction.grid.voxel_m, np.zeros(int(junction.shape.prod()), np.uint32)
 
     def all_of(way: March) -> Callable[[], None]:
         def work() -> None:
@@ -285,51 +286,54 @@ def march_rows(scene: Scene) -> list[Row]:
         return work
 
     seconds = medians([all_of(way) for way in MARCHES.values()])
-    true = [scene.hits(site, ends) for site, ends in scans]
+    true = [junction.hits(site, ends) for site, ends in scans]
     found = [_ours(f"march, {', '.join(SITES)}", seconds[0])]
     for (name, way), took in list(zip(MARCHES.items(), seconds, strict=True))[1:]:
-        theirs = [scene.hits(site, ends, way) for site, ends in scans]
+        theirs = [junction.hits(site, ends, way) for site, ends in scans]
         errors = [wrong(a, b) for a, b in zip(theirs, true, strict=True)]
         scores = [
-            (field.score(a, scene.gamma).egvs, field.score(b, scene.gamma).egvs)
+            (field.score(a, junction.gamma).egvs, field.score(b, junction.gamma).egvs)
             for a, b in zip(theirs, true, strict=True)
         ]
         found.append(_row(f"march: {name}", took / seconds[0], errors, scores))
     return found
 
 
-def occupancy_rows(scene: Scene) -> list[Row]:
+def occupancy_rows(junction: Junction) -> list[Row]:
     """(d): what counts as occupied."""
     plain = touching()
     ways = {
-        "ours": lambda: by_boxes(scene.batch, scene.grid),
-        "touching boxes": lambda: by_boxes(scene.batch, scene.grid, plain),
-        "voxel centres": lambda: by_centre(scene.batch, scene.grid),
+        "ours": lambda: by_boxes(junction.batch, junction.grid),
+        "touching boxes": lambda: by_boxes(junction.batch, junction.grid, plain),
+        "voxel centres": lambda: by_centre(junction.batch, junction.grid),
     }
-    hits = [scene.hits(site, scene.surveyed.scan(site).scan.ends_m) for site in scene.sites]
+    hits = [junction.hits(site, ends) for site, ends in junction.scans()]
     seconds = medians(list(ways.values()))
     true = ways["ours"]()
-    field = scene.field(true)
+    field = junction.field(true)
     found: list[Row] = [(f"occupancy, {FRAMES} frames: ours", "1 x", f"{seconds[0] * 1e3:.1f} ms", "the reference", "")]
     for (name, way), took in list(zip(ways.items(), seconds, strict=True))[1:]:
         counts = way()
-        theirs = scene.field(counts)
-        scores = [(theirs.score(h, scene.gamma).egvs, field.score(h, scene.gamma).egvs) for h in hits]
+        theirs = junction.field(counts)
+        scores = [(theirs.score(h, junction.gamma).egvs, field.score(h, junction.gamma).egvs) for h in hits]
         found.append(_row(f"occupancy: {name}", took / seconds[0], [wrong(counts, true)], scores))
     return found
 
 
-def cast_rows(scene: Scene) -> list[Row]:
+def cast_rows(junction: Junction) -> list[Row]:
     """(e), (f): the cast of beams that can meet the region of interest, and the march of what it finds."""
-    caster, origin = scene.surveyed._caster, np.asarray(scene.grid.origin_m)
+    origin = np.asarray(junction.grid.origin_m)
+    positions_m = np.array([site.pose.position_m for site in junction.scene.sites])
+    range_m = max(sensor.range_m for sensor in junction.scene.used_sensors.values())
+    caster = Caster(junction.world, junction.scene.roi, positions_m, range_m)
     triangles = caster._triangles
-    field = scene.field(by_boxes(scene.batch, scene.grid))
+    field = junction.field(by_boxes(junction.batch, junction.grid))
     jobs = []
-    for site in scene.sites:
-        sensor = scene.surveyed._sensors[site.site]
-        directions = scene.surveyed._directions(site)
-        d = directions[caster.scan(site.position_m, directions, sensor.range_m).beam]
-        jobs.append((site, np.asarray(site.position_m) - origin, d, sensor.range_m))
+    for site in junction.sites:
+        sensor = junction.scene.sensor(site.sensor)
+        directions = sensor.directions(*site.pose.angles_deg)
+        d = directions[caster.scan(site.pose.position_m, directions, sensor.range_m).beam]
+        jobs.append((site, np.asarray(site.pose.position_m) - origin, d, sensor.range_m))
 
     def ours(o: Any, d: Any, range_m: float) -> Any:
         return caster.scan(tuple(o + origin), d, range_m).ends_m
@@ -351,17 +355,17 @@ def cast_rows(scene: Scene) -> list[Row]:
     for (name, way, every), took in zip(ways, seconds[1:], strict=True):
         errors, scores = [], []
         for site, o, d, range_m in jobs:
-            theirs, true = (scene.hits(site, cast(o, d[::every], range_m)) for cast in (way, ours))
+            theirs, true = (junction.hits(site, cast(o, d[::every], range_m)) for cast in (way, ours))
             errors.append(wrong(theirs, true))
-            scores.append((field.score(theirs, scene.gamma).egvs, field.score(true, scene.gamma).egvs))
+            scores.append((field.score(theirs, junction.gamma).egvs, field.score(true, junction.gamma).egvs))
         found.append(_row(f"cast: {name}", took / seconds[0], errors, scores))
     return found
 
 
 def rows() -> list[tuple[Any, ...]]:
     """(what, seconds against ours, wrong voxels, beams or frames missed and invented, error of the score)."""
-    scene = Scene.shipped()
-    return [*march_rows(scene), *occupancy_rows(scene), *cast_rows(scene)]
+    junction = Junction.shipped()
+    return [*march_rows(junction), *occupancy_rows(junction), *cast_rows(junction)]
 
 
 if __name__ == "__main__":

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 import pipeline
-from pipeline.sensing import scanner as survey
-from pipeline.stages import statics, tpog
+from pipeline.artefacts.boxes import FrameBoxes
+from pipeline.scoring.occupancy import count
 from pipeline.world.casting import Caster
 from pipeline.world.mesh import World
 
@@ -52,11 +52,12 @@ def rows() -> list[tuple[str, str, str, bool]]:
 def _beams() -> list[tuple[str, str, str, bool]]:
     """Only beams that can meet the region of interest are cast."""
     scenario = pipeline.load(SCENARIO)
-    roi, surveyed = scenario.roi.box, survey.Survey(scenario, statics.build(scenario, statics.Tally.empty()))
-    sensor = surveyed._sensors[surveyed.sites[0].site]
-    directions, range_m, caster = sensor.directions(), sensor.range_m, surveyed._caster
-    starts = [np.asarray(site.position_m) - np.asarray(roi.origin_m) for site in surveyed.sites]
-    scans = [caster.scan(site.position_m, directions, range_m) for site in surveyed.sites]
+    roi, scene = scenario.roi.box, pipeline.build_scene(scenario)
+    sensor = scene.sensor(scene.sites[0].sensor)
+    directions, range_m = sensor.directions(), sensor.range_m
+    caster = Caster(scene.world, roi, np.array([site.pose.position_m for site in scene.sites]), range_m)
+    starts = [np.asarray(site.pose.position_m) - np.asarray(roi.origin_m) for site in scene.sites]
+    scans = [caster.scan(site.pose.position_m, directions, range_m) for site in scene.sites]
     same = True
     for start, scan in zip(starts, scans, strict=True):
         ranges = np.minimum(caster.first_hits(start, directions, range_m)[0], range_m)
@@ -80,10 +81,10 @@ def _flat() -> list[tuple[str, str, str, bool]]:
     rng, n = np.random.default_rng(5), 20_000
     centres = np.column_stack([rng.uniform(0, 100, n), rng.uniform(0, 50, n), np.full(n, 0.75)])
     sizes = np.tile([4.5, 1.75, 1.5], (n, 1))
-    flat = tpog.Boxes(np.arange(n) // 20, np.column_stack([centres, rng.uniform(-3, 3, n), np.zeros(n), sizes]))
-    tipped = tpog.Boxes(flat.frame, flat.values + np.array([0, 0, 0, 0, 1e-15, 0, 0, 0]))
-    same = np.array_equal(tpog.count(flat, grid, n // 20), tpog.count(tipped, grid, n // 20))
-    took = in_turn(lambda: tpog.count(flat, grid, n // 20), lambda: tpog.count(tipped, grid, n // 20))
+    flat = FrameBoxes(np.arange(n) // 20, np.column_stack([centres, rng.uniform(-3, 3, n), np.zeros(n), sizes]))
+    tipped = FrameBoxes(flat.frame, flat.values + np.array([0, 0, 0, 0, 1e-15, 0, 0, 0]))
+    same = np.array_equal(count(flat, grid, n // 20), count(tipped, grid, n // 20))
+    took = in_turn(lambda: count(flat, grid, n // 20), lambda: count(tipped, grid, n // 20))
     return [
         (
             "flat boxes: flat path / separating axes",
@@ -96,16 +97,16 @@ def _flat() -> list[tuple[str, str, str, bool]]:
 
 def _pair(name: str, grown: Callable[[World], World]) -> list[tuple[str, str, str, bool]]:
     scenario = pipeline.load(SCENARIO)
-    plain = statics.build(scenario, statics.Tally.empty())
-    roi, surveyed, world = scenario.roi.box, survey.Survey(scenario, plain), grown(plain)
-    sites = np.array([site.position_m for site in surveyed.sites])
+    roi, scene = scenario.roi.box, pipeline.build_scene(scenario)
+    world = grown(scene.world)
+    sites = np.array([site.pose.position_m for site in scene.sites])
     nothing = World(np.empty((0, 3)), np.empty((0, 3), np.int32), np.empty(0, np.int32), ())
-    sensor = surveyed._sensors[surveyed.sites[0].site]
+    sensor = scene.sensor(scene.sites[0].sensor)
     directions, range_m = sensor.directions(), sensor.range_m
     held, whole, empty = Caster(world, roi, sites, range_m), Caster(world, roi), Caster(nothing, roi)
 
     def cast(caster: Caster) -> list[bytes]:
-        scans = (caster.scan(site.position_m, directions, range_m) for site in surveyed.sites)
+        scans = (caster.scan(site.pose.position_m, directions, range_m) for site in scene.sites)
         return [scan.ends_m.tobytes() + scan.returned.tobytes() for scan in scans]
 
     same = cast(held) == cast(whole)

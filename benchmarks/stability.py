@@ -27,8 +27,8 @@ import numpy as np
 
 import pipeline
 from benchmarks.numerics.march import beams_of, check
+from benchmarks.scenes import recorded_boxes
 from pipeline.kernels import boxes, march
-from pipeline.stages import tpog, traffic
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENE = "nishishinjuku"
@@ -149,12 +149,8 @@ def box_rows() -> list[tuple[str, float, float, int]]:
     frames = 1000
     scenario = pipeline.load(ROOT / "scenarios" / SCENE, [f"traffic.frames={frames}"])
     grid = scenario.roi.grid
-    with tempfile.TemporaryDirectory() as temporary:
-        traffic.run(scenario, Path(temporary))
-        batches = list(tpog._read(Path(temporary) / "trajectories.parquet", grid))
-    frame, values = np.concatenate([b.frame for b in batches]), np.concatenate([b.values for b in batches])
-    near = tpog._in_reach(values, grid)
-    frame, values = frame[near], values[near]
+    boxes_near = recorded_boxes(scenario)
+    frame, values = boxes_near.frame, boxes_near.values
     shape, (nx, ny, nz) = np.asarray(grid.shape, np.int64), grid.shape
     steps, seen = np.zeros((nz + 1, nx, ny), np.int32), np.full((3, nx, ny), -1, np.int64)
 

@@ -7,7 +7,6 @@ bound, the pair goes to 50-digit arithmetic. So every answer is certain, and onl
 
 from __future__ import annotations
 
-import tempfile
 from pathlib import Path
 
 import mpmath
@@ -16,8 +15,10 @@ import numpy as np
 
 import pipeline
 from benchmarks.numerics.row import Row
+from benchmarks.scenes import recorded_boxes
+from pipeline.artefacts.boxes import FrameBoxes
 from pipeline.kernels import boxes
-from pipeline.stages import tpog, traffic
+from pipeline.scoring.occupancy import count
 from tests.oracles import boxes as oracle
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -199,23 +200,18 @@ def real(scale):
     axis."""
     frames = max(100, round(5000 * min(scale, 1.0) / 100) * 100)
     scenario = pipeline.load(ROOT / "scenarios" / "nishishinjuku", [f"traffic.frames={frames}"])
-    with tempfile.TemporaryDirectory() as temporary:
-        out, grid = Path(temporary), scenario.roi.grid
-        traffic.run(scenario, out)
-        batches = list(tpog._read(out / "trajectories.parquet", grid))
-    frame, values = np.concatenate([b.frame for b in batches]), np.concatenate([b.values for b in batches])
-    near = tpog._in_reach(values, grid)
-    frame, values = frame[near], values[near]
+    grid, recorded = scenario.roi.grid, recorded_boxes(scenario)
+    frame, values = recorded.frame, recorded.values
     doubtful, nearest = np.empty((len(values), 5), np.int64), np.empty(len(values))
     some = np.ascontiguousarray(values[:: max(1, round(1 / max(scale, 1e-9) / 2))])
     wrong, pairs, _ = compare(some, np.asarray(grid.shape, np.int64), grid.voxel_m, doubtful, nearest)
     close = int((nearest[: len(some)] <= 1e-9).sum())
-    before = tpog.count(tpog.Boxes(frame, values), grid, frames)
+    before = count(recorded, grid, frames)
     turned = 0
     for axis in range(3):
         for sign in (-1, 1):
             moved = values + sign * 1e-9 * np.eye(8)[axis]
-            turned += int((tpog.count(tpog.Boxes(frame, moved), grid, frames) != before).sum())
+            turned += int((count(FrameBoxes(frame, moved), grid, frames) != before).sum())
     return [
         Row(
             "boxes of nishishinjuku",

@@ -264,10 +264,10 @@ def _shipped(name: str, scale: float) -> Row:
 
     def jobs() -> Iterator[tuple[Caster, Floats, Floats, Floats]]:
         for site in sites.of(scenario):
-            sensor = sensors.resolve(site.sensor, scenario.sensors, site.site)
-            d = sensor.directions(site.yaw_deg, site.pitch_deg, site.roll_deg)
-            kept = caster.scan(site.position_m, d, sensor.range_m).beam[::step]
-            yield caster, triangles, np.asarray(site.position_m) - np.asarray(scenario.roi.box.origin_m), d[kept]
+            sensor = sensors.resolve(site.sensor, scenario.sensors, site.name)
+            d = sensor.directions(*site.pose.angles_deg)
+            kept = caster.scan(site.pose.position_m, d, sensor.range_m).beam[::step]
+            yield caster, triangles, np.asarray(site.pose.position_m) - np.asarray(scenario.roi.box.origin_m), d[kept]
 
     return _compare(f"{name}: {'every beam' if step == 1 else f'one in {step} beams'} of every site", jobs())
 
@@ -281,7 +281,7 @@ def _aimed(name: str, rng: np.random.Generator, scale: float) -> Row:
             n = _many(scale, 300_000 // len(places))
             chosen, side, s = rng.integers(0, len(triangles), n), rng.integers(0, 3, n), rng.random((n, 1))
             on_side = triangles[chosen, side] * (1 - s) + triangles[chosen, (side + 1) % 3] * s
-            o = np.asarray(site.position_m) - np.asarray(scenario.roi.box.origin_m)
+            o = np.asarray(site.pose.position_m) - np.asarray(scenario.roi.box.origin_m)
             yield caster, triangles, o, _unit(on_side + rng.normal(size=(n, 3)) * 1e-3 - o)
 
     return _compare(f"{name}: aimed within some mm of the sides of its triangles", jobs())

@@ -7,7 +7,6 @@ segment goes to the rational oracle instead. So every answer is certain, and onl
 
 from __future__ import annotations
 
-import tempfile
 from fractions import Fraction
 from pathlib import Path
 
@@ -17,9 +16,7 @@ import numpy as np
 import pipeline
 from benchmarks.numerics.row import Row
 from pipeline.kernels import march
-from pipeline.sensing import scanner as survey
-from pipeline.stages import statics
-from pipeline.world.mesh import read_ply
+from pipeline.sensing.scanner import Scanner
 from tests.oracles import march as oracle
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -270,23 +267,20 @@ def count_fragile(o, d, shape, voxel_m, moved_m):
     return in_plane, others
 
 
-def beams_of(name, folder):
+def beams_of(name):
     """(grid, [(site, o, d)]) of a shipped scene."""
     scenario = pipeline.load(ROOT / "scenarios" / name)
-    statics.run(scenario, folder)
-    world, _ = read_ply(folder / "statics.ply")
-    surveyed, grid = survey.Survey(scenario, world), scenario.roi.grid
-    found = []
-    for site in surveyed.sites:
-        o = grid.to_grid_m(np.asarray(site.position_m)) / grid.voxel_m
-        found.append((site.site, o, np.ascontiguousarray(surveyed.scan(site).scan.ends_m / grid.voxel_m)))
+    scene, grid = pipeline.build_scene(scenario), scenario.roi.grid
+    scanner, found = Scanner(scene), []
+    for site in scene.sites:
+        o = grid.to_grid_m(np.asarray(site.pose.position_m)) / grid.voxel_m
+        found.append((site.name, o, np.ascontiguousarray(scanner.scan_site(site).rows.ends_m / grid.voxel_m)))
     return grid, found
 
 
 def shipped(name, scale):
     """Rows of a shipped scene: its beams against sorted cuts, the audit, and how many a nanometre could turn."""
-    with tempfile.TemporaryDirectory() as temporary:
-        grid, sites = beams_of(name, Path(temporary))
+    grid, sites = beams_of(name)
     shape = np.asarray(grid.shape, np.int64)
     step = max(1, round(1 / max(scale, 1e-9) ** 0.5))
     total = excluded = mismatches = asked = in_plane = others = 0

@@ -1,0 +1,32 @@
+"""Scenes, recordings and single stages for what is measured here."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.artefacts.boxes import FrameBoxes, read_boxes
+from pipeline.scenario.models import Scenario
+from pipeline.scoring.occupancy import near_grid
+from pipeline.stages import traffic
+from pipeline.stages.base import Workspace
+
+
+def run_stage(stage: Any, scenario: Scenario, folder: Path, **options: Any) -> dict[str, Any]:
+    """Run one stage in a folder that holds the artefacts of those before it."""
+    work = Workspace(scenario, folder)
+    found: dict[str, Any] = stage.run(work, stage.inputs(work), **options)
+    return found
+
+
+def recorded_boxes(scenario: Scenario) -> FrameBoxes:
+    """Boxes near the grid of traffic that is simulated for it, in the grid's frame."""
+    with tempfile.TemporaryDirectory() as temporary:
+        run_stage(traffic, scenario, Path(temporary))
+        groups = list(read_boxes(Path(temporary) / "trajectories.parquet", scenario.roi.grid))
+    frame, values = (np.concatenate([getattr(group, name) for group in groups]) for name in ("frame", "values"))
+    near = near_grid(values, scenario.roi.grid)
+    return FrameBoxes(frame[near], values[near])
