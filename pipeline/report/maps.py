@@ -55,9 +55,7 @@ def occupancy(
     return plan.svg(parts, alt, bar=ColourBar(0.0, peak, label))
 
 
-def site_map(
-    grid: Grid, values: ColumnValues, outlines: Sequence[Outlines], sites: Sequence[MapSite], alt: str
-) -> str:
+def site_map(grid: Grid, values: ColumnValues, outlines: Sequence[Outlines], sites: Sequence[MapSite], alt: str) -> str:
     """The sites over the static outlines: colour by score, number by rank, name beside it; occupied roads faint below.
 
     Of sites that share a place, the best is in the middle of its rings. Where many sites stand, only the first ten and
@@ -94,7 +92,7 @@ def site_view(grid: Grid, values: ColumnValues, peak: float, view: SiteView, pre
     plan, site = Plan(view.box, prefix, width=460.0, tallest=420.0), view.site
     x, y = plan.x(site.x_m), plan.y(site.y_m)
     parts = [
-        plan.image(grid, raster.shade_image(~view.crossed.any(axis=2)), "shadow"),
+        plan.image(grid, raster.shade_image(np.logical_not(view.crossed.any(axis=2))), "shadow"),
         _field(plan, grid, values, peak),
         _drawn(plan, view.outlines),
         plan.roi(grid),

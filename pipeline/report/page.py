@@ -1,6 +1,6 @@
 """The report stage: one page that shows a reader who has not read the paper what came of a run.
 
-Steps: read the scores, the TPOG, the statics and ``run.json``; draw (:mod:`pipeline.report.figures`); fill the template.
+Steps: read the scores, the TPOG and ``run.json``; draw (:mod:`pipeline.report.figures`); fill the template.
 ``report.html`` is one file that fetches nothing.
 
 It is a function of the artefacts and of what ``run.json`` holds of the earlier stages, their costs included: no clock,

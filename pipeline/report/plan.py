@@ -108,7 +108,8 @@ class Plan:
         """The whole figure."""
         base = self.top + self.frame_height
         tall = base + 40.0 + (56.0 if bar else 0.0)
-        frame = f'<rect x="{self.left:.1f}" y="{self.top:.1f}" width="{self.frame_width:.1f}" height="{self.frame_height:.1f}"/>'
+        place = f'x="{self.left:.1f}" y="{self.top:.1f}"'
+        frame = f'<rect {place} width="{self.frame_width:.1f}" height="{self.frame_height:.1f}"/>'
         clip = f'<clipPath id="{self.prefix}-clip">{frame}</clipPath>'
         drawing = "\n".join(parts)
         return "\n".join(
@@ -122,8 +123,9 @@ class Plan:
         )
 
     def _axes(self, base: float) -> str:
-        right = self.left + self.frame_width
-        lines, ticks, texts = [], [f"M{self.left:.1f} {self.top:.1f}h{self.frame_width:.1f}v{self.frame_height:.1f}h{-self.frame_width:.1f}z"], []
+        wide, tall = self.frame_width, self.frame_height
+        lines, texts = [], []
+        ticks = [f"M{self.left:.1f} {self.top:.1f}h{wide:.1f}v{tall:.1f}h{-wide:.1f}z"]
         for value, text in self._ticks[0]:
             x = self.x(value)
             lines.append(f"M{x:.1f} {self.top:.1f}V{base:.1f}")
@@ -131,14 +133,12 @@ class Plan:
             texts.append(f'<text x="{x:.1f}" y="{base + 18:.1f}" text-anchor="middle">{text}</text>')
         for value, text in self._ticks[1]:
             y = self.y(value)
-            lines.append(f"M{self.left:.1f} {y:.1f}H{right:.1f}")
+            lines.append(f"M{self.left:.1f} {y:.1f}H{self.left + wide:.1f}")
             ticks.append(f"M{self.left:.1f} {y:.1f}h-5")
             texts.append(f'<text x="{self.left - 8:.1f}" y="{y + 4:.1f}" text-anchor="end">{text}</text>')
-        wide = 7.0 * max(len(t) for _, t in self._ticks[1])
-        side, middle = self.left - 16.0 - wide, self.top + self.frame_height / 2
-        texts.append(
-            f'<text x="{self.left + self.frame_width / 2:.1f}" y="{base + 34:.1f}" text-anchor="middle">x, east (m)</text>'
-        )
+        side = self.left - 16.0 - 7.0 * max(len(t) for _, t in self._ticks[1])
+        centre, middle = self.left + wide / 2, self.top + tall / 2
+        texts.append(f'<text x="{centre:.1f}" y="{base + 34:.1f}" text-anchor="middle">x, east (m)</text>')
         texts.append(
             f'<text transform="translate({side:.1f} {middle:.1f}) rotate(-90)" text-anchor="middle">y, north (m)</text>'
         )
@@ -162,7 +162,8 @@ class ColourBar:
     def svg(self, prefix: str, x: float, y: float, width: float) -> str:
         stops = "".join(self._stop(i) for i in range(STEPS + 1))
         fill = f'<linearGradient id="{prefix}-scale">{stops}</linearGradient>'
-        bar = f'<rect class="axis" style="fill:url(#{prefix}-scale)" x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="12"/>'
+        place = f'x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="12"'
+        bar = f'<rect class="axis" style="fill:url(#{prefix}-scale)" {place}/>'
         ticks = "".join(
             f'<path class="axis" d="M{at:.1f} {y + 12:.1f}v4"/>'
             f'<text x="{at:.1f}" y="{y + 28:.1f}" text-anchor="middle">{text}</text>'

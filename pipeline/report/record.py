@@ -56,9 +56,8 @@ class StageRecord:
         """From the stage's object in ``run.json``."""
         cost = found.get("cost") or {}
         summary = {key: value for key, value in (found.get("summary") or {}).items() if key not in _UNSTABLE}
-        return cls(
-            stage, found.get("inputs", ""), found.get("artefacts", {}), summary, cost.get("seconds"), cost.get("peak_mb")
-        )
+        inputs, artefacts = found.get("inputs", ""), found.get("artefacts", {})
+        return cls(stage, inputs, artefacts, summary, cost.get("seconds"), cost.get("peak_mb"))
 
 
 @dataclass(frozen=True)
