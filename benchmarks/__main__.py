@@ -84,7 +84,7 @@ def whole_run(folder: Path) -> tuple[list[tuple[str, str, str, bool]], float]:
     )
     took, peak = egvs("run", str(SCENARIO), "--out", str(folder / "run"))
     record = json.loads((folder / "run" / "run.json").read_text())
-    sumo = record["stages"]["traffic"]["said"]["sumo_seconds"]
+    sumo = record["stages"]["traffic"]["summary"]["sumo_seconds"]
     helped = statistics.median(egvs("--help")[0] for _ in range(5))
     allowed = 2 * sumo + 3
     return [
