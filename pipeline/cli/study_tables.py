@@ -71,8 +71,9 @@ def _settings(title: str, rows: Sequence[Row], errors: bool, is_wide: bool) -> T
             "+-": f"{r.seconds_spread:.2f}", "busy": f"{r.busy_s:.2f}", "traffic": f"{r.traffic_s:.2f}",
             "tpog": f"{r.tpog_s:.2f}", "scan": f"{r.scan_s:.2f}", "score": f"{r.score_s:.2f}",
             "memory MB": f"{r.peak_mb:.0f}", "disk MB": f"{r.bytes / 1e6:.1f}", "error": f"{r.error:.2%}",
-            "std error": known, "vs own": f"{r.own_change:.2%}", "tau": f"{r.tau:.3f}", "rho": f"{r.rho:.3f}", "regret": f"{r.regret:.2%}",
+            "std error": known, "vs own": f"{r.own_change:.2%}", "tau": f"{r.tau:.3f}", "rho": f"{r.rho:.3f}",
             "kept": ", ".join(["best"] * r.best_kept + ["three"] * r.best_three_kept) or "-",
+            "regret": f"{r.regret:.2%}",
         }  # fmt: skip
         table.add_row(*(cells[name] for name in names))
     return table
