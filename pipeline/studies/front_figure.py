@@ -160,7 +160,8 @@ def _name_settings(axes: Any, settings: Sequence[PlottedSetting]) -> None:
         for align, x, y in (("left", 6, -11), ("right", -8, -11), ("left", 6, 6), ("right", -8, 6)):
             name = axes.annotate(
                 text, (s.seconds, _error_percent(s)), xytext=(x, y), textcoords="offset points", fontsize=7.5,
-                ha=align, zorder=2, bbox={"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.75},
+                ha=align, zorder=2,
+                bbox={"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.75},
             )  # fmt: skip
             box = name.get_window_extent(renderer)
             hides = any(box.overlaps(other) for other in taken) or any(box.contains(*marker) for marker in markers)
