@@ -1,4 +1,4 @@
-"""Where do the pictures in README and docs come from?
+"""Draws the pictures in README and docs.
 
 ``make pictures`` runs the shipped scenarios and draws: the map of the README, taken from the report, and for each
 effect what the score (or, where an effect changes traffic, the occupancy) looks like from above before and after, on
@@ -18,7 +18,10 @@ import numpy as np
 import pipeline
 from pipeline.artefacts.readers import read_scores, read_tpog, read_trajectories
 from pipeline.effects import registry as effects
-from pipeline.report import plan as figures
+from pipeline.report.maps import SiteView, site_view
+from pipeline.report.outlines import outlines_of
+from pipeline.report.plan import extent, standalone
+from pipeline.report.ranking import ScoredSite
 from pipeline.runs import workflow
 from pipeline.scenario.models import Scenario
 from pipeline.scoring.egvs import EntropyField
@@ -46,7 +49,7 @@ SHOWN: dict[str, tuple[str, dict[str, Any], str]] = {
 def figure(page: str, label: str) -> str:
     """The figure of a report whose accessible label begins with ``label``, as a file of its own."""
     found = next(svg for svg in re.findall(r"<svg.*?</svg>", page, re.DOTALL) if f'aria-label="{label}' in svg)
-    return figures.standalone(found)
+    return standalone(found)
 
 
 def seen(scenario: Scenario, out: Path, site: str) -> tuple[np.ndarray, np.ndarray]:
@@ -76,20 +79,17 @@ def before_and_after(name: str, folder: Path) -> Iterator[tuple[str, str]]:
         workflow.run(scenario, out)
         found.append((word, *seen(scenario, out, site)))
     tpog = read_tpog(out / "tpog.parquet")
-    rows = read_scores(out / "scores.parquet").to_pylist()
-    row = next(r for r in rows if r["site"] == (site or rows[0]["site"]))
-    spot = figures.Spot(*(row[key] for key in ("site", "x_m", "y_m", "z_m", "egvs", "rank")))
-    box = figures.extent(tpog.grid, [spot])
-    layers = figures.footprints(read_ply(out / "statics.ply")[0], box)
+    scored = ScoredSite.all_of(read_scores(out / "scores.parquet"))
+    place = next(s for s in scored if s.site == (site or scored[0].site)).on_map
+    box = extent(tpog.grid, [place])
+    outlines = outlines_of(read_ply(out / "statics.ply")[0], box)
     peak = max(float(field.max()) for _, field, _ in found)
     for word, field, crossed in found:
-        stand = figures.Stand(spot, crossed, layers, box)
+        view = SiteView(place, crossed, outlines, box)
         what = f"score of site {site} by column" if site else "mean occupied voxels by column"
         alt = f"{name}, {word}: {what}, from above, 0 to {peak:.3g}"
-        yield (
-            f"{name}-{word}.svg",
-            figures.standalone(figures.view(tpog.grid, field, peak, stand, f"{name}-{word}", alt)),
-        )
+        drawn = site_view(tpog.grid, field, peak, view, f"{name}-{word}", alt)
+        yield f"{name}-{word}.svg", standalone(drawn)
 
 
 def side_view(out: Path, pitched: bool) -> str:

@@ -1,1 +1,1 @@
-""""""
+"""The command line: what the user types, and the tables that answer."""

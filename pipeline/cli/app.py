@@ -1,18 +1,18 @@
-"""The command line: parses, calls, prints; nothing else.
+"""The verbs of the command line: each parses, calls, prints; nothing else.
 
 Heavy modules are imported by the verb that needs them, so that ``egvs --help`` answers at once.
 """
 
 from __future__ import annotations
 
-import re
-import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from pipeline.cli import arguments
+from pipeline.cli.arguments import Audit, Jobs, Out, ScenarioPath, Set
 from pipeline.core.errors import EgvsError, InputError
 from pipeline.core.version import __version__
 
@@ -29,18 +29,6 @@ app = typer.Typer(
 
 _INTERRUPTED = 130
 """Exit code after Ctrl-C."""
-
-ScenarioPath = Annotated[Path, typer.Argument(metavar="SCENARIO", help="A folder with a scenario.toml, or the file.")]
-Out = Annotated[
-    Path | None, typer.Option("--out", metavar="DIR", help="The run's folder; runs/<scenario name> by default.")
-]
-Set = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override one value, e.g. traffic.frames=500.")
-]
-Jobs = Annotated[
-    int | None, typer.Option("--jobs", min=1, help="Threads; one a core by default. Results do not depend on it.")
-]
-Audit = Annotated[bool, typer.Option("--audit", help="Check every beam's chords, and print the worst case.")]
 
 
 def main() -> None:
@@ -62,7 +50,7 @@ def _fail(message: str, code: int) -> None:
     sys.exit(code)
 
 
-def _version(wanted: bool) -> None:
+def _print_version(wanted: bool) -> None:
     if wanted:
         print(f"egvs {__version__}")
         raise typer.Exit
@@ -71,41 +59,30 @@ def _version(wanted: bool) -> None:
 @app.callback()
 def options(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
     """Options of every verb."""
     del version
 
 
+# ---- the whole run, and single stages
+
+
 @app.command()
 def run(scenario: ScenarioPath, out: Out = None, set_: Set = None, jobs: Jobs = None, audit: Audit = False) -> None:
     """Everything, in order; stages whose inputs did not change are skipped."""
-    from pipeline.cli import screen as show
+    from pipeline.cli import results
+    from pipeline.cli.progress import Screen
     from pipeline.runs import workflow
 
-    resolved = _load(scenario, set_)
-    folder = out or workflow.default_folder(resolved)
-    with show.Screen() as screen:
-        extra = {"score": {"audit": True}} if audit else None
-        record = workflow.run(resolved, folder, jobs=jobs, progress=screen.progress, told=screen.told, options=extra)
-    screen.result(folder, record)
-
-
-def _one(
-    stage: str, scenario: Path, out: Path | None, set_: list[str] | None, jobs: int | None = None, **extra: Any
-) -> None:
-    """Run one stage and say what came of it."""
-    from pipeline.cli import screen as show
-    from pipeline.runs import workflow
-
-    resolved = _load(scenario, set_)
-    folder = out or workflow.default_folder(resolved)
-    with show.Screen() as screen:
-        record = workflow.run_one(
-            stage, resolved, folder, jobs=jobs, progress=screen.progress, told=screen.told, **extra
+    resolved, folder = _resolved(scenario, set_, out)
+    extra = {"score": {"audit": True}} if audit else None
+    with Screen() as screen:
+        record = workflow.run(
+            resolved, folder, jobs=jobs, progress=screen.progress, told=screen.stage_event, options=extra
         )
-    screen.stage(folder, stage, record)
+    results.print_run(folder, record, anything_ran=screen.any_stage_ran)
 
 
 @app.command()
@@ -119,20 +96,20 @@ def traffic(
     ] = None,
 ) -> None:
     """Simulate traffic with SUMO: trajectories.parquet."""
-    extra: dict[str, Any] = {"traci": _address(traci)} if traci is not None else {}
-    _one("traffic", scenario, out, set_, **extra)
+    extra: dict[str, Any] = {"traci": arguments.host_and_port(traci)} if traci is not None else {}
+    _run_stage("traffic", scenario, out, set_, **extra)
 
 
 @app.command()
 def statics(scenario: ScenarioPath, out: Out = None, set_: Set = None) -> None:
     """Build the static world: statics.ply."""
-    _one("statics", scenario, out, set_)
+    _run_stage("statics", scenario, out, set_)
 
 
 @app.command()
 def tpog(scenario: ScenarioPath, out: Out = None, set_: Set = None) -> None:
     """Count occupancy: tpog.parquet."""
-    _one("tpog", scenario, out, set_)
+    _run_stage("tpog", scenario, out, set_)
 
 
 @app.command()
@@ -151,19 +128,38 @@ def scan(
     if cloud not in ("ply", "pcd"):
         raise InputError("--cloud", repr(cloud), "ply or pcd")
     extra: dict[str, Any] = {"points": tuple(points), "cloud": cloud} if points else {}
-    _one("scan", scenario, out, set_, jobs, **extra)
+    _run_stage("scan", scenario, out, set_, jobs, **extra)
 
 
 @app.command()
 def score(scenario: ScenarioPath, out: Out = None, set_: Set = None, jobs: Jobs = None, audit: Audit = False) -> None:
     """Score and rank the sites: scores.parquet."""
-    _one("score", scenario, out, set_, jobs, **({"audit": True} if audit else {}))
+    _run_stage("score", scenario, out, set_, jobs, **({"audit": True} if audit else {}))
 
 
 @app.command()
 def report(scenario: ScenarioPath, out: Out = None, set_: Set = None) -> None:
     """Draw the report: report.html."""
-    _one("report", scenario, out, set_)
+    _run_stage("report", scenario, out, set_)
+
+
+def _run_stage(
+    stage: str, scenario: Path, out: Path | None, set_: list[str] | None, jobs: int | None = None, **extra: Any
+) -> None:
+    """Run one stage and print what it wrote."""
+    from pipeline.cli import results
+    from pipeline.cli.progress import Screen
+    from pipeline.runs import workflow
+
+    resolved, folder = _resolved(scenario, set_, out)
+    with Screen() as screen:
+        record = workflow.run_one(
+            stage, resolved, folder, jobs=jobs, progress=screen.progress, told=screen.stage_event, **extra
+        )
+    results.print_stage(folder, stage, record)
+
+
+# ---- runs that exist already
 
 
 @app.command()
@@ -175,14 +171,18 @@ def verify(
     jobs: Jobs = None,
 ) -> None:
     """Run again what DIR/run.json says, and compare every artefact byte for byte."""
-    from pipeline.cli import screen as show
+    from pipeline.cli import results
+    from pipeline.cli.progress import Screen
     from pipeline.runs import workflow
 
-    with show.Screen() as screen:
-        wrong = workflow.verify(folder, scenario, jobs=jobs, progress=screen.progress, told=screen.told)
-    screen.verdict(folder, wrong)
-    if wrong:
+    with Screen() as screen:
+        differences = workflow.verify(folder, scenario, jobs=jobs, progress=screen.progress, told=screen.stage_event)
+    results.print_verification(folder, differences)
+    if differences:
         raise typer.Exit(1)
+
+
+# ---- studies: many runs of one scenario
 
 
 @app.command()
@@ -203,27 +203,24 @@ def accuracy(
     ] = 0,
 ) -> None:
     """What accuracy costs in time, and the cheapest setting within a tolerance."""
-    from pipeline.cli import screen as show
-    from pipeline.runs import workflow
-    from pipeline.studies import accuracy as what_it_costs
+    from pipeline.cli import study_tables
+    from pipeline.cli.progress import Screen
+    from pipeline.studies.accuracy import study
 
-    resolved = _load(scenario, set_)
-    folder = out or workflow.default_folder(resolved)
-    with show.Screen("accuracy") as screen:
-        found = what_it_costs.study(
-            scenario, set_ or (), folder, tolerance=tolerance, budget_s=_seconds(budget), seeds=seeds, jobs=jobs,
-            progress=screen.progress, told=screen.setting,
-        )  # fmt: skip
-    show.accuracy(found, _again("run", scenario, set_))
-
-
-@app.command()
-def sensors() -> None:
-    """Print the sensor catalogue."""
-    from pipeline.cli import screen as show
-    from pipeline.sensing.sensors import CATALOGUE
-
-    show.catalogue(CATALOGUE.values())
+    _, folder = _resolved(scenario, set_, out)
+    with Screen("accuracy") as screen:
+        outcome = study(
+            scenario,
+            set_ or (),
+            folder,
+            tolerance=tolerance,
+            budget_s=arguments.duration_s(budget),
+            seeds=seeds,
+            jobs=jobs,
+            progress=screen.progress,
+            told=screen.setting_event,
+        )
+    study_tables.print_study(outcome, arguments.command("run", scenario, set_))
 
 
 @app.command()
@@ -239,35 +236,43 @@ def effects(
     jobs: Jobs = None,
 ) -> None:
     """Print which effects exist; for a scenario, which it calls for, and why."""
-    from pipeline.cli import screen as show
-    from pipeline.runs import workflow
-    from pipeline.studies import effects as callings
+    from pipeline.cli import effect_tables
+    from pipeline.cli.progress import Screen
+    from pipeline.studies import effects as study
 
     if scenario is None:
         if ablation:
             raise InputError("--ablation", "without a scenario", "egvs effects SCENARIO --ablation")
-        show.effects(callings.catalogue())
+        effect_tables.print_effects(study.catalogue())
         return
-    resolved = _load(scenario, set_)
-    folder = out or workflow.default_folder(resolved)
-    prices, calls = callings.prices(resolved, folder), callings.called(resolved)
-    show.effects(calls, prices)
-    untold = [
-        call.name
-        for call in calls
-        if call.state == "on" and call.name in resolved.effects and call.name not in (prices or {})
-    ]
-    if prices is None or untold:
-        what = "they" if prices is None else ", ".join(untold)
-        print(f"what {what} cost and change: {_again('accuracy', scenario, set_, out)}, or --ablation")
+    resolved, folder = _resolved(scenario, set_, out)
+    prices, calls = study.prices(resolved, folder), study.called(resolved)
+    effect_tables.print_effects(calls, prices)
+    on = [call.name for call in calls if call.state == "on" and call.name in resolved.effects]
+    unpriced = [name for name in on if name not in (prices or {})]
+    if prices is None or unpriced:
+        what = "they" if prices is None else ", ".join(unpriced)
+        print(f"what {what} cost and change: {arguments.command('accuracy', scenario, set_, out)}, or --ablation")
     if ablation:
         if not resolved.effects:
             raise InputError(
                 "--ablation", "the scenario names no effect", "name one, e.g. --set effects.rain.rate_mm_h=20"
             )
-        with show.Screen() as screen:
-            changes = callings.ablation(resolved, folder, jobs=jobs, progress=screen.progress)
-        show.ablation(changes)
+        with Screen() as screen:
+            changes = study.ablation(resolved, folder, jobs=jobs, progress=screen.progress)
+        effect_tables.print_ablation(changes)
+
+
+# ---- catalogues, and scenarios to begin with
+
+
+@app.command()
+def sensors() -> None:
+    """Print the sensor catalogue."""
+    from pipeline.cli.sensor_table import print_sensors
+    from pipeline.sensing.sensors import CATALOGUE
+
+    print_sensors(CATALOGUE.values())
 
 
 @app.command()
@@ -280,43 +285,17 @@ def new(
     lefthand: Annotated[bool, typer.Option("--lefthand", help="Traffic drives on the left.")] = False,
 ) -> None:
     """Make a scenario from an OpenStreetMap extract."""
-    from pipeline.cli import screen as show
-    from pipeline.importers import openstreetmap as from_osm
+    from pipeline.cli import results
+    from pipeline.importers import openstreetmap
 
-    show.summary(folder, from_osm.new(folder, osm, _place(at) if at is not None else None, lefthand=lefthand))
+    place = arguments.latitude_and_longitude(at) if at is not None else None
+    results.print_new_scenario(folder, openstreetmap.new(folder, osm, place, lefthand=lefthand))
 
 
-def _load(path: Path, set_: list[str] | None) -> Scenario:
+def _resolved(path: Path, set_: list[str] | None, out: Path | None) -> tuple[Scenario, Path]:
+    """The scenario with ``--set`` laid over it, and the run's folder."""
+    from pipeline.runs.workflow import default_folder
     from pipeline.scenario.loading import load
 
-    return load(path, set_ or ())
-
-
-def _again(verb: str, scenario: Path, set_: list[str] | None, out: Path | None = None) -> str:
-    """A command that can be typed."""
-    words = ["egvs", verb, str(scenario), *(word for one in set_ or () for word in ("--set", one))]
-    return shlex.join([*words, "--out", str(out)] if out is not None else words)
-
-
-def _seconds(text: str) -> float:
-    units = {"s": 1.0, "m": 60.0, "h": 3600.0, "": 1.0}
-    found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)([smh]?)", text)
-    seconds = float(found[1]) * units[found[2]] if found else 0.0
-    if not 0 < seconds < float("inf"):
-        raise InputError("--budget", repr(text), "a time above 0 with one unit, for example 90s, 10m or 1.5h")
-    return seconds
-
-
-def _address(text: str) -> tuple[str, int]:
-    host, _, port = text.rpartition(":")
-    if not host or not port.isdigit() or not 0 < int(port) < 65536:
-        raise InputError("--traci", repr(text), "HOST:PORT, for example localhost:8813")
-    return host, int(port)
-
-
-def _place(text: str) -> tuple[float, float]:
-    try:
-        lat, lon = (float(part) for part in text.split(","))
-    except ValueError:
-        raise InputError("--at", repr(text), "LAT,LON in degrees, for example 50.8704,9.7080") from None
-    return lat, lon
+    scenario = load(path, set_ or ())
+    return scenario, out or default_folder(scenario)

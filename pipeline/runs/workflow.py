@@ -163,7 +163,7 @@ def run_stage(
     done = {
         "inputs": inputs,
         "artefacts": {a: files.sha256_of(out / a) for a in stage.ARTEFACTS if (out / a).exists()},
-        "said": said,
+        "summary": said,
         "cost": cost.to_json(),
     }
     record["stages"][name] = done

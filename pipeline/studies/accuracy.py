@@ -39,7 +39,7 @@ from pipeline.runs.workflow import alone, refresh_report
 from pipeline.scenario.models import Scenario
 from pipeline.scoring.egvs import EntropyField
 from pipeline.stages.base import metadata
-from pipeline.studies import front_figure as pareto
+from pipeline.studies import front_figure
 from pipeline.studies import settings as knobs
 from pipeline.studies.settings import APPROXIMATES, MEASURES, REFERENCE, SCENARIO, Setting
 from pipeline.studies.trials import STAGES, Bench, Trial, inputs_of
@@ -229,7 +229,7 @@ def _study(
     if REFERENCE not in trials:
         times = 1
     _write(files[0], scenario, rows, trials[SCENARIO], times, tolerance)
-    pareto.draw([_point(row) for row in rows], tolerance, scenario.name, files[1])
+    front_figure.draw_figure([_plotted(row) for row in rows], tolerance, scenario.name, files[1])
     neighbours = trials.get(REFERENCE, trials[SCENARIO]).neighbours
     empty = not any(trials[SCENARIO].shares)
     return Study(rows, skipped | more, tolerance, best, times, neighbours, files, repeated=repeated, empty=empty)
@@ -481,8 +481,8 @@ def _beats(one: Row, other: Row) -> bool:
     )
 
 
-def _point(r: Row) -> pareto.Point:
-    return pareto.Point(
+def _plotted(r: Row) -> front_figure.PlottedSetting:
+    return front_figure.PlottedSetting(
         r.setting, r.kind, r.knob, r.seconds, r.judged, r.tau, r.regret, r.front, r.recommended, r.default
     )
 

@@ -1,4 +1,4 @@
-"""Is the report one sound file that fetches nothing, says what the artefacts hold, and has the same bytes each time?
+"""The report is one sound file that fetches nothing, says what the artefacts hold, and has the same bytes each time.
 
 Runs are small and go through the real stages; only the traffic is made up.
 """
@@ -17,19 +17,23 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from pipeline.artefacts import readers as results
 from pipeline.artefacts import tables
+from pipeline.artefacts.readers import read_scores, read_tpog
 from pipeline.core.grid import Grid
+from pipeline.report import maps, plan, raster
 from pipeline.report import page as report
-from pipeline.report import plan as figures
-from pipeline.report.plan import Layer, Spot
+from pipeline.report.figures import Figures
+from pipeline.report.outlines import outlines_of
+from pipeline.report.plan import MapSite
+from pipeline.report.ranking import Ranking
+from pipeline.report.record import RunRecord
 from pipeline.scenario.loading import from_values
 from pipeline.scoring import visibility
 from pipeline.scoring.egvs import EntropyField
 from pipeline.stages import scan, score
 from pipeline.stages.base import metadata
 from pipeline.studies import accuracy
-from pipeline.studies import settings as knobs
+from pipeline.studies import settings as study_settings
 from pipeline.world.mesh import World, write_ply
 
 NASTY = '<b>&"x'
@@ -101,22 +105,22 @@ def finished(folder, sites=SITES, counts=lane, record=True, **keys):
 
 
 def a_record(seconds=1.25):
-    said = {
-        "vehicles": {"fewest": 3, "most": 5, "different": 1234}, "mean_speed_m_s": 5.0, "share_standing": 0.25, "collisions": 7,
-        "frames_with_overlap": 2, "longest_standing_s": 12.5, "sumo": "9.8.7", "sumo_seconds": 77.77, "notes": ["<i>late</i>"],
+    traffic = {
+        "vehicles": {"fewest": 3, "most": 5, "different": 1234}, "mean_speed_m_s": 5.0, "share_standing": 0.25,
+        "collisions": 7, "frames_with_overlap": 2, "longest_standing_s": 12.5, "sumo": "9.8.7",
+        "sumo_seconds": 77.77, "notes": ["<i>late</i>"],
     }  # fmt: skip
     stage = {
         "inputs": "",
         "artefacts": {"tpog.parquet": "ab" * 32},
-        "said": {},
+        "summary": {},
         "cost": {"seconds": seconds, "peak_mb": 512.0},
     }
     statics = {"triangles": 36, "built": {"tree_crown": 1}, "mended": {}, "left_out": {"lines": 4}}
     return {
-        "effects": [],
         "stages": {
-            "traffic": stage | {"said": said, "artefacts": {}},
-            "statics": stage | {"said": statics, "artefacts": {}},
+            "traffic": stage | {"summary": traffic, "artefacts": {}},
+            "statics": stage | {"summary": statics, "artefacts": {}},
             "tpog": stage,
         },
     }
@@ -201,14 +205,14 @@ def test_every_figure_says_what_it_shows(made):
     drawn = [values for tag, values in Reader(made[2]).tags if tag == "svg"]
     assert len(drawn) == 7
     assert all(values["role"] == "img" and values["aria-label"] for values in drawn)
-    rows = results.read_scores(made[1] / "scores.parquet").to_pylist()
+    rows = read_scores(made[1] / "scores.parquet").to_pylist()
     best = next(row for row in rows if row["rank"] == 1)
     assert any(f"{best['entropy_seen']:.1%}" in values["aria-label"] for values in drawn)
 
 
 def test_the_figures_are_files_of_their_own(made):
     for figure in re.findall(r"<svg.*?</svg>", made[2], re.DOTALL):
-        root = ET.fromstring(figures.standalone(figure))
+        root = ET.fromstring(plan.standalone(figure))
         assert root.tag == "{http://www.w3.org/2000/svg}svg"
 
 
@@ -235,7 +239,7 @@ def test_whatever_is_shown_is_an_input(made, tmp_path):
     about, out, _ = made
     before = report.inputs(about, out)
     changed = a_record()
-    changed["stages"]["traffic"]["said"]["collisions"] = 8
+    changed["stages"]["traffic"]["summary"]["collisions"] = 8
     (tmp_path / "out").mkdir()
     for name in ("tpog.parquet", "scores.parquet", "scans.parquet", "statics.ply"):
         shutil.copy(out / name, tmp_path / "out")
@@ -257,7 +261,7 @@ def test_it_is_the_same_without_kept_scans(tmp_path):
 def test_ranking_holds_every_site_and_equal_scores_share_a_rank(tmp_path):
     about, out = finished(tmp_path, sites=[*SITES, ("twin", 6, 9, 2)])
     read = Reader(page(about, out))
-    for row in results.read_scores(out / "scores.parquet").to_pylist():
+    for row in read_scores(out / "scores.parquet").to_pylist():
         shown = next(r for r in read.rows if f"|{row['site']}|" in r)
         assert f"{row['egvs']:,.0f}|" in shown and f"{row['entropy_seen']:.1%}|" in shown
         twins = row["site"] in ("north", "twin")
@@ -265,7 +269,7 @@ def test_ranking_holds_every_site_and_equal_scores_share_a_rank(tmp_path):
 
 
 def test_headline_names_the_best_and_its_lead(made):
-    rows = sorted(results.read_scores(made[1] / "scores.parquet").to_pylist(), key=lambda row: row["rank"])
+    rows = sorted(read_scores(made[1] / "scores.parquet").to_pylist(), key=lambda row: row["rank"])
     text = Reader(made[2]).text
     assert f"{rows[0]['site']} is the best of 4 sites: it sees {rows[0]['entropy_seen']:.1%}" in text
     assert f"leads {rows[1]['site']}, the next, by {1 - rows[1]['egvs'] / rows[0]['egvs']:.1%}" in text
@@ -273,9 +277,9 @@ def test_headline_names_the_best_and_its_lead(made):
 
 def test_what_sites_see_agrees_with_their_scores(made):
     about, out, text = made
-    tpog = results.read_tpog(out / "tpog.parquet")
+    tpog = read_tpog(out / "tpog.parquet")
     field = EntropyField.of(tpog.counts, tpog.frames, tpog.grid)
-    rows = {row["site"]: row for row in results.read_scores(out / "scores.parquet").to_pylist()}
+    rows = {row["site"]: row for row in read_scores(out / "scores.parquet").to_pylist()}
     for name, hits in visibility.hits_of(about, out, tpog.grid, ["north", "west"]):
         crossed = hits.ravel()[field.cells] > 0
         assert field.per_cell_bit[crossed].sum() / field.per_cell_bit.sum() == pytest.approx(rows[name]["entropy_seen"])
@@ -283,9 +287,9 @@ def test_what_sites_see_agrees_with_their_scores(made):
             assert f"sees {crossed.sum():,} of {len(crossed):,} uncertain voxels" in text
 
 
-def test_record_is_told(made):
+def test_the_record_is_shown(made):
     text = Reader(made[2]).text
-    for said in (
+    for shown in (
         "3 to 5",
         "1,234",
         "5 m/s (18 km/h)",
@@ -297,15 +301,15 @@ def test_record_is_told(made):
         "512 MB",
         "ab" * 32,
     ):
-        assert said in text
+        assert shown in text
 
 
 def test_effects_are_named_and_no_longer_left_out(made):
     about, out, text = made
     assert "Effects none" in Reader(text).text and "fog" in text
-    record = a_record() | {"effects": ["fog", "moving_occlusion"]}
-    shown = report._page(about, report.Ranking.of(results.read_scores(out / "scores.parquet").to_pylist(), out),
-                         results.read_tpog(out / "tpog.parquet"), report.Drawn("", "", (), "", ()), record, "")  # fmt: skip
+    foggy = about.with_effects({"fog": {"visibility_m": 100}, "moving_occlusion": {}})
+    ranking, tpog = Ranking.read(out / "scores.parquet"), read_tpog(out / "tpog.parquet")
+    shown = report.page(foggy, ranking, tpog, Figures("", "", (), "", ()), RunRecord.read(out), None)
     assert "this run models fog, moving occlusion. Left out are rain, " in Reader(shown).text
 
 
@@ -350,13 +354,13 @@ def test_no_record_no_costs(tmp_path):
     about, out = finished(tmp_path, record=False)
     read = Reader(page(about, out))
     assert any(row.strip("|").startswith("traffic|–|") for row in read.rows)
-    (out / "run.json").write_text(json.dumps({"stages": {"scan": {"artefacts": {}, "said": {}}}}))
+    (out / "run.json").write_text(json.dumps({"stages": {"scan": {"artefacts": {}, "summary": {}}}}))
     assert Reader(page(about, out)).text == read.text
 
 
 def test_a_far_site_is_on_the_map(tmp_path):
     about, out = finished(tmp_path, sites=[*SITES, ("far", 40, 30, 5)])
-    x0, y0, x1, y1 = figures.extent(about.roi.grid, [Spot("far", 40, 30, 5, 1.0, 1)])
+    x0, y0, x1, y1 = plan.extent(about.roi.grid, [MapSite("far", 40, 30, 5, 1.0, 1)])
     assert x0 < 0 and y0 < 0 and x1 > 40 and y1 > 30
     assert "far" in Reader(page(about, out)).text
 
@@ -366,7 +370,7 @@ def test_five_hundred_sites(tmp_path):
     about, out = finished(tmp_path, sites=sites)
     text = page(about, out)
     read = Reader(text)
-    rows = sorted(results.read_scores(out / "scores.parquet").to_pylist(), key=lambda row: row["rank"])
+    rows = sorted(read_scores(out / "scores.parquet").to_pylist(), key=lambda row: row["rank"])
     shown = [row for row in read.rows if re.search(r"\|g\d{3}\|", f"|{row}")]
     assert len(shown) == 35 and "465 more sites" in read.text
     assert f"|{rows[-1]['site']}|" in shown[-1]
@@ -401,7 +405,7 @@ def test_north_is_up_and_east_is_right():
     grid = Grid((0.0, 0.0, 0.0), 1.0, (4, 3, 1))
     field = np.zeros((4, 3))
     field[3, 2], field[0, 0] = 4.0, 1.0
-    drawn = figures.occupancy(grid, field, "voxels", (), [Spot("a", 0, 0, 1, 1.0, 1)], "")
+    drawn = maps.occupancy(grid, field, "voxels", (), [MapSite("a", 0, 0, 1, 1.0, 1)], "")
     for png in re.findall(r'href="([^"]+)"', drawn):
         index = decoded(png)
         assert index.shape == (3, 4) and index[0, 3] == 254 and index[2, 0] == 1 + 253.999 // 2
@@ -411,14 +415,14 @@ def test_north_is_up_and_east_is_right():
 def test_large_grids_are_averaged():
     field = np.zeros((1300, 700))
     field[:2, :2] = 3.0
-    smaller = figures._fewer(field, np.mean)
+    smaller = raster.shrunk(field, np.mean)
     assert smaller.shape == (650, 350) and smaller[0, 0] == 3.0 and smaller.sum() == 3.0
 
 
 def test_names_do_not_hide_one_another():
-    spots = [Spot(f"c{n:02}", 5.0 * n, 50.0, 2.0, 100.0 - n, n + 1) for n in range(8)]
+    candidates = [MapSite(f"c{n:02}", 5.0 * n, 50.0, 2.0, 100.0 - n, n + 1) for n in range(8)]
     grid = Grid((0.0, 0.0, 0.0), 0.5, (200, 100, 4))
-    drawn = figures.site_map(grid, np.zeros((200, 100)), (), spots, "")
+    drawn = maps.site_map(grid, np.zeros((200, 100)), (), candidates, "")
     labels = [(float(x), float(y)) for x, y in re.findall(r'class="label" x="([\d.]+)" y="([\d.]+)"', drawn)]
     assert len(labels) == 8
     for i, (x, y) in enumerate(labels):
@@ -427,32 +431,31 @@ def test_names_do_not_hide_one_another():
 
 
 def test_sites_at_one_place_are_rings_and_the_best_is_inside():
-    spots = [
-        Spot("low", 5.0, 5.0, 2.0, 10.0, 2),
-        Spot("high", 5.0, 5.0, 4.0, 20.0, 1),
-        Spot("else", 9.0, 9.0, 4.0, 5.0, 3),
+    candidates = [
+        MapSite("low", 5.0, 5.0, 2.0, 10.0, 2),
+        MapSite("high", 5.0, 5.0, 4.0, 20.0, 1),
+        MapSite("else", 9.0, 9.0, 4.0, 5.0, 3),
     ]
-    drawn = figures.site_map(Grid((0.0, 0.0, 0.0), 0.5, (20, 20, 4)), np.zeros((20, 20)), (), spots, "")
+    drawn = maps.site_map(Grid((0.0, 0.0, 0.0), 0.5, (20, 20, 4)), np.zeros((20, 20)), (), candidates, "")
     both = re.search(r'<g class="site first">.*?</g>', drawn).group()
     radii = [(float(r), int(q)) for q, r in re.findall(r'class="q(\d+)".*?r="([\d.]+)"', both)]
     assert len(radii) == 2 and radii[0][0] > radii[1][0] and radii[1][1] == 16
     assert "high, low" in drawn and "height 4 m; low" in both
 
 
-def test_footprints_are_outlines_without_inner_edges():
-    layers = {layer.look: layer for layer in figures.footprints(world(), (0.0, 0.0, 12.0, 8.0))}
-    assert {look: layer.kinds for look, layer in layers.items()} == {
+def test_outlines_have_no_inner_edges():
+    outlines = {group.look: group for group in outlines_of(world(), (0.0, 0.0, 12.0, 8.0))}
+    assert {look: group.kinds for look, group in outlines.items()} == {
         "large": ("building",), "small": ("pole",), "green": ("tree crown",),
     }  # fmt: skip
-    assert [len(ring) for ring in layers["large"].rings] == [5], "a rectangle: its triangles are united"
+    assert [len(ring) for ring in outlines["large"].rings] == [5], "a rectangle: its triangles are united"
 
 
-def test_footprints_are_cut_to_what_is_shown():
-    (layer,) = figures.footprints(world(), (9.0, 5.0, 10.0, 8.0))
-    assert isinstance(layer, Layer)
-    assert layer.rings[0][:, 0].min() >= 8.0 and layer.rings[0][:, 0].max() <= 11.0
+def test_outlines_are_cut_to_what_is_shown():
+    (buildings,) = outlines_of(world(), (9.0, 5.0, 10.0, 8.0))
+    assert buildings.rings[0][:, 0].min() >= 8.0 and buildings.rings[0][:, 0].max() <= 11.0
     empty = World(np.empty((0, 3)), np.empty((0, 3), dtype=np.int32), np.empty(0, dtype=np.int32), ())
-    assert figures.footprints(empty, (0.0, 0.0, 1.0, 1.0)) == ()
+    assert outlines_of(empty, (0.0, 0.0, 1.0, 1.0)) == ()
 
 
 @pytest.mark.parametrize(
@@ -466,14 +469,14 @@ def test_footprints_are_cut_to_what_is_shown():
     ],
 )
 def test_ticks_are_round(low, high, texts):
-    assert [text for _, text in figures._nice(low, high, 5)] == texts
+    assert [text for _, text in plan.round_values(low, high, 5)] == texts
 
 
 def test_the_accuracy_study_is_shown_where_there_is_one(mini, tmp_path, egvs, monkeypatch):
     """Its recommendation, the front, the figure; not of another scenario or other files; the run is verified in each
     case."""
-    monkeypatch.setattr(knobs, "VOXELS_M", (1.0,))
-    monkeypatch.setattr(knobs, "GAMMAS", (2.0,))
+    monkeypatch.setattr(study_settings, "VOXELS_M", (1.0,))
+    monkeypatch.setattr(study_settings, "GAMMAS", (2.0,))
     monkeypatch.setattr(accuracy, "REPEATS", 1)
     own = accuracy._judged
 
@@ -518,7 +521,7 @@ def test_the_accuracy_study_is_shown_where_there_is_one(mini, tmp_path, egvs, mo
     assert not shown()  # nor is it of other sites
 
 
-def test_a_study_that_was_replaced_is_told_by_verify(mini, tmp_path, egvs):
+def test_a_study_that_was_replaced_is_named_by_verify(mini, tmp_path, egvs):
     out = tmp_path / "out"
     assert egvs("run", mini, "--out", out)[0] == 0
     assert egvs("accuracy", mini, "--out", out, "--budget", "0.001s")[0] == 0

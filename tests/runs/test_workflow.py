@@ -284,12 +284,13 @@ def test_a_ranking_fits_the_terminal(mini: Path, tmp_path: Path, width: int) -> 
     """No number is cut, on the narrowest terminal too."""
     from rich.console import Console
 
-    from pipeline.cli import screen as show
+    from pipeline.cli.ranking_table import ranking_table
+    from pipeline.report.ranking import ScoredSite
 
     pipeline.run(pipeline.load(mini), tmp_path)
     rows = pipeline.read_scores(tmp_path / "scores.parquet").to_pylist()
     console = Console(width=width, record=True, file=io.StringIO())
-    console.print(show.ranking(rows, width))
+    console.print(ranking_table([ScoredSite(**row) for row in rows], width))
     text = console.export_text()
     assert "…" not in text
     assert all(len(line) <= width for line in text.splitlines())

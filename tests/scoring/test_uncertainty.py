@@ -14,9 +14,11 @@ import pytest
 
 import pipeline
 from pipeline.artefacts import tables
-from pipeline.cli import screen as show
+from pipeline.artefacts.readers import SEPARABLE
+from pipeline.cli.ranking_table import ranking_table
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Grid
+from pipeline.report.ranking import ScoredSite
 from pipeline.scoring import uncertainty
 from pipeline.scoring.egvs import EntropyField, binary_entropy
 from pipeline.scoring.uncertainty import Estimate, LeaveOut
@@ -185,7 +187,7 @@ def test_scores_say_how_sure_they_are(mini: Path, tmp_path: Path) -> None:
     rows = pipeline.read_scores(tmp_path / "out" / "scores.parquet").to_pylist()
     assert all(row["egvs_se"] > 0 and row["egvs_bias"] < 0 for row in rows)
     assert sorted(row["beats_next"] for row in rows)[-1] == 1.0
-    assert record["stages"]["score"]["said"]["standard_errors_from"] == "4 groups of 10 frames"
+    assert record["stages"]["score"]["summary"]["standard_errors_from"] == "4 groups of 10 frames"
     leave_out = LeaveOut.of(tmp_path / "out" / "tpog.parquet", pipeline.read_tpog(tmp_path / "out" / "tpog.parquet"))
     assert leave_out is not None
     visibility = Visibility(scenario, tmp_path / "out", scenario.roi.grid)
@@ -228,7 +230,7 @@ def test_without_errors_the_scores_are_the_same(mini: Path, tmp_path: Path, chan
     table, plain = (pipeline.read_scores(tmp_path / name / "scores.parquet") for name in ("with", "without"))
     assert set(table.column_names) - set(plain.column_names) == {"egvs_se", "egvs_bias", "beats_next"}
     assert table.select(plain.column_names) == plain
-    assert show.ranking(plain.to_pylist()).caption is None
+    assert ranking_table(ScoredSite.all_of(plain)).caption is None
 
 
 def test_the_ranking_marks_neighbours_that_are_not_separable(mini: Path, tmp_path: Path, egvs) -> None:
@@ -238,7 +240,7 @@ def test_the_ranking_marks_neighbours_that_are_not_separable(mini: Path, tmp_pat
     assert "~ " in printed
     assert "not separable" in printed
     rows = tables.read(tmp_path / "out" / "scores.parquet", "scores")[0].to_pylist()
-    unsure = [row["site"] for row in rows if row["beats_next"] < show.SEPARABLE]
+    unsure = [row["site"] for row in rows if row["beats_next"] < SEPARABLE]
     assert set(unsure) & {"pole_a", "pole_c"}
 
 

@@ -1,0 +1,57 @@
+"""Options that several verbs share, and values that are more than a number or a path."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline.core.errors import InputError
+
+ScenarioPath = Annotated[Path, typer.Argument(metavar="SCENARIO", help="A folder with a scenario.toml, or the file.")]
+Out = Annotated[
+    Path | None, typer.Option("--out", metavar="DIR", help="The run's folder; runs/<scenario name> by default.")
+]
+Set = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override one value, e.g. traffic.frames=500.")
+]
+Jobs = Annotated[
+    int | None, typer.Option("--jobs", min=1, help="Threads; one a core by default. Results do not depend on it.")
+]
+Audit = Annotated[bool, typer.Option("--audit", help="Check every beam's chords, and print the worst case.")]
+
+
+def duration_s(text: str) -> float:
+    """``--budget``: seconds from 90s, 10m or 1.5h."""
+    units = {"s": 1.0, "m": 60.0, "h": 3600.0, "": 1.0}
+    match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)([smh]?)", text)
+    seconds = float(match[1]) * units[match[2]] if match else 0.0
+    if not 0 < seconds < float("inf"):
+        raise InputError("--budget", repr(text), "a time above 0 with one unit, for example 90s, 10m or 1.5h")
+    return seconds
+
+
+def host_and_port(text: str) -> tuple[str, int]:
+    """``--traci``: HOST:PORT."""
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdigit() or not 0 < int(port) < 65536:
+        raise InputError("--traci", repr(text), "HOST:PORT, for example localhost:8813")
+    return host, int(port)
+
+
+def latitude_and_longitude(text: str) -> tuple[float, float]:
+    """``--at``: LAT,LON in degrees."""
+    try:
+        lat, lon = (float(part) for part in text.split(","))
+    except ValueError:
+        raise InputError("--at", repr(text), "LAT,LON in degrees, for example 50.8704,9.7080") from None
+    return lat, lon
+
+
+def command(verb: str, scenario: Path, set_: list[str] | None, out: Path | None = None) -> str:
+    """A command that the user can type."""
+    words = ["egvs", verb, str(scenario), *(word for one in set_ or () for word in ("--set", one))]
+    return shlex.join([*words, "--out", str(out)] if out is not None else words)

@@ -1,0 +1,77 @@
+"""How far a run is: a progress bar on a terminal, plain lines elsewhere. All of it goes to standard error; standard
+output carries results."""
+
+from __future__ import annotations
+
+import sys
+from types import TracebackType
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from pipeline.cli.terminal import in_words
+
+
+class Screen:
+    """Shows a run as it goes on.
+
+    Attributes
+    ----------
+    any_stage_ran
+        False as long as every stage was skipped.
+    """
+
+    def __init__(self, verb: str = "") -> None:
+        self.any_stage_ran = False
+        self._stage = verb
+        self._console = Console(stderr=True, highlight=False, soft_wrap=True)
+        self._bar = Progress(
+            TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=self._console, transient=True
+        )
+        self._task = self._bar.add_task("", total=None, visible=False)
+        self._has_bar = sys.stderr.isatty()
+
+    def __enter__(self) -> Screen:
+        if self._has_bar:
+            self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._has_bar:
+            self._bar.stop()
+
+    def progress(self, what: str, done: int, total: int) -> None:
+        """A :data:`pipeline.core.progress.Progress`."""
+        if self._has_bar:
+            count = f"{done}/{total}" if total else str(done)
+            self._bar.update(self._task, description=f"{self._stage}: {what} {count}", completed=done, visible=True)
+            self._bar.tasks[0].total = total or None  # update() takes None for "as it was"
+
+    def stage_event(self, stage: str, state: str, record: dict[str, Any]) -> None:
+        """A stage "runs", or is "done" or "skipped": one line when it ends."""
+        self._stage = stage
+        if state == "runs":
+            self.any_stage_ran = True
+            if self._has_bar:
+                self._bar.update(self._task, description=stage, completed=0, visible=True)
+                self._bar.tasks[0].total = None
+            return
+        if self._has_bar:
+            self._bar.update(self._task, visible=False)
+        took = "unchanged" if state == "skipped" else f"{record['cost']['seconds']:.2f} s"
+        summary = {key: value for key, value in record["summary"].items() if key != "flags"}
+        self._print(f"{stage:<8} {took:>10}   {in_words(summary)}")
+
+    def setting_event(self, name: str, state: str, about: dict[str, Any]) -> None:
+        """A setting of an accuracy study is "done", "kept" or "skipped": one line. What the budget leaves out is
+        printed at the end."""
+        if about.get("beyond"):
+            return
+        took = f"{about['seconds']:.2f} s" if "seconds" in about else state
+        self._print(f"{took:>10}   {name}{' (kept)' if state == 'kept' else ''} {about.get('why', '')}")
+
+    def _print(self, line: str) -> None:
+        self._console.print(line, markup=False)

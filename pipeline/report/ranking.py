@@ -1,0 +1,129 @@
+"""The ranking of the sites: their order, the best, those that come close, the extremes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, fields
+from functools import cached_property
+from pathlib import Path
+
+import pyarrow as pa
+
+from pipeline.artefacts.readers import SEPARABLE, read_scores
+from pipeline.core.errors import InputError
+from pipeline.report.plan import MapSite
+
+CLOSE = 0.01
+"""Sites within this share of the best score are named beside it."""
+
+
+@dataclass(frozen=True)
+class ScoredSite:
+    """A row of ``scores.parquet``; see its schema for units.
+
+    ``egvs_se``, ``egvs_bias`` and ``beats_next`` are None where no standard errors were computed."""
+
+    site: str
+    x_m: float
+    y_m: float
+    z_m: float
+    yaw_deg: float
+    pitch_deg: float
+    roll_deg: float
+    sensor: str
+    egvs: float
+    egvs_limit: float
+    rank: int
+    beams: int
+    beams_in_roi: int
+    returns: int
+    entropy_seen: float
+    egvs_se: float | None = None
+    egvs_bias: float | None = None
+    beats_next: float | None = None
+
+    @classmethod
+    def all_of(cls, scores: pa.Table) -> tuple[ScoredSite, ...]:
+        """The rows of ``scores.parquet``, in its order."""
+        names = [column.name for column in fields(cls) if column.name in scores.column_names]
+        return tuple(cls(**row) for row in scores.select(names).to_pylist())
+
+    @property
+    def is_separable(self) -> bool:
+        """Whether the site is told apart from the one below it, as far as is known."""
+        return self.beats_next is None or self.beats_next >= SEPARABLE
+
+    @property
+    def relative_se(self) -> float | None:
+        """The standard error as a share of the score; None where either is not known or 0."""
+        return self.egvs_se / self.egvs if self.egvs_se is not None and self.egvs > 0 else None
+
+    @property
+    def on_map(self) -> MapSite:
+        """As the maps want it."""
+        return MapSite(self.site, self.x_m, self.y_m, self.z_m, self.egvs, self.rank)
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """Sites by rank, those of equal rank in the order of the sites.
+
+    Attributes
+    ----------
+    sites
+        At least one.
+    best
+        Those of rank 1.
+    close
+        Those that follow within ``CLOSE`` of the best score.
+    """
+
+    sites: tuple[ScoredSite, ...]
+    best: tuple[ScoredSite, ...]
+    close: tuple[ScoredSite, ...]
+
+    @classmethod
+    def read(cls, path: Path) -> Ranking:
+        """From ``scores.parquet``; InputError when it holds no site."""
+        scored = ScoredSite.all_of(read_scores(path))
+        if not scored:
+            raise InputError(path, "holds no site", "at least one; run the score stage again")
+        sites = tuple(sorted(scored, key=lambda s: s.rank))
+        best = tuple(s for s in sites if s.rank == 1)
+        near = (1 - CLOSE) * best[0].egvs
+        return cls(sites, best, tuple(s for s in sites if s.rank > 1 and s.egvs >= near > 0))
+
+    @property
+    def last(self) -> ScoredSite:
+        """The worst site."""
+        return self.sites[-1]
+
+    @property
+    def is_tie(self) -> bool:
+        """Whether no site is better than another."""
+        return len(self.best) == len(self.sites)
+
+    @property
+    def extremes(self) -> tuple[ScoredSite, ...]:
+        """The best and the worst site; one where they score the same."""
+        return self.sites[:1] if self.is_tie else (self.sites[0], self.last)
+
+    @property
+    def has_errors(self) -> bool:
+        """Whether standard errors were computed."""
+        return self.sites[0].egvs_se is not None
+
+    @cached_property
+    def shared_ranks(self) -> set[int]:
+        """Ranks that several sites have."""
+        return {rank for rank, count in Counter(s.rank for s in self.sites).items() if count > 1}
+
+    @property
+    def on_map(self) -> list[MapSite]:
+        """As the maps want it."""
+        return [site.on_map for site in self.sites]
+
+    def of_best(self, site: ScoredSite) -> float:
+        """A score as a share of the best one; 0 where that is 0."""
+        top = self.best[0].egvs
+        return site.egvs / top if top > 0 else 0.0

@@ -1,0 +1,81 @@
+"""The sentences and numbers of the report, in plain words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from pipeline.report.ranking import CLOSE, Ranking, ScoredSite
+
+
+def headline(ranking: Ranking, has_traffic: bool) -> str:
+    """The outcome in one sentence."""
+    best, others = ranking.best, len(ranking.sites) - 1
+    top = best[0]
+    if not has_traffic:
+        return "No traffic in the region: the sites cannot be ranked"
+    if not top.egvs > 0:
+        return "No site sees anything of the traffic" if others else f"{top.site} sees nothing of the traffic"
+    sees = f"sees {share(top.entropy_seen)} of the traffic’s uncertainty"
+    if not others:
+        return f"{top.site}, the only site, {sees}"
+    if ranking.is_tie:
+        same = f"All {len(best)} sites score the same"
+        return f"{same}: each {sees}" if _see_the_same(best) else same
+    if len(best) > 1:
+        few = len(best) <= 4
+        names = ", ".join(s.site for s in best[:-1]) if few else f"{top.site} and {len(best) - 2} others"
+        return f"{names} and {best[-1].site} share the first place of {others + 1}: {top.site} {sees}"
+    return f"{top.site} is the best of {others + 1} sites: it {sees}"
+
+
+def _see_the_same(sites: Sequence[ScoredSite]) -> bool:
+    return len({s.entropy_seen for s in sites}) == 1
+
+
+def lead(ranking: Ranking) -> str:
+    """By how much the best leads, and who comes close; nothing where nobody leads."""
+    if ranking.is_tie or not ranking.best[0].egvs > 0:
+        return ""
+    second = ranking.sites[len(ranking.best)]
+    behind = 1 - ranking.of_best(second)
+    by = f"{behind:.1%}" if behind >= 0.0005 else "less than 0.1%"
+    subject, whose = ("It leads", "its") if len(ranking.best) == 1 else ("They lead", "their")
+    text = f"{subject} {second.site}, the next, by {by} of {whose} score."
+    if not ranking.best[0].is_separable:
+        text += " With this much traffic the two cannot be told apart."
+    if len(ranking.close) > 1:
+        names = ", ".join(s.site for s in ranking.close[:4])
+        more = f" and {len(ranking.close) - 4} more" if len(ranking.close) > 4 else ""
+        text += f" Within {CLOSE:.0%} of the best are {len(ranking.close)} others: {names}{more}."
+    return text
+
+
+def share_of_limit(site: ScoredSite) -> float | None:
+    """A score as a share of what no site could exceed."""
+    limit = site.egvs_limit
+    return site.egvs / limit if limit > 0 and math.isfinite(limit) else None
+
+
+def share(value: float) -> str:
+    """A share in per cent."""
+    return f"{value:.1%}"
+
+
+def whole(value: float) -> str:
+    """A number without decimals, thousands apart."""
+    return f"{value:,.0f}"
+
+
+def plain(value: float) -> str:
+    """A number as a person would write it."""
+    return f"{value:,.2f}".rstrip("0").rstrip(".")
+
+
+def duration(seconds: float) -> str:
+    """A time in hours, minutes and seconds."""
+    minutes, rest = divmod(round(seconds), 60)
+    if not minutes:
+        return f"{seconds:g} s"
+    hours, minutes = divmod(minutes, 60)
+    return " ".join(f"{n} {unit}" for n, unit in ((hours, "h"), (minutes, "min"), (rest, "s")) if n)
