@@ -1,0 +1,79 @@
+"""A scorer gives any scan the score that the score stage would, on any thread and in any process."""
+
+from __future__ import annotations
+
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+import pipeline
+from pipeline.core.errors import InputError
+from pipeline.scoring.scorer import Scorer
+from pipeline.sensing.scanner import Scanner
+from pipeline.sensing.sites import Pose
+
+OCCLUSION = 'effects.moving_occlusion.method="frames"'
+
+
+@pytest.fixture(params=[[], ["effects.rain.rate_mm_h=30"], [OCCLUSION]], ids=["plain", "rain", "occlusion"])
+def run(request, mini, tmp_path):
+    """A scenario, its scene, and the folder of its run."""
+    scenario = pipeline.load(mini, ["score.keep_visibility=all", *request.param])
+    pipeline.run(scenario, tmp_path / "run")
+    return pipeline.build_scene(scenario), tmp_path / "run"
+
+
+def scorer_of(scene, folder) -> Scorer:
+    return Scorer(scene, pipeline.read_tpog(folder / "tpog.parquet"), folder / "trajectories.parquet")
+
+
+def test_it_gives_what_the_stage_wrote(run):
+    scene, folder = run
+    rows = {row["site"]: row for row in pipeline.read_scores(folder / "scores.parquet").to_pylist()}
+    scanner, scorer = Scanner(scene), scorer_of(scene, folder)
+    for site in scene.sites:
+        worth, hits = scorer.score_and_hits(scanner.scan_site(site))
+        assert (worth.egvs, worth.entropy_seen) == (rows[site.name]["egvs"], rows[site.name]["entropy_seen"])
+        assert np.array_equal(hits, pipeline.read_visibility(folder / "visibility.parquet", site.name))
+        assert rows[site.name]["egvs_limit"] == scorer.limit
+
+
+def test_hits_belong_to_the_caller_and_scores_to_no_order(run):
+    scene, folder = run
+    scanner, scorer = Scanner(scene), scorer_of(scene, folder)
+    first, second = (scanner.scan_site(site) for site in scene.sites)
+    hits = scorer.hits(first)
+    kept, score = hits.copy(), scorer.score(first)
+    scorer.hits(second)[:] = -1.0
+    assert np.array_equal(hits, kept) and scorer.score(first) == score
+
+
+def test_threads_and_other_processes_get_the_same(run):
+    scene, folder = run
+    scanner, scorer = Scanner(scene), scorer_of(scene, folder)
+    scans = [scanner.scan(Pose(8.0 + i, 14.0, 3.0), scene.sensor("small")) for i in range(12)]
+    alone = [scorer_of(scene, folder).score(scan) for scan in scans]
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(scorer.score, scans)) == alone
+    again = pickle.loads(pickle.dumps(scorer))
+    assert [again.score(scan) for scan in scans] == alone
+
+
+def test_traffic_to_replay_must_be_named(mini, tmp_path):
+    scenario = pipeline.load(mini, [OCCLUSION])
+    pipeline.run(scenario, tmp_path)
+    with pytest.raises(InputError, match="no trajectories to replay"):
+        Scorer(pipeline.build_scene(scenario), pipeline.read_tpog(tmp_path / "tpog.parquet"))
+
+
+def test_a_new_pose_is_hidden_by_vehicles_that_no_site_has_before_it(mini, tmp_path):
+    """Boxes are left out that lie outside the region of interest and the sensor: for each sensor anew."""
+    scenario = pipeline.load(mini, [OCCLUSION])
+    pipeline.run(scenario, tmp_path)
+    scene = pipeline.build_scene(scenario)
+    far = Pose(-12.0, -2.0, 1.0)  # behind the car that comes along y = -2, beyond every site
+    scan = Scanner(scene).scan(far, scene.sensor("small"))
+    plain = Scorer(pipeline.build_scene(pipeline.load(mini)), pipeline.read_tpog(tmp_path / "tpog.parquet"))
+    assert 0 < scorer_of(scene, tmp_path).score(scan).egvs < plain.score(scan).egvs
