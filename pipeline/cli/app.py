@@ -88,7 +88,9 @@ def run(scenario: ScenarioPath, out: Out = None, set_: Set = None, jobs: Jobs = 
     folder = out or workflow.default_folder(resolved)
     with show.Screen() as screen:
         extra = {"score": {"audit": True}} if audit else None
-        record = workflow.run(resolved, folder, jobs=jobs, progress=screen.progress, told=screen.told, options=extra)
+        record = workflow.run(
+            resolved, folder, jobs=jobs, progress=screen.progress, listener=screen.told, options=extra
+        )
     screen.result(folder, record)
 
 
@@ -103,7 +105,7 @@ def _one(
     folder = out or workflow.default_folder(resolved)
     with show.Screen() as screen:
         record = workflow.run_one(
-            stage, resolved, folder, jobs=jobs, progress=screen.progress, told=screen.told, **extra
+            stage, resolved, folder, jobs=jobs, progress=screen.progress, listener=screen.told, **extra
         )
     screen.stage(folder, stage, record)
 
@@ -179,7 +181,7 @@ def verify(
     from pipeline.runs import workflow
 
     with show.Screen() as screen:
-        wrong = workflow.verify(folder, scenario, jobs=jobs, progress=screen.progress, told=screen.told)
+        wrong = workflow.verify(folder, scenario, jobs=jobs, progress=screen.progress, listener=screen.told)
     screen.verdict(folder, wrong)
     if wrong:
         raise typer.Exit(1)

@@ -20,6 +20,7 @@ from pipeline.artefacts.readers import SEPARABLE
 from pipeline.sensing.sensors import Sensor
 
 if TYPE_CHECKING:
+    from pipeline.runs.record import RunRecord, StageRecord
     from pipeline.studies.accuracy import Row, Seeds, Study
     from pipeline.studies.effects import Call, Change, Price
 
@@ -59,20 +60,20 @@ class Screen:
             self._bar.update(self._task, description=f"{self._stage}: {what} {count}", completed=done, visible=True)
             self._bar.tasks[0].total = total or None  # update() takes None for "as it was"
 
-    def told(self, stage: str, state: str, record: dict[str, Any]) -> None:
-        """A :data:`pipeline.runs.workflow.Told`."""
+    def told(self, stage: str, state: str, record: StageRecord | None) -> None:
+        """A :data:`pipeline.runs.workflow.StageListener`."""
         self._stage = stage
-        if state == "runs":
-            self._ran = True
+        self._ran = self._ran or state != "skipped"
+        if record is None:
             if self._lively:
                 self._bar.update(self._task, description=stage, completed=0, visible=True)
                 self._bar.tasks[0].total = None
             return
         if self._lively:
             self._bar.update(self._task, visible=False)
-        took = "unchanged" if state == "skipped" else f"{record['cost']['seconds']:.2f} s"
+        took = {"skipped": "unchanged", "fetched": "from store"}.get(state) or f"{record.cost.seconds:.2f} s"
         self._err.print(
-            f"{stage:<8} {took:>10}   {_in_words({k: v for k, v in record['said'].items() if k != 'flags'})}",
+            f"{stage:<8} {took:>10}   {_in_words({k: v for k, v in record.summary.items() if k != 'flags'})}",
             markup=False,
         )
 
@@ -85,30 +86,29 @@ class Screen:
             f"{took:>10}   {name}{' (kept)' if state == 'kept' else ''} {said.get('why', '')}", markup=False
         )
 
-    def result(self, folder: Path, record: dict[str, Any]) -> None:
+    def result(self, folder: Path, record: RunRecord) -> None:
         """The ranking, the artefacts, and what each stage cost."""
         from pipeline.artefacts.readers import read_scores
 
         self._out.print(ranking(read_scores(folder / "scores.parquet").to_pylist(), self._out.width))
         self._audit(record)
         table = Table("stage", "artefact", "seconds", "peak MB", box=None, pad_edge=False)
-        for stage, done in record["stages"].items():
-            cost = done["cost"]
-            names = "\n".join(str(folder / name) for name in done["artefacts"])
-            table.add_row(stage, names, f"{cost['seconds']:.2f}", f"{cost['peak_mb']:.0f}")
+        for stage, done in record.stages.items():
+            names = "\n".join(str(folder / name) for name in done.artefacts)
+            table.add_row(stage, names, f"{done.cost.seconds:.2f}", f"{done.cost.peak_mb:.0f}")
         self._out.print(table)
         if not self._ran:
             self._out.print("nothing to do: no stage's inputs changed since the last run")
 
-    def stage(self, folder: Path, stage: str, record: dict[str, Any]) -> None:
+    def stage(self, folder: Path, stage: str, record: RunRecord) -> None:
         """What one stage wrote."""
         if stage == "score":
             from pipeline.artefacts.readers import read_scores
 
             self._out.print(ranking(read_scores(folder / "scores.parquet").to_pylist(), self._out.width))
             self._audit(record)
-        done = record["stages"][stage]
-        for name in (*done["artefacts"], *done["said"].get("clouds", ())):
+        done = record.stages[stage]
+        for name in (*done.artefacts, *done.summary.get("clouds", ())):
             self._out.print(str(folder / name), markup=False)
 
     def verdict(self, folder: Path, wrong: list[str]) -> None:
@@ -120,8 +120,8 @@ class Screen:
         for line in wrong:
             self._out.print(f"{folder}: {line}", markup=False)
 
-    def _audit(self, record: dict[str, Any]) -> None:
-        found = record["stages"]["score"]["said"].get("audit")
+    def _audit(self, record: RunRecord) -> None:
+        found = record.stages["score"].summary.get("audit")
         if found:
             self._out.print(
                 f"audit: chords add up to {found['worst_sum']:.1e} of a beam's length at worst, longest piece in no voxel "

@@ -77,7 +77,6 @@ def inputs(scenario: Scenario, out: Path) -> dict[str, Any]:
         "costs": _costs(record),
         "files": {name: files.sha256_of(out / name) for name in (*read, *ACCURACY) if (out / name).is_file()},
         "said": {name: _said(record, name) for name in _STAGES},
-        "effects": record.get("effects", []),
     }
 
 
@@ -303,7 +302,7 @@ def _page(
         lstrip_blocks=True,
     )
     environment.filters |= {"svg": Markup, "share": _share, "whole": lambda value: f"{value:,.0f}", "plain": _plain}
-    rows, effects = ranking.rows, _effects(scenario, record)
+    rows, effects = ranking.rows, _effects(scenario)
     shortened = len(rows) > LISTED
     return environment.get_template("report.html.j2").render(
         study=study,
@@ -337,10 +336,9 @@ def _page(
     )
 
 
-def _effects(scenario: Scenario, record: dict[str, Any]) -> list[str]:
-    """Names of the effects that the scenario or the record names, each once."""
-    noted = [e if isinstance(e, str) else str(e["name"]) for e in record.get("effects", [])]
-    return list(dict.fromkeys([*scenario.effects, *noted]))
+def _effects(scenario: Scenario) -> list[str]:
+    """Names of the effects that the scenario names."""
+    return list(scenario.effects)
 
 
 def _headline(ranking: Ranking, tpog: Tpog) -> str:
@@ -432,7 +430,7 @@ def _stage(record: dict[str, Any], name: str) -> dict[str, Any]:
 
 def _said(record: dict[str, Any], name: str) -> dict[str, Any]:
     """What a stage said of its outcome, without what another run would say differently."""
-    return {key: value for key, value in (_stage(record, name).get("said") or {}).items() if key not in _UNSTABLE}
+    return {key: value for key, value in (_stage(record, name).get("summary") or {}).items() if key not in _UNSTABLE}
 
 
 def _share(value: float) -> str:
