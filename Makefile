@@ -9,9 +9,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --co
 run: $(VENV)/.installed
 	$(BIN)/egvs run scenarios/nishishinjuku
 
-# Compiled kernels are removed first: numba does not notice when a kernel that another one calls has changed.
 test: $(VENV)/.installed-dev
-	@find pipeline/kernels -name '*.nb[ci]' -delete
 	$(BIN)/python -m pytest
 
 lint: $(VENV)/.installed-dev

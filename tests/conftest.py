@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -72,6 +73,22 @@ def fcd() -> str:
         lines.append(f"{t:.2f};east;{t * 2 + 1:.6f};-2.0;90.0;car;2.0")
         lines.append(f"{t:.2f};west;{39 - t * 1.7:.6f};{2 + 0.5 * math.sin(t):.6f};{270 - 5 * math.cos(t):.6f};car;1.7")
     return "\n".join(lines) + "\n"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def store_of_the_session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What fixtures of several tests make is kept here, never in the working tree."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("EGVS_STORE", str(tmp_path_factory.mktemp("store")))
+        yield
+
+
+@pytest.fixture(autouse=True)
+def store(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A store of the test's own: what a test makes with parts of the program replaced must not reach another one."""
+    folder = tmp_path_factory.mktemp("store")
+    monkeypatch.setenv("EGVS_STORE", str(folder))
+    return folder
 
 
 @pytest.fixture

@@ -80,7 +80,7 @@ def run(scenario: ScenarioPath, out: Out = None, set_: Set = None, jobs: Jobs = 
     extra = {"score": {"audit": True}} if audit else None
     with Screen() as screen:
         record = workflow.run(
-            resolved, folder, jobs=jobs, progress=screen.progress, told=screen.stage_event, options=extra
+            resolved, folder, jobs=jobs, progress=screen.progress, listener=screen.stage_event, options=extra
         )
     results.print_run(folder, record, anything_ran=screen.any_stage_ran)
 
@@ -154,7 +154,7 @@ def _run_stage(
     resolved, folder = _resolved(scenario, set_, out)
     with Screen() as screen:
         record = workflow.run_one(
-            stage, resolved, folder, jobs=jobs, progress=screen.progress, told=screen.stage_event, **extra
+            stage, resolved, folder, jobs=jobs, progress=screen.progress, listener=screen.stage_event, **extra
         )
     results.print_stage(folder, stage, record)
 
@@ -176,7 +176,7 @@ def verify(
     from pipeline.runs import workflow
 
     with Screen() as screen:
-        differences = workflow.verify(folder, scenario, jobs=jobs, progress=screen.progress, told=screen.stage_event)
+        differences = workflow.verify(folder, scenario, jobs=jobs, progress=screen.progress, listener=screen.stage_event)
     results.print_verification(folder, differences)
     if differences:
         raise typer.Exit(1)

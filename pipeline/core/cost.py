@@ -1,12 +1,11 @@
-"""What did a piece of work cost?
-
-Wall seconds, and the highest memory that the process held meanwhile (Linux lets the mark be reset; elsewhere it is the
-highest so far)."""
+"""The cost of a piece of work: wall seconds, processor seconds, and the highest memory that the process held meanwhile
+(Linux lets the mark be reset; elsewhere it is the highest so far)."""
 
 from __future__ import annotations
 
 import ctypes
 import gc
+import os
 import resource
 import sys
 import time
@@ -24,12 +23,15 @@ class Cost:
     """Filled when the measured block ends."""
 
     seconds: float = 0.0
+    busy_s: float = 0.0
+    """Seconds that processors worked for this process and those that it waited for (SUMO): other people's work is not
+    in it."""
     peak_mb: float = 0.0
     held_mb: float = 0.0
     """What the process held when the block began; elsewhere than on Linux, the highest until then."""
 
     def to_json(self) -> dict[str, Any]:
-        """Rounded to what such a measurement is worth."""
+        """What a run's record says of it, rounded to what such a measurement is worth."""
         return {"seconds": round(self.seconds, 3), "peak_mb": round(self.peak_mb, 1)}
 
 
@@ -38,11 +40,11 @@ def measured() -> Iterator[Cost]:
     """Measure the block; the yielded cost is filled at its end."""
     cost, resettable = Cost(), _reset()
     cost.held_mb = _status_mb("VmRSS:") if resettable else _peak_so_far_mb()
-    start = time.perf_counter()
+    start, busy = time.perf_counter(), _busy_s()
     try:
         yield cost
     finally:
-        cost.seconds = time.perf_counter() - start
+        cost.seconds, cost.busy_s = time.perf_counter() - start, _busy_s() - busy
         cost.peak_mb = _status_mb("VmHWM:") if resettable else _peak_so_far_mb()
 
 
@@ -55,6 +57,10 @@ def let_go() -> None:
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc's
     if trim is not None:
         trim(0)
+
+
+def _busy_s() -> float:
+    return sum(os.times()[:4])
 
 
 def _reset() -> bool:

@@ -1,46 +1,41 @@
-"""How does a scenario become a ranking?
+"""A scenario becomes a ranking: static world and empty scans, traffic and the TPOG, scores, the report.
 
-:func:`run` is the whole program: static world and empty scans, traffic and the TPOG, scores, the report. A stage whose
-inputs (settings by value, files by hash) are those of the last run, and whose artefacts are still what it wrote, is
-skipped. After each stage ``run.json`` is written anew, so that an interrupted run goes on from the last whole stage.
+:func:`run` is the whole program. A stage whose inputs (settings by value, files by hash, the program's source) are
+those of the last run, and whose artefacts are still what it wrote, is skipped; one that the store knows is fetched from
+there; any other one is made, and kept in the store. After each stage ``run.json`` is written anew, so that an
+interrupted run goes on from the last whole stage.
 
 :func:`verify` runs again what ``run.json`` says and compares every artefact byte for byte.
 """
 
 from __future__ import annotations
 
-import importlib
-import json
 import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from pipeline.core import files
-from pipeline.core.version import __version__
-from pipeline.artefacts import tables
-from pipeline.core.cost import measured
-from pipeline.core.errors import InputError, RunError
+from pipeline.core.errors import InputError
+from pipeline.core.progress import Progress, silent
+from pipeline.runs import stages
+from pipeline.runs.locking import alone
+from pipeline.runs.record import RECORD, RunRecord, StageRecord
+from pipeline.runs.stages import STAGES, Inputs, Made
+from pipeline.runs.store import Store
 from pipeline.scenario.loading import from_values
 from pipeline.scenario.models import Scenario
-from pipeline.core.progress import Progress, silent
 
-STAGES = ("statics", "scan", "traffic", "tpog", "score", "report")
-"""In the order of running. The two branches do not know each other; the quick one comes first, so that a site in a wall
-is told before traffic is simulated."""
-
-RECORD = "run.json"
-
-Told = Callable[[str, str, dict[str, Any]], None]
-"""Called with (stage, "runs" | "done" | "skipped", its record) as a run goes on."""
+StageListener = Callable[[str, str, StageRecord | None], None]
+"""Called with (stage, state, its record) as a run goes on. States: "runs" (no record yet), then "done"; or "skipped"
+(nothing changed), or "fetched" (from the store)."""
 
 
-def _mute(_stage: str, _state: str, _record: dict[str, Any]) -> None:
-    """A :data:`Told` that says nothing."""
+def unheard(_stage: str, _state: str, _record: StageRecord | None) -> None:
+    """A :data:`StageListener` that says nothing."""
 
 
 def run(
@@ -49,10 +44,10 @@ def run(
     *,
     jobs: int | None = None,
     progress: Progress = silent,
-    told: Told = _mute,
+    listener: StageListener = unheard,
     options: dict[str, dict[str, Any]] | None = None,
-) -> dict[str, Any]:
-    """Run every stage whose inputs changed, in order.
+) -> RunRecord:
+    """Bring every stage up to date, in order.
 
     Parameters
     ----------
@@ -63,18 +58,20 @@ def run(
     jobs
         Threads; one a core when None. Results do not depend on it.
     options
-        Further keyword arguments of single stages, e.g. ``{"score": {"audit": True}}``; such a stage is not skipped.
+        Further keyword arguments of single stages, e.g. ``{"score": {"audit": True}}``; such a stage is always run, and
+        not kept in the store.
 
     Returns
     -------
-    dict
+    RunRecord
         What ``run.json`` holds.
     """
     folder = Path(out) if out is not None else default_folder(scenario)
     with alone(folder):
-        record = _read_record(folder, scenario)
+        work = _Work(scenario, folder, Store.default(), jobs, progress, listener)
+        record = RunRecord.going_on(scenario, folder)
         for name in STAGES:
-            run_stage(name, scenario, folder, record, jobs=jobs, progress=progress, told=told, **(options or {}).get(name, {}))
+            record = work.bring(name, record, **(options or {}).get(name, {}))
         return record
 
 
@@ -85,17 +82,16 @@ def run_one(
     *,
     jobs: int | None = None,
     progress: Progress = silent,
-    told: Told = _mute,
+    listener: StageListener = unheard,
     **options: Any,
-) -> dict[str, Any]:
+) -> RunRecord:
     """Run a single stage, whether its inputs changed or not, and note it in ``run.json``."""
     with alone(out):
-        record = _read_record(out, scenario)
-        record["stages"].pop(name, None)
-        run_stage(name, scenario, out, record, jobs=jobs, progress=progress, told=told, **options)
-        for other in [stage for stage in record["stages"] if stage != name and not _is_of(stage, scenario, out, record)]:
-            del record["stages"][other]  # of other settings: the record would contradict itself
-        _write_record(out, record)
+        work = _Work(scenario, out, Store.default(), jobs, progress, listener)
+        record = work.bring(name, RunRecord.going_on(scenario, out), again=True, **options)
+        for other in [stage for stage in record.stages if stage != name and not _is_of(stage, scenario, out, record)]:
+            record = record.having(other, None)  # of other settings: the record would contradict itself
+        record.write(out)
         return record
 
 
@@ -103,32 +99,20 @@ def refresh_report(out: Path) -> Path | None:
     """Draw the report of a whole run anew where something that it shows has changed, an accuracy study say; the
     report's path.
 
-    None, and nothing is done, where there is no whole run. For those who hold the folder (:func:`alone`).
+    None, and nothing is done, where there is no whole run. For those who hold the folder
+    (:func:`pipeline.runs.locking.alone`).
     """
     if not (out / RECORD).is_file():
         return None
-    record = _load_record(out)
-    source = Path(os.path.normpath(out / record["scenario_folder"]))
-    if not all(name in record["stages"] for name in STAGES) or not source.is_dir():
+    record = RunRecord.read(out)
+    source = Path(os.path.normpath(out / record.scenario_folder))
+    if not all(name in record.stages for name in STAGES) or not source.is_dir():
         return None
-    scenario = from_values(record["scenario"], source, str(out / RECORD))
+    scenario = from_values(record.scenario, source, str(out / RECORD))
     if not all(_is_of(name, scenario, out, record) for name in STAGES if name != "report"):
         return None
-    run_stage("report", scenario, out, record, jobs=None, progress=silent, told=_mute)
+    _Work(scenario, out, Store.default(), None, silent, unheard).bring("report", record)
     return out / "report.html"
-
-
-def _is_of(name: str, scenario: Scenario, out: Path, record: dict[str, Any]) -> bool:
-    """Whether a stage's last run is what this scenario, and the artefacts as they are now, would give."""
-    try:
-        return bool(record["stages"][name]["inputs"] == key(name, scenario, out))
-    except InputError:
-        return False
-
-
-def key(name: str, scenario: Scenario, out: Path) -> str:
-    """A hash of everything that a stage's artefacts depend on; ``out`` holds those of the stages before."""
-    return files.hash_of({"egvs": __version__, **_stage(name).inputs(scenario, out)})
 
 
 def default_folder(scenario: Scenario) -> Path:
@@ -136,46 +120,97 @@ def default_folder(scenario: Scenario) -> Path:
     return Path("runs") / scenario.name
 
 
-def run_stage(
+def fetch_or_make(
     name: str,
     scenario: Scenario,
     out: Path,
-    record: dict[str, Any],
+    key: str,
+    store: Store,
+    make: Callable[[], Made],
     *,
-    jobs: int | None,
-    progress: Progress,
-    told: Told,
-    **options: Any,
-) -> None:
-    """Run one stage unless nothing changed; ``record`` (the content of ``run.json``) is brought up to date and
-    written."""
-    stage = _stage(name)
-    inputs = key(name, scenario, out)
-    last = record["stages"].get(name)
-    if last and not options and last["inputs"] == inputs and _intact(out, last["artefacts"]):
-        told(name, "skipped", last)
-        return
-    told(name, "runs", {})
-    record["stages"].pop(name, None)
-    _write_record(out, record)
-    with measured() as cost:
-        said = stage.run(scenario, out, jobs=jobs, progress=progress, **options)
-    done = {
-        "inputs": inputs,
-        "artefacts": {a: files.sha256_of(out / a) for a in stage.ARTEFACTS if (out / a).exists()},
-        "summary": said,
-        "cost": cost.to_json(),
-    }
-    record["stages"][name] = done
-    record["scenario"] = scenario.model_dump(mode="json")
-    _write_record(out, record)
-    told(name, "done", done)
+    progress: Progress = silent,
+    link: bool = False,
+) -> tuple[Made, bool]:
+    """A stage's artefacts in ``out``: from the store, else made, and kept there; of several processes that want the
+    same, one makes it. Returns what came of it, and whether it came from the store."""
+    entry = store.take(name, key, out, link=link)
+    if entry is None:
+        with store.maker(name, key, progress=progress):
+            entry = store.take(name, key, out, link=link)  # another one has made it meanwhile
+            if entry is None:
+                made = make()
+                store.put(name, key, out, made, link=link)
+                return made, False
+    for other in set(stages.artefacts_of(name)) - set(entry.made.artefacts):
+        (out / other).unlink(missing_ok=True)  # as the stage does
+    return entry.made, True
+
+
+@dataclass(frozen=True)
+class _Work:
+    """One scenario in one folder."""
+
+    scenario: Scenario
+    out: Path
+    store: Store
+    jobs: int | None
+    progress: Progress
+    listener: StageListener
+
+    def bring(self, name: str, record: RunRecord, *, again: bool = False, **options: Any) -> RunRecord:
+        """Bring one stage up to date; the record of the run with it, written.
+
+        A stage with ``options`` is always run, and its artefacts are not kept in the store; ``again``: always run."""
+        inputs = stages.inputs(name, self.scenario, self.out)
+        last = record.stages.get(name)
+        if last and not (again or options) and last.inputs == inputs.key and _intact(self.out, last.artefacts):
+            self.listener(name, "skipped", last)
+            return record
+        record = replace(record.having(name, None), scenario=self.scenario.model_dump(mode="json"))
+        record.write(self.out)
+        made, fetched = self._made(name, inputs, again, options)
+        done = StageRecord(inputs.key, inputs.files, made.artefacts, made.summary, made.cost)
+        record = record.having(name, done)
+        record.write(self.out)
+        self.listener(name, "fetched" if fetched else "done", done)
+        return record
+
+    def _made(self, name: str, inputs: Inputs, again: bool, options: dict[str, Any]) -> tuple[Made, bool]:
+        def make() -> Made:
+            self.listener(name, "runs", None)
+            return stages.make(name, self.scenario, self.out, jobs=self.jobs, progress=self.progress, **options)
+
+        if not (again or options):
+            return fetch_or_make(name, self.scenario, self.out, inputs.key, self.store, make, progress=self.progress)
+        made = make()
+        if not options:
+            with self.store.maker(name, inputs.key, wait=False) as mine:
+                if mine:
+                    self.store.put(name, inputs.key, self.out, made)
+        return made, False
+
+
+def _is_of(name: str, scenario: Scenario, out: Path, record: RunRecord) -> bool:
+    """Whether a stage's last run is what this scenario, and the artefacts as they are now, would give."""
+    try:
+        return record.stages[name].inputs == stages.inputs(name, scenario, out).key
+    except InputError:
+        return False
+
+
+def _intact(out: Path, artefacts: dict[str, str]) -> bool:
+    return all((out / name).is_file() and files.sha256_of(out / name) == digest for name, digest in artefacts.items())
 
 
 def verify(
-    folder: Path, scenario_folder: Path | None = None, *, jobs: int | None = None, progress: Progress = silent, told: Told = _mute
+    folder: Path,
+    scenario_folder: Path | None = None,
+    *,
+    jobs: int | None = None,
+    progress: Progress = silent,
+    listener: StageListener = unheard,
 ) -> list[str]:
-    """Run again what ``folder/run.json`` says, elsewhere, and compare.
+    """Run again what ``folder/run.json`` says, elsewhere, and compare. Nothing is taken from the store.
 
     Parameters
     ----------
@@ -187,111 +222,55 @@ def verify(
     list of str
         One line for each artefact that differs: altered since the run, or not reproduced by it. Empty when all is well.
     """
-    record = _load_record(folder)
-    missing = [name for name in STAGES if name not in record["stages"]]
+    record = RunRecord.read(folder)
+    missing = [name for name in STAGES if name not in record.stages]
     if missing:
         raise InputError(folder / RECORD, f"the stage {missing[0]} is not done", "a finished run; call egvs run first")
-    source = scenario_folder or Path(os.path.normpath(folder / record["scenario_folder"]))
+    source = scenario_folder or Path(os.path.normpath(folder / record.scenario_folder))
     if not source.is_dir():
         raise InputError(folder / RECORD, f"the scenario's folder {source} is not there", "name it with --scenario")
-    scenario = from_values(record["scenario"], source, str(folder / RECORD))
+    scenario = from_values(record.scenario, source, str(folder / RECORD))
     wrong = [f"{name} was altered after the run" for name in _altered(folder, record)]
     with tempfile.TemporaryDirectory(prefix="egvs-verify-") as temporary:
-        again = _new_record(scenario, Path(temporary))
-        for name in STAGES:
-            if name == "report":
-                # It shows what the stages cost, which is part of the record, and an accuracy study if one was made.
-                again["stages"] |= {n: {**again["stages"][n], "cost": record["stages"][n]["cost"]} for n in again["stages"]}
-                _write_record(Path(temporary), again)
-                if not _is_of(name, scenario, Path(temporary), record):
-                    for study in folder.glob("accuracy.p*"):
-                        shutil.copy(study, temporary)
-                    if not _is_of(name, scenario, Path(temporary), record):
-                        wrong.append("report.html shows an accuracy study that was replaced since; egvs report draws it anew")
-            run_stage(name, scenario, Path(temporary), again, jobs=jobs, progress=progress, told=told)
-            wrong += _differences(name, record, again)
+        elsewhere = Path(temporary)
+        again = RunRecord.of(scenario, elsewhere)
+        made_by_stages = {artefact for stage in record.stages.values() for artefact in stage.artefacts}
+        for name, before in record.stages.items():
+            beside = before.files.keys() - made_by_stages
+            _lay_beside(folder, elsewhere, {file: before.files[file] for file in beside})
+            inputs = stages.inputs(name, scenario, elsewhere)
+            for file in sorted(file for file in beside if inputs.files.get(file) != before.files[file]):
+                made_of_it = " and ".join(before.artefacts) or f"the stage {name}"
+                wrong.append(f"{made_of_it} shows {file}, which was replaced since; egvs {name} makes it anew")
+            listener(name, "runs", None)
+            made = stages.make(name, scenario, elsewhere, jobs=jobs, progress=progress)
+            after = StageRecord(inputs.key, inputs.files, made.artefacts, made.summary, made.cost)
+            listener(name, "done", after)
+            again = again.having(name, replace(after, cost=before.cost))  # which the report shows
+            again.write(elsewhere)
+            wrong += _differences(before, after)
     return wrong
 
 
-def _differences(name: str, record: dict[str, Any], again: dict[str, Any]) -> Iterator[str]:
-    before, after = record["stages"][name]["artefacts"], again["stages"][name]["artefacts"]
-    for artefact in sorted(before.keys() | after.keys()):
-        then, now = (digests.get(artefact, "absent")[:12] for digests in (before, after))
+def _lay_beside(folder: Path, elsewhere: Path, read: dict[str, str]) -> None:
+    """Lay files of the run's folder that a stage read and no stage made (an accuracy study, which the report shows)
+    beside what is made again, where they are still the same."""
+    for name, digest in read.items():
+        path = folder / name
+        if Path(name).name == name and path.is_file() and files.sha256_of(path) == digest:
+            shutil.copyfile(path, elsewhere / name)
+
+
+def _differences(before: StageRecord, after: StageRecord) -> Iterator[str]:
+    for artefact in sorted(before.artefacts.keys() | after.artefacts.keys()):
+        then, now = (stage.artefacts.get(artefact, "absent")[:12] for stage in (before, after))
         if then != now:
             yield f"{artefact} differs from what the run made: {then} then, {now} now"
 
 
-def _altered(folder: Path, record: dict[str, Any]) -> Iterator[str]:
-    for stage in record["stages"].values():
-        for artefact, digest in stage["artefacts"].items():
+def _altered(folder: Path, record: RunRecord) -> Iterator[str]:
+    for stage in record.stages.values():
+        for artefact, digest in stage.artefacts.items():
             path = folder / artefact
             if not path.is_file() or files.sha256_of(path) != digest:
                 yield artefact
-
-
-def _stage(name: str) -> ModuleType:
-    """A stage's module, imported when it is needed (``--help`` and a skipped run stay quick)."""
-    return importlib.import_module("pipeline.report.page" if name == "report" else f"pipeline.stages.{name}")
-
-
-def _intact(out: Path, artefacts: dict[str, str]) -> bool:
-    return all((out / name).is_file() and files.sha256_of(out / name) == digest for name, digest in artefacts.items())
-
-
-def _new_record(scenario: Scenario, folder: Path) -> dict[str, Any]:
-    return {
-        "egvs": __version__,
-        "seed": scenario.seed,
-        "scenario": scenario.model_dump(mode="json"),
-        "scenario_folder": Path(os.path.relpath(scenario.folder, folder)).as_posix(),
-        "effects": [],
-        "stages": {},
-    }
-
-
-def _read_record(folder: Path, scenario: Scenario) -> dict[str, Any]:
-    """What is known of earlier work in this folder, with the scenario as it is now."""
-    record = _new_record(scenario, folder)
-    if (folder / RECORD).is_file():
-        record["stages"] = _load_record(folder)["stages"]
-    return record
-
-
-def _load_record(folder: Path) -> dict[str, Any]:
-    path = folder / RECORD
-    try:
-        record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        record["stages"].items()
-    except (FileNotFoundError, NotADirectoryError):
-        raise InputError(path, "no such file", "a folder that egvs run has written") from None
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise InputError(path, f"is not a run's record ({error})", "remove it and run again") from None
-    for key, kind in (("egvs", str), ("seed", int), ("scenario", dict), ("scenario_folder", str), ("effects", list)):
-        if not isinstance(record.get(key), kind):
-            raise InputError(path, f"is not a run's record ({key!r} is {record.get(key)!r})", "remove it and run again")
-    return record
-
-
-def _write_record(out: Path, record: dict[str, Any]) -> None:
-    files.write_text(out / RECORD, json.dumps(record, indent=2, ensure_ascii=False) + "\n")
-
-
-@contextmanager
-def alone(folder: Path) -> Iterator[None]:
-    """Keep two runs out of one folder; the lock goes with the process, however it ends."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = (folder / ".lock").open("w")
-    except OSError as error:
-        raise InputError(folder, f"cannot be written ({error.strerror})", "a folder of yours") from None
-    with lock:
-        try:
-            import fcntl
-
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise RunError(f"{folder}: another run is at work there") from None
-        yield
-
-
-__all__ = ["RECORD", "STAGES", "alone", "default_folder", "key", "refresh_report", "run", "run_one", "run_stage", "verify"]

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 
 NAME = "traffic"
 ARTEFACTS = ("trajectories.parquet",)
+COMPANIONS = ("sumo",)
 
 GROUP_FRAMES = 500
 """Frames in a row group; fixed, so that the bytes do not depend on how the rows arrive."""

@@ -35,7 +35,8 @@ from pipeline.artefacts.readers import read_tpog
 from pipeline.core.errors import EgvsError, InputError
 from pipeline.core.progress import Progress, silent
 from pipeline.effects import registry as effects
-from pipeline.runs.workflow import alone, refresh_report
+from pipeline.runs.locking import alone
+from pipeline.runs.workflow import refresh_report
 from pipeline.scenario.models import Scenario
 from pipeline.scoring.egvs import EntropyField
 from pipeline.stages.base import metadata

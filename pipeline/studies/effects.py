@@ -151,7 +151,7 @@ def ablation(scenario: Scenario, out: Path, *, jobs: int | None = None, progress
         if not folder.exists() and plain.exists():
             shutil.copytree(plain, folder, ignore=shutil.ignore_patterns(".lock"))
         record = workflow.run(scenario.with_effects(named), folder, jobs=jobs, progress=progress)
-        seconds = sum(done["cost"]["seconds"] for stage, done in record["stages"].items() if stage != "report")
+        seconds = sum(done.cost.seconds for stage, done in record.stages.items() if stage != "report")
         scores = read_scores(folder / "scores.parquet")
         names = tuple(scores["site"].to_pylist())
         changes.append(

@@ -36,7 +36,7 @@ from pipeline.core.cost import let_go, measured
 from pipeline.core.errors import InputError, RunError
 from pipeline.core.progress import Progress
 from pipeline.core.version import __version__
-from pipeline.runs import workflow
+from pipeline.runs import stages
 from pipeline.scenario.loading import load
 from pipeline.scenario.models import Scenario, SiteGrid
 from pipeline.scoring.egvs import EntropyField
@@ -142,7 +142,7 @@ class Bench:
         with self._workshop() as work:
             keys = {}
             for name in STAGES:
-                keys[name] = workflow.key(name, scenario, work)
+                keys[name] = stages.inputs(name, scenario, work).key
                 if not self._is_kept(name, keys[name]):
                     self._measure(name, keys[name], scenario, work)
                 _link(self._folder(name, keys[name]), work)

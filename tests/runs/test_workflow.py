@@ -23,6 +23,8 @@ import pipeline
 from pipeline.core import files
 from pipeline.artefacts import tables
 from pipeline.runs import workflow
+from pipeline.runs.locking import alone
+from pipeline.runs.stages import STAGES
 from pipeline.sensing import scanner as survey
 from pipeline.core.errors import InputError, RunError
 
@@ -37,7 +39,7 @@ def digests(out: Path) -> dict[str, str]:
 def states(scenario: pipeline.Scenario, out: Path, **options: object) -> dict[str, str]:
     """Run, and say of each stage whether it ran or was skipped."""
     seen: dict[str, str] = {}
-    workflow.run(scenario, out, told=lambda stage, state, _: seen.__setitem__(stage, state), **options)  # type: ignore[arg-type]
+    workflow.run(scenario, out, listener=lambda stage, state, _: seen.__setitem__(stage, state), **options)  # type: ignore[arg-type]
     return seen
 
 
@@ -52,7 +54,7 @@ def done(mini: Path, tmp_path: Path) -> tuple[Path, Path]:
 def test_artefacts_are_there_and_the_record_names_them(done: tuple[Path, Path]) -> None:
     _, out = done
     record = json.loads((out / "run.json").read_text())
-    assert list(record["stages"]) == list(workflow.STAGES)
+    assert list(record["stages"]) == list(STAGES)
     for stage in record["stages"].values():
         for name, digest in stage["artefacts"].items():
             assert files.sha256_of(out / name) == digest
@@ -85,7 +87,7 @@ def test_a_second_run_does_nothing_and_says_so(done: tuple[Path, Path], egvs) ->
     assert set(states(pipeline.load(mini), out).values()) == {"skipped"}
     code, printed, said = egvs("run", mini, "--out", out)
     assert code == 0
-    assert said.count("unchanged") == len(workflow.STAGES)
+    assert said.count("unchanged") == len(STAGES)
     assert "pole_a" in printed
     assert before == {p.name: p.stat().st_mtime_ns for p in out.iterdir() if p.is_file() and p.name != ".lock"}
 
@@ -170,7 +172,7 @@ def test_verify_of_an_unfinished_run_says_what_is_missing(done: tuple[Path, Path
 
 def test_two_runs_in_one_folder_are_kept_apart(done: tuple[Path, Path]) -> None:
     mini, out = done
-    with workflow.alone(out), pytest.raises(RunError, match="another run is at work"):
+    with alone(out), pytest.raises(RunError, match="another run is at work"):
         pipeline.run(pipeline.load(mini), out)
 
 
@@ -181,11 +183,11 @@ def test_a_record_that_is_none_is_refused(done: tuple[Path, Path]) -> None:
         pipeline.run(pipeline.load(mini), out)
 
 
-@pytest.mark.parametrize("key", ["scenario", "scenario_folder", "egvs", "seed", "effects"])
+@pytest.mark.parametrize("key", ["scenario", "scenario_folder", "egvs", "seed"])
 def test_a_record_with_an_odd_value_is_refused(done: tuple[Path, Path], key: str, egvs) -> None:
     mini, out = done
     record = json.loads((out / "run.json").read_text())
-    (out / "run.json").write_text(json.dumps(record | {key: [None] if key != "effects" else "all"}))
+    (out / "run.json").write_text(json.dumps(record | {key: [None]}))
     for arguments in (("run", mini, "--out", out), ("verify", out)):
         code, _, said = egvs(*arguments)
         assert (code, f"'{key}' is" in said) == (2, True), said
@@ -284,13 +286,12 @@ def test_a_ranking_fits_the_terminal(mini: Path, tmp_path: Path, width: int) -> 
     """No number is cut, on the narrowest terminal too."""
     from rich.console import Console
 
-    from pipeline.cli.ranking_table import ranking_table
-    from pipeline.report.ranking import ScoredSite
+    from pipeline.cli import screen as show
 
     pipeline.run(pipeline.load(mini), tmp_path)
     rows = pipeline.read_scores(tmp_path / "scores.parquet").to_pylist()
     console = Console(width=width, record=True, file=io.StringIO())
-    console.print(ranking_table([ScoredSite(**row) for row in rows], width))
+    console.print(show.ranking(rows, width))
     text = console.export_text()
     assert "…" not in text
     assert all(len(line) <= width for line in text.splitlines())

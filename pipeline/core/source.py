@@ -1,0 +1,131 @@
+"""The program's own source as one digest, so that what was made by another version of the code is not taken for new.
+
+Steps: from some modules of this package, follow every import down (those inside functions too, those for type checking
+alone not); hash the sources. What is loaded by name only (effects, plug-ins) is not seen from the text: name its module
+as well. A module of another package counts with its file, and with what it imports of its own package and of this one.
+
+Imports are read by their pattern, not by a parser, which takes a tenth of the time; a line of a docstring that looks
+like an import may add a module, none is missed. A file is read once in a process: one that is edited while the program
+runs counts as it was when it was first asked for.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+PACKAGE = "pipeline"
+_ROOT = Path(__file__).resolve().parent.parent
+
+LIBRARIES = {
+    "embreex": ("embreex",),
+    "numba": ("numba", "llvmlite"),
+    "numpy": ("numpy",),
+    "pyarrow": ("pyarrow",),
+    "scipy": ("scipy",),
+    "shapely": ("shapely",),
+    "trimesh": ("trimesh", "mapbox-earcut"),
+}
+"""Libraries whose version may change a result: name in an import -> distributions."""
+
+_TYPES_ONLY = re.compile(r"^if TYPE_CHECKING:\n(?:(?:[ \t].*)?\n)+", re.MULTILINE)
+_IMPORT = re.compile(
+    r"^[ \t]*(?:from[ \t]+([.\w]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n]*)|import[ \t]+([^\n]+))", re.MULTILINE
+)
+
+
+@dataclass(frozen=True)
+class Source:
+    """What some modules are made of: the digest of all their sources, and the libraries of :data:`LIBRARIES` that they
+    import."""
+
+    digest: str
+    libraries: frozenset[str]
+
+
+@cache
+def of(*modules: str) -> Source:
+    """The source of modules, e.g. ``"pipeline.stages.score"``, and of everything that they import."""
+    homes = {PACKAGE, *(module.partition(".")[0] for module in modules)}
+    found: dict[str, _File] = {}
+    waiting = list(modules)
+    while waiting:
+        module = waiting.pop()
+        if module in found or module.partition(".")[0] not in homes or (path := _path(module)) is None:
+            continue
+        found[module] = _read(path, module if path.name == "__init__.py" else module.rpartition(".")[0])
+        waiting += found[module].imports
+        waiting.append(module.rpartition(".")[0])
+    every = hashlib.sha256()
+    for module, file in sorted(found.items()):
+        every.update(f"{module} {file.sha256}\n".encode())
+    return Source(every.hexdigest(), frozenset().union(*(file.libraries for file in found.values())))
+
+
+def of_object(kind: type) -> Source:
+    """The source of the module that defines a class, and of everything that it imports."""
+    return of(kind.__module__)
+
+
+def versions(libraries: frozenset[str]) -> dict[str, str]:
+    """Library -> version, of those installed."""
+    return {name: text for key in sorted(libraries) for name in LIBRARIES[key] if (text := _version(name)) is not None}
+
+
+@cache
+def _version(distribution: str) -> str | None:
+    try:
+        return version(distribution)
+    except PackageNotFoundError:
+        return None
+
+
+@dataclass(frozen=True)
+class _File:
+    sha256: str
+    imports: tuple[str, ...]
+    libraries: frozenset[str]
+
+
+@cache
+def _read(path: Path, package: str) -> _File:
+    content = path.read_bytes()
+    imports = tuple(imported(content.decode("utf-8"), package))
+    libraries = frozenset(name.partition(".")[0] for name in imports) & LIBRARIES.keys()
+    return _File(hashlib.sha256(content).hexdigest(), imports, libraries)
+
+
+def imported(text: str, package: str) -> Iterator[str]:
+    """The names that a module's text imports when it runs, modules and their attributes alike."""
+    for source, names, whole in _IMPORT.findall(_TYPES_ONLY.sub("", text)):
+        if whole:
+            yield from (part.split()[0] for part in whole.partition("#")[0].split(",") if part.strip())
+            continue
+        if source.startswith("."):
+            source = importlib.util.resolve_name(source, package)
+        yield source
+        for part in re.sub(r"#[^\n]*", "", names).strip("()\n ").split(","):
+            if part.strip():
+                yield f"{source}.{part.split()[0]}"
+
+
+@cache
+def _path(module: str) -> Path | None:
+    """A module's file; None for what is none (an attribute of a module), and for the door of this package, whose lazy
+    names would lead everywhere."""
+    top, _, rest = module.partition(".")
+    if top == PACKAGE:
+        inside = _ROOT.joinpath(*rest.split("."))
+        here = (inside.with_suffix(".py"), inside / "__init__.py") if rest else ()
+        return next((path for path in here if path.is_file()), None)
+    try:
+        spec = importlib.util.find_spec(module)
+    except (ImportError, ValueError):
+        return None
+    return Path(spec.origin) if spec is not None and spec.origin is not None and spec.origin.endswith(".py") else None

@@ -1,0 +1,78 @@
+"""Compiled kernels are kept from one process to the next, and made again when one that they call has changed."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import pipeline
+
+CORE = Path(pipeline.__file__).parent / "core"
+INNER = "import numba\n\n\n@numba.njit(cache=True)\ndef inner(x):\n    return x + {}\n"
+OUTER = (
+    "import numba\n\nfrom pipeline.kernels.inner import inner\n\n\n"
+    "@numba.njit(cache=True)\ndef outer(x):\n    return inner(x)\n"
+)
+CALL = """
+from pipeline.kernels.outer import outer
+print(outer(1), "compiled" if outer.stats.cache_misses else "kept")
+"""
+
+
+@pytest.fixture
+def package(tmp_path: Path) -> Path:
+    """A package of two kernels, one of which calls the other."""
+    kernels = tmp_path / "pipeline" / "kernels"
+    kernels.mkdir(parents=True)
+    (tmp_path / "pipeline" / "__init__.py").write_text("")
+    shutil.copytree(CORE, tmp_path / "pipeline" / "core", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(CORE.parent / "kernels" / "__init__.py", kernels)
+    (kernels / "inner.py").write_text(INNER.format(1))
+    (kernels / "outer.py").write_text(OUTER)
+    return tmp_path
+
+
+def call(package: Path, **environment: str) -> str:
+    clean = {key: value for key, value in os.environ.items() if key not in ("NUMBA_CACHE_DIR", "PYTHONPATH")}
+    done = subprocess.run(
+        [sys.executable, "-c", CALL], cwd=package, env=clean | environment, check=True, capture_output=True, text=True
+    )
+    return done.stdout.strip()
+
+
+def kept(folder: Path) -> int:
+    return len(list(folder.glob("numba-*")))
+
+
+def test_a_called_kernel_that_changed_is_noticed(package: Path) -> None:
+    assert call(package) == "2 compiled"
+    assert call(package) == "2 kept"
+    (package / "pipeline" / "kernels" / "inner.py").write_text(INNER.format(2))
+    assert call(package) == "3 compiled"
+    assert call(package) == "3 kept"
+    folder = package / "pipeline" / "kernels" / "__pycache__"
+    assert kept(folder) == 2
+    for added in (3, 4, 5):
+        (package / "pipeline" / "kernels" / "inner.py").write_text(INNER.format(added))
+        assert call(package) == f"{1 + added} compiled"
+    assert kept(folder) == 3  # the present one, and two that a program may still use
+
+
+def test_a_folder_of_the_users_is_used(package: Path, tmp_path: Path) -> None:
+    assert call(package, NUMBA_CACHE_DIR=str(tmp_path / "mine")) == "2 compiled"
+    assert call(package, NUMBA_CACHE_DIR=str(tmp_path / "mine")) == "2 kept"
+    assert kept(tmp_path / "mine") == 1
+    assert kept(package / "pipeline" / "kernels" / "__pycache__") == 0
+
+
+def test_where_the_package_cannot_be_written_the_users_cache_is_used(package: Path, tmp_path: Path) -> None:
+    (package / "pipeline" / "kernels" / "__pycache__").write_text("a file where the folder would be")
+    home = {"XDG_CACHE_HOME": str(tmp_path / "cache"), "PYTHONDONTWRITEBYTECODE": "1"}
+    assert call(package, **home) == "2 compiled"
+    assert call(package, **home) == "2 kept"
+    assert kept(tmp_path / "cache" / "egvs") == 1
