@@ -211,7 +211,7 @@ class Scene:
     def shipped(cls) -> Scene:
         """Statics built, traffic simulated."""
         scenario = pipeline.load(SCENARIO, [f"traffic.frames={FRAMES}"])
-        grid, world = scenario.roi.grid, statics.build(scenario, statics.Tally.empty())
+        grid, world = scenario.roi.grid, statics.build(scenario)[0]
         with tempfile.TemporaryDirectory() as temporary:
             traffic.run(scenario, Path(temporary))
             read = list(tpog._read(Path(temporary) / "trajectories.parquet", grid))

@@ -52,7 +52,7 @@ def rows() -> list[tuple[str, str, str, bool]]:
 def _beams() -> list[tuple[str, str, str, bool]]:
     """Only beams that can meet the region of interest are cast."""
     scenario = pipeline.load(SCENARIO)
-    roi, surveyed = scenario.roi.box, survey.Survey(scenario, statics.build(scenario, statics.Tally.empty()))
+    roi, surveyed = scenario.roi.box, survey.Survey(scenario, statics.build(scenario)[0])
     sensor = surveyed._sensors[surveyed.sites[0].site]
     directions, range_m, caster = sensor.directions(), sensor.range_m, surveyed._caster
     starts = [np.asarray(site.position_m) - np.asarray(roi.origin_m) for site in surveyed.sites]
@@ -96,7 +96,7 @@ def _flat() -> list[tuple[str, str, str, bool]]:
 
 def _pair(name: str, grown: Callable[[World], World]) -> list[tuple[str, str, str, bool]]:
     scenario = pipeline.load(SCENARIO)
-    plain = statics.build(scenario, statics.Tally.empty())
+    plain = statics.build(scenario)[0]
     roi, surveyed, world = scenario.roi.box, survey.Survey(scenario, plain), grown(plain)
     sites = np.array([site.position_m for site in surveyed.sites])
     nothing = World(np.empty((0, 3)), np.empty((0, 3), np.int32), np.empty(0, np.int32), ())

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import difflib
 import importlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -33,6 +33,7 @@ from pydantic import ValidationError
 
 from pipeline.core.errors import InputError
 from pipeline.core.models import StrictModel
+from pipeline.traffic import configuration
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -42,8 +43,12 @@ if TYPE_CHECKING:
     from pipeline.sensing.crossings import Crossings
     from pipeline.sensing.sensors import Sensor
     from pipeline.sensing.sites import Site
+    from pipeline.traffic.boxes import Size
+    from pipeline.traffic.extensions import BoxChange, TrafficPlan
+    from pipeline.traffic.network import Network
     from pipeline.world.casting import EmptyScan
     from pipeline.world.mesh import World
+    from pipeline.world.terrain import Surface
 
 KINDS: dict[str, tuple[str, str]] = {
     "range_limit": ("score", "detect"),
@@ -54,14 +59,15 @@ KINDS: dict[str, tuple[str, str]] = {
     "divergence": ("scan", "expand"),
     "mount_sway": ("scan", "expand"),
     "foliage": ("scan", "transmit"),
-    "slope": ("traffic", "traffic"),
-    "articulated": ("traffic", "traffic"),
     "pedestrians_bicycles": ("traffic", "traffic"),
+    "articulated": ("traffic", "traffic"),
+    "slope": ("traffic", "traffic"),
 }
 """Every effect: the stage that it acts in, and its kind. Composed in this order within a stage."""
 
-SELF_ACTING = "slope"
-"""The one effect that switches itself on, when the network has relief: leaving it out would be wrong."""
+SELF_ACTING: dict[str, Callable[[Scenario], bool]] = {"slope": configuration.may_have_heights}
+"""Effects that switch themselves on where leaving them out would be wrong; and a quick look whether they may, so that
+elsewhere none is imported."""
 
 
 class Parameters(StrictModel):
@@ -183,7 +189,70 @@ class TransmitScore(Effect):
 
 
 class Traffic(Effect):
-    """Who moves, and how boxes are made of it; the traffic stage knows these by name."""
+    """Who moves, and how boxes are made of it: a :class:`pipeline.traffic.extensions.TrafficExtension` that changes
+    nothing."""
+
+    SELF_ACTING: ClassVar[bool] = False
+    """Whether it also acts where nobody names it; then :meth:`acts` alone decides."""
+    ADDS_TRAFFIC: ClassVar[bool] = False
+    """Whether it has a :meth:`plan`."""
+    LAYS_GROUND: ClassVar[bool] = False
+    """Whether it has a :meth:`ground`."""
+
+    @property
+    def adds_traffic(self) -> bool:
+        """See :data:`ADDS_TRAFFIC`."""
+        return self.ADDS_TRAFFIC
+
+    def acts(self, scenario: Scenario) -> tuple[bool, str]:
+        """Whether it can change anything, judged from the scenario alone; and why (not)."""
+        reason = self.why_idle(scenario)
+        return reason is None, reason or "named"
+
+    def why_idle(self, scenario: Scenario) -> str | None:
+        """Why it cannot change anything; None when it can."""
+        del scenario
+        return None
+
+    def idle(self, scene: Scene) -> str | None:
+        """As :meth:`acts` has it."""
+        on, reason = self.acts(scene.scenario)
+        return None if on else reason
+
+    def lacks(self, scene: Scene) -> InputError | None:
+        """As :meth:`refusal` has it."""
+        return self.refusal(scene.scenario)
+
+    def refusal(self, scenario: Scenario) -> InputError | None:
+        """Why this scenario cannot have it; None when it can."""
+        del scenario
+        return None
+
+    def sizes(self) -> dict[str, Size]:
+        """Sizes of the types of vehicles and persons that it adds."""
+        return {}
+
+    def uncounted_types(self, sizes: Mapping[str, Size]) -> frozenset[str]:
+        """Which of SUMO's types are no vehicles of the scenario."""
+        del sizes
+        return frozenset()
+
+    def plan(
+        self, scenario: Scenario, roads: Network, begin_s: float, end_s: float, rng: np.random.Generator
+    ) -> TrafficPlan:
+        """The traffic that it adds between two times."""
+        raise NotImplementedError
+
+    def box_change(self, scenario: Scenario, sizes: Mapping[str, Size]) -> BoxChange | None:
+        """What changes the boxes of a recording whose vehicles have these sizes; None for nothing."""
+        del scenario, sizes
+        return None
+
+    def ground(
+        self, scenario: Scenario, low_m: NDArray[np.float64] | None = None, high_m: NDArray[np.float64] | None = None
+    ) -> Surface:
+        """The ground over a rectangle; around the network when None."""
+        raise NotImplementedError
 
 
 def make(name: str, parameters: dict[str, Any], place: str) -> Effect:
@@ -240,6 +309,41 @@ def acting(
     reasons = {effect.NAME: effect.idle(scene) for effect in found}
     live = tuple(effect for effect in found if reasons[effect.NAME] is None)
     return live, {name: reason for name, reason in reasons.items() if reason is not None}
+
+
+def traffic_effects(scenario: Scenario) -> tuple[tuple[Traffic, ...], tuple[str, ...]]:
+    """The effects on the traffic that act, in order; and notes on those that act by themselves or are skipped."""
+    live, notes = [], []
+    for effect in _traffic(scenario):
+        (on, reason), named = effect.acts(scenario), effect.NAME in scenario.effects
+        if on:
+            live.append(effect)
+        if on and effect.SELF_ACTING:
+            notes.append(f"{effect.NAME}: on, {reason}")
+        elif not on:
+            skipped = f"named, but {reason}: skipped, the result is the same"
+            notes.append(f"{effect.NAME}: {skipped if named else f'off, {reason}'}")
+    return tuple(live), tuple(notes)
+
+
+def ground_effect(scenario: Scenario) -> Traffic | None:
+    """The effect that lays the ground; None where it is flat."""
+    return next((e for e in _traffic(scenario) if e.LAYS_GROUND and e.acts(scenario)[0]), None)
+
+
+def traffic_settings(scenario: Scenario) -> dict[str, Any]:
+    """What the traffic's inputs say of the named effects that act. One that acts by itself depends on files alone."""
+    named = [effect for effect in _traffic(scenario) if not effect.SELF_ACTING]
+    return settings(effect for effect in named if effect.acts(scenario)[0])
+
+
+def _traffic(scenario: Scenario) -> Iterator[Traffic]:
+    """The effects on the traffic that are named, or may act by themselves."""
+    for name, (stage, _) in KINDS.items():
+        if stage == "traffic" and (name in scenario.effects or (name in SELF_ACTING and SELF_ACTING[name](scenario))):
+            effect = make(name, dict(scenario.effects.get(name, {})), f"{scenario.file}: effects")
+            assert isinstance(effect, Traffic)
+            yield effect
 
 
 def settings(effects: Iterable[Effect]) -> dict[str, Any]:
