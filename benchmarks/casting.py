@@ -31,7 +31,7 @@ def _work(name: str) -> tuple[dict[str, Callable[[], Any]], int, int]:
     from embreex.rtcore_scene import EmbreeScene
 
     scenario = pipeline.load(_SCENARIOS / name)
-    world = statics.build(scenario, statics.Tally.empty())
+    world = statics.build(scenario)[0]
     caster, origin = Caster(world, scenario.roi.box), np.asarray(scenario.roi.box.origin_m)
     bare = EmbreeScene()
     TriangleMesh(bare, caster._triangles.astype(np.float32))

@@ -115,7 +115,9 @@ def side_view(out: Path, pitched: bool) -> str:
 
 def main() -> None:
     """Draw the picture of the README and those of the effects."""
-    assert set(SHOWN) == set(effects.KINDS) - {effects.SELF_ACTING}  # the slope cannot be left out where there is one
+    assert set(SHOWN) == set(effects.KINDS) - set(
+        effects.SELF_ACTING
+    )  # the slope cannot be left out where there is one
     (IMAGES / "effects").mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)

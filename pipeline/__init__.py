@@ -12,7 +12,15 @@ From a notebook::
 
     scenario = pipeline.load("scenarios/nishishinjuku", ["traffic.frames=500"])
     record = pipeline.run(scenario, "runs/trial")
-    p = pipeline.read_tpog("runs/trial/tpog.parquet").p  # share of frames in which each voxel is occupied
+    tpog = pipeline.read_tpog("runs/trial/tpog.parquet")
+    tpog.p  # share of frames in which each voxel is occupied
+
+Any pose, not only the scenario's sites, in milliseconds::
+
+    scene = pipeline.build_scene(scenario)
+    scanner, scorer = pipeline.Scanner(scene), pipeline.Scorer(scene, tpog)
+    pose = pipeline.Pose(x_m=12.0, y_m=30.0, z_m=4.5, yaw_deg=180.0)
+    scorer.score(scanner.scan(pose, scene.sensor("VLP-32C"))).egvs
 
 Names are imported when they are first used, so that ``import pipeline`` costs nothing.
 """
@@ -25,17 +33,33 @@ from typing import TYPE_CHECKING, Any
 from pipeline.core.version import __version__
 
 if TYPE_CHECKING:
-    from pipeline.artefacts.readers import read_scans, read_scores, read_tpog, read_trajectories, read_visibility
+    from pipeline.artefacts.readers import Tpog, read_scans, read_scores, read_tpog, read_trajectories, read_visibility
     from pipeline.core.errors import EgvsError, InputError, RunError
+    from pipeline.effects.scenes import build as build_scene
     from pipeline.runs.workflow import run, verify
     from pipeline.scenario.loading import load
     from pipeline.scenario.models import Scenario
+    from pipeline.scoring.scorer import Scorer
+    from pipeline.sensing.scanner import Scanner
+    from pipeline.sensing.scene import Scene
+    from pipeline.sensing.sensors import Sensor
+    from pipeline.sensing.sites import Pose, Site
+    from pipeline.world.mesh import World
 
 _HOME = {
     "EgvsError": "core.errors",
     "InputError": "core.errors",
+    "Pose": "sensing.sites",
     "RunError": "core.errors",
+    "Scanner": "sensing.scanner",
     "Scenario": "scenario.models",
+    "Scene": "sensing.scene",
+    "Scorer": "scoring.scorer",
+    "Sensor": "sensing.sensors",
+    "Site": "sensing.sites",
+    "Tpog": "artefacts.readers",
+    "World": "world.mesh",
+    "build_scene": "effects.scenes:build",
     "load": "scenario.loading",
     "read_scans": "artefacts.readers",
     "read_scores": "artefacts.readers",
@@ -45,13 +69,23 @@ _HOME = {
     "run": "runs.workflow",
     "verify": "runs.workflow",
 }
+"""Public name -> the module that it is from, and the name there where that is another one."""
 
 __all__ = [
     "EgvsError",
     "InputError",
+    "Pose",
     "RunError",
+    "Scanner",
     "Scenario",
+    "Scene",
+    "Scorer",
+    "Sensor",
+    "Site",
+    "Tpog",
+    "World",
     "__version__",
+    "build_scene",
     "load",
     "read_scans",
     "read_scores",
@@ -65,7 +99,8 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name in _HOME:
-        return getattr(importlib.import_module(f"pipeline.{_HOME[name]}"), name)
+        module, _, there = _HOME[name].partition(":")
+        return getattr(importlib.import_module(f"pipeline.{module}"), there or name)
     raise AttributeError(f"module 'pipeline' has no attribute {name!r}")
 
 

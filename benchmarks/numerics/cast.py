@@ -234,7 +234,7 @@ def _scenes(rng: np.random.Generator, scale: float, lattice: bool) -> Row:
 
 def _scene(name: str) -> tuple[Scenario, Caster, Floats]:
     scenario = pipeline.load(_SCENARIOS / name)
-    world = statics.build(scenario, statics.Tally.empty())
+    world = statics.build(scenario)[0]
     return scenario, Caster(world, scenario.roi.box), world.triangles_m - np.asarray(scenario.roi.box.origin_m)
 
 

@@ -176,7 +176,9 @@ def verify(
     from pipeline.runs import workflow
 
     with Screen() as screen:
-        differences = workflow.verify(folder, scenario, jobs=jobs, progress=screen.progress, listener=screen.stage_event)
+        differences = workflow.verify(
+            folder, scenario, jobs=jobs, progress=screen.progress, listener=screen.stage_event
+        )
     results.print_verification(folder, differences)
     if differences:
         raise typer.Exit(1)
@@ -248,7 +250,7 @@ def effects(
     resolved, folder = _resolved(scenario, set_, out)
     prices, calls = study.prices(resolved, folder), study.called(resolved)
     effect_tables.print_effects(calls, prices)
-    on = [call.name for call in calls if call.state == "on" and call.name in resolved.effects]
+    on = [call.name for call in calls if call.state == "on" and call.name in resolved.effects.named]
     unpriced = [name for name in on if name not in (prices or {})]
     if prices is None or unpriced:
         what = "they" if prices is None else ", ".join(unpriced)

@@ -10,6 +10,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+from pipeline.artefacts.run_record import StageRecord
 from pipeline.cli.terminal import in_words
 
 
@@ -50,19 +51,20 @@ class Screen:
             self._bar.update(self._task, description=f"{self._stage}: {what} {count}", completed=done, visible=True)
             self._bar.tasks[0].total = total or None  # update() takes None for "as it was"
 
-    def stage_event(self, stage: str, state: str, record: dict[str, Any]) -> None:
-        """A stage "runs", or is "done" or "skipped": one line when it ends."""
+    def stage_event(self, stage: str, state: str, record: StageRecord | None) -> None:
+        """A :data:`pipeline.runs.workflow.StageListener`: one line when a stage ends."""
         self._stage = stage
-        if state == "runs":
+        if state in ("runs", "fetched"):
             self.any_stage_ran = True
+        if record is None:
             if self._has_bar:
                 self._bar.update(self._task, description=stage, completed=0, visible=True)
                 self._bar.tasks[0].total = None
             return
         if self._has_bar:
             self._bar.update(self._task, visible=False)
-        took = "unchanged" if state == "skipped" else f"{record['cost']['seconds']:.2f} s"
-        summary = {key: value for key, value in record["summary"].items() if key != "flags"}
+        took = {"skipped": "unchanged", "fetched": "from store"}.get(state) or f"{record.cost.seconds:.2f} s"
+        summary = {key: value for key, value in record.summary.items() if key != "flags"}
         self._print(f"{stage:<8} {took:>10}   {in_words(summary)}")
 
     def setting_event(self, name: str, state: str, about: dict[str, Any]) -> None:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +18,12 @@ from pipeline.report.outlines import Outlines, outlines_of
 from pipeline.report.plan import extent, shared_scale
 from pipeline.report.ranking import Ranking, ScoredSite
 from pipeline.report.raster import ColumnValues
-from pipeline.scenario.models import Scenario
-from pipeline.scoring import visibility
 from pipeline.scoring.egvs import EntropyField
-from pipeline.world.mesh import read_ply
+from pipeline.scoring.scorer import Scorer
+from pipeline.stages.base import Workspace
+from pipeline.stages.scan_source import scans
+from pipeline.stages.scene import scene_of
+from pipeline.stages.world import world_of
 
 
 @dataclass(frozen=True)
@@ -60,13 +61,12 @@ class Figures:
     outlines: tuple[Outlines, ...]
 
 
-def draw(scenario: Scenario, out: Path, ranking: Ranking, tpog: Tpog) -> Figures:
-    """Draw the figures of the run in ``out``."""
-    world, _ = read_ply(out / "statics.ply")
-    outlines = outlines_of(world, extent(tpog.grid, ranking.on_map))
+def draw(work: Workspace, ranking: Ranking, tpog: Tpog) -> Figures:
+    """Draw the figures of the run in a workspace."""
+    outlines = outlines_of(world_of(work), extent(tpog.grid, ranking.on_map))
     occupied = tpog.counts.sum(axis=2) / tpog.frames
     field = EntropyField.of(tpog.counts, tpog.frames, tpog.grid)
-    views, scale = _views(scenario, out, ranking, field, outlines) if len(field.cells) else ((), "")
+    views, scale = _views(work, ranking, tpog, field, outlines) if len(field.cells) else ((), "")
     return Figures(
         _occupancy(tpog, occupied, ranking, outlines) if tpog.counts.any() else "",
         _sites(tpog, occupied, ranking, outlines),
@@ -100,7 +100,7 @@ def _sites(tpog: Tpog, occupied: ColumnValues, ranking: Ranking, outlines: Seque
 
 
 def _views(
-    scenario: Scenario, out: Path, ranking: Ranking, field: EntropyField, outlines: Sequence[Outlines]
+    work: Workspace, ranking: Ranking, tpog: Tpog, field: EntropyField, outlines: Sequence[Outlines]
 ) -> tuple[tuple[SeenAndMissed, ...], str]:
     """What the best and the worst site see and miss, and the colour scale of these figures."""
     extremes = {site.site: site for site in ranking.extremes}
@@ -108,9 +108,11 @@ def _views(
     box = extent(field.grid, [site.on_map for site in extremes.values()])
     titles = ("The site",) if len(ranking.sites) == 1 else ("Best site", "Last site")
     views: dict[str, SeenAndMissed] = {}
-    for name, hits in visibility.hits_of(scenario, out, field.grid, list(extremes)):
+    scorer = Scorer(scene_of(work), tpog, work.path("trajectories.parquet"))
+    for scan in scans(work, extremes.keys()):
+        name = scan.site.name
         number = list(extremes).index(name)
-        view = SiteView(extremes[name].on_map, hits > 0, outlines, box)
+        view = SiteView(extremes[name].on_map, scorer.hits(scan.beams) > 0, outlines, box)
         views[name] = _seen_and_missed(extremes[name], titles[number], field, peak, view, f"view-{number}")
     return tuple(views[name] for name in extremes), shared_scale(peak, "Entropy in the column (bit)")
 

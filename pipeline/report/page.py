@@ -14,14 +14,15 @@ from typing import Any
 
 from pipeline.artefacts.readers import SEPARABLE, Tpog, read_tpog
 from pipeline.core import files
-from pipeline.core.progress import Progress, silent
 from pipeline.core.version import __version__
 from pipeline.report import figures, labels, wording
 from pipeline.report.colours import STYLE_SHEET
 from pipeline.report.figures import Figures
 from pipeline.report.ranking import Ranking
-from pipeline.report.record import ACCURACY, RunRecord, StudySummary
+from pipeline.report.record import ACCURACY, ShownRun, StudySummary
 from pipeline.scenario.models import Scenario
+from pipeline.stages.base import StageInputs, Summary, Workspace
+from pipeline.stages.scene import scan_inputs
 
 NAME = "report"
 ARTEFACTS = ("report.html",)
@@ -41,23 +42,23 @@ _LEFT_OUT = (
 """What no plain scene models, and the effect that does."""
 
 
-def inputs(scenario: Scenario, out: Path) -> dict[str, Any]:
+def inputs(work: Workspace) -> StageInputs:
     """The artefacts by hash, the summaries and costs of the earlier stages, and the settings that are shown."""
     read = ["trajectories.parquet", "tpog.parquet", "statics.ply", "scores.parquet"]
-    if scenario.scan.keep:
+    stages = ShownRun.read(work.folder).stages
+    settings: dict[str, Any] = {"shown": _shown(work.scenario), "keep": work.scenario.scan.keep}
+    hashes: dict[str, str] = {}
+    if work.scenario.scan.keep:
         read.append("scans.parquet")
-    stages = RunRecord.read(out).stages
-    more: dict[str, Any] = {}
-    if not scenario.scan.keep:
-        from pipeline.sensing import scanner
-
-        more = {"scan": scanner.settings(scenario, out), "scan_files": scanner.file_digests(scenario, out)}
-    return {
-        "settings": {"shown": _shown(scenario), "keep": scenario.scan.keep, **more},
+    else:
+        cast = scan_inputs(work)
+        settings["scan"], hashes = cast.settings, dict(cast.files)
+    hashes |= work.digests(*(name for name in (*read, *ACCURACY) if work.path(name).is_file()))
+    more = {
         "costs": {name: [stage.seconds, stage.peak_mb] for name, stage in stages.items()},
-        "files": {name: files.sha256_of(out / name) for name in (*read, *ACCURACY) if (out / name).is_file()},
         "summaries": {name: dict(stage.summary) for name, stage in stages.items()},
     }
+    return StageInputs(settings, hashes, more)
 
 
 def _shown(scenario: Scenario) -> dict[str, Any]:
@@ -69,11 +70,11 @@ def _shown(scenario: Scenario) -> dict[str, Any]:
         "frame_period_s": scenario.traffic.frame_period_s,
         "vehicles": scenario.traffic.vehicles,
         "gamma": repr(scenario.score.gamma),
-        "effects": scenario.effects,
+        "effects": scenario.effects.model_dump(mode="json"),
     }
 
 
-def run(scenario: Scenario, out: Path, *, jobs: int | None = None, progress: Progress = silent) -> dict[str, Any]:
+def run(work: Workspace, inputs: StageInputs) -> Summary:
     """Write ``report.html``.
 
     Returns
@@ -81,15 +82,15 @@ def run(scenario: Scenario, out: Path, *, jobs: int | None = None, progress: Pro
     dict
         ``best`` and ``worst`` (names of sites), ``kilobytes``.
     """
-    del jobs
-    ranking, tpog = Ranking.read(out / "scores.parquet"), read_tpog(out / "tpog.parquet")
-    record = RunRecord.read(out)
-    progress("artefacts read", 1, 3)
-    drawn = figures.draw(scenario, out, ranking, tpog)
-    progress("figures drawn", 2, 3)
-    html = page(scenario, ranking, tpog, drawn, record, StudySummary.read(out, record))
-    files.write_text(out / ARTEFACTS[0], html)
-    progress("page written", 3, 3)
+    del inputs
+    out = work.folder
+    ranking, tpog, record = Ranking.read(out / "scores.parquet"), read_tpog(out / "tpog.parquet"), ShownRun.read(out)
+    work.progress("artefacts read", 1, 3)
+    drawn = figures.draw(work, ranking, tpog)
+    work.progress("figures drawn", 2, 3)
+    html = page(work.scenario, ranking, tpog, drawn, record, StudySummary.read(out, record))
+    files.write_text(work.path(ARTEFACTS[0]), html)
+    work.progress("page written", 3, 3)
     return {
         "best": ranking.sites[0].site,
         "worst": ranking.last.site,
@@ -98,7 +99,7 @@ def run(scenario: Scenario, out: Path, *, jobs: int | None = None, progress: Pro
 
 
 def page(
-    scenario: Scenario, ranking: Ranking, tpog: Tpog, drawn: Figures, record: RunRecord, study: StudySummary | None
+    scenario: Scenario, ranking: Ranking, tpog: Tpog, drawn: Figures, record: ShownRun, study: StudySummary | None
 ) -> str:
     """The whole page, HTML text."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -112,7 +113,7 @@ def page(
         lstrip_blocks=True,
     )
     environment.filters |= {"svg": Markup, "share": wording.share, "whole": wording.whole, "plain": wording.plain}
-    sites, effects, gamma = ranking.sites, list(scenario.effects), scenario.score.gamma
+    sites, effects, gamma = ranking.sites, list(scenario.effects.named), scenario.score.gamma
     shortened, has_traffic = len(sites) > LISTED, bool(tpog.counts.any())
     return environment.get_template("report.html.j2").render(
         scenario=scenario,

@@ -6,7 +6,6 @@ then says that it does not know."""
 from __future__ import annotations
 
 import base64
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
@@ -14,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.artefacts.readers import read_accuracy
-from pipeline.core.errors import InputError
+from pipeline.artefacts.run_record import RECORD, RunRecord, StageRecord
 
 STAGES = ("traffic", "statics", "tpog", "scan", "score")
 """Those that the page shows."""
@@ -27,8 +26,8 @@ _UNSTABLE = ("sumo_seconds",)
 
 
 @dataclass(frozen=True)
-class StageRecord:
-    """What ``run.json`` holds of a stage; empty where it says nothing.
+class ShownStage:
+    """What the page says of a stage; empty where ``run.json`` says nothing.
 
     Attributes
     ----------
@@ -52,32 +51,24 @@ class StageRecord:
     peak_mb: float | None = None
 
     @classmethod
-    def of(cls, stage: str, found: Mapping[str, Any]) -> StageRecord:
-        """From the stage's object in ``run.json``."""
-        cost = found.get("cost") or {}
-        summary = {key: value for key, value in (found.get("summary") or {}).items() if key not in _UNSTABLE}
-        inputs, artefacts = found.get("inputs", ""), found.get("artefacts", {})
-        return cls(stage, inputs, artefacts, summary, cost.get("seconds"), cost.get("peak_mb"))
+    def of(cls, stage: str, record: StageRecord) -> ShownStage:
+        """From what ``run.json`` holds of it."""
+        summary = {key: value for key, value in record.summary.items() if key not in _UNSTABLE}
+        cost = record.cost.to_json()
+        return cls(stage, record.inputs, record.artefacts, summary, cost["seconds"], cost["peak_mb"])
 
 
 @dataclass(frozen=True)
-class RunRecord:
-    """What ``run.json`` holds of the stages before the report."""
+class ShownRun:
+    """What the page says of the stages before the report."""
 
-    stages: Mapping[str, StageRecord]
+    stages: Mapping[str, ShownStage]
 
     @classmethod
-    def read(cls, out: Path) -> RunRecord:
+    def read(cls, out: Path) -> ShownRun:
         """From ``out / "run.json"``; empty where there is none, InputError where it is damaged."""
-        path = out / "run.json"
-        found: Any = {}
-        if path.is_file():
-            try:
-                found = json.loads(path.read_text(encoding="utf-8"))
-            except (json.JSONDecodeError, UnicodeDecodeError) as error:
-                raise InputError(path, f"is not a run's record ({error})", "remove it and run again") from None
-        stages = found.get("stages", {}) if isinstance(found, dict) else {}
-        return cls({name: StageRecord.of(name, stages.get(name) or {}) for name in STAGES})
+        known = RunRecord.read(out).stages if (out / RECORD).is_file() else {}
+        return cls({name: ShownStage.of(name, known[name]) if name in known else ShownStage(name) for name in STAGES})
 
     @property
     def total_s(self) -> float:
@@ -122,7 +113,7 @@ class StudySummary:
     figure: str
 
     @classmethod
-    def read(cls, out: Path, record: RunRecord) -> StudySummary | None:
+    def read(cls, out: Path, run: ShownRun) -> StudySummary | None:
         """A study of what the run ran on: its own setting, the reference, the front, the default; None where there is
         no such study."""
         table, figure = (out / name for name in ACCURACY)
@@ -130,7 +121,7 @@ class StudySummary:
         if study is None:
             return None
         rows, about = study
-        if any(name not in record.stages or record.stages[name].inputs != key for name, key in about["stages"].items()):
+        if any(name not in run.stages or run.stages[name].inputs != key for name, key in about["stages"].items()):
             return None
         names = [column.name for column in fields(StudiedSetting)]
         settings = (StudiedSetting(**{name: row[name] for name in names}) for row in rows)

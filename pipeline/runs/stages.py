@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from pipeline.artefacts import schemas
+from pipeline.artefacts.run_record import STAGES
 from pipeline.core import files, source
 from pipeline.core.cost import Cost, measured
-from pipeline.core.progress import Progress
 from pipeline.core.version import __version__
-from pipeline.scenario.models import Scenario
-
-STAGES = ("statics", "scan", "traffic", "tpog", "score", "report")
-"""In the order of running. The two branches do not know each other; the quick one comes first, so that a site in a wall
-is told before traffic is simulated."""
+from pipeline.effects import registry
+from pipeline.stages.base import StageInputs, Workspace
 
 RANKING = STAGES[:-1]
 """What a ranking takes; the report is left out."""
@@ -34,10 +30,13 @@ class Inputs:
         version.
     files
         The files among it: name -> sha256.
+    read
+        As the stage named it.
     """
 
     key: str
     files: dict[str, str]
+    read: StageInputs
 
 
 @dataclass(frozen=True)
@@ -60,14 +59,34 @@ class Made:
     cost: Cost
 
 
-def module_name(stage: str) -> str:
-    """Where a stage lives."""
-    return "pipeline.report.page" if stage == "report" else f"pipeline.stages.{stage}"
-
-
 def module_of(stage: str) -> ModuleType:
     """A stage's module, imported when it is needed (``--help`` stays quick)."""
-    return importlib.import_module(module_name(stage))
+    match stage:
+        case "statics":
+            from pipeline.stages import statics
+
+            return statics
+        case "scan":
+            from pipeline.stages import scan
+
+            return scan
+        case "traffic":
+            from pipeline.stages import traffic
+
+            return traffic
+        case "tpog":
+            from pipeline.stages import tpog
+
+            return tpog
+        case "score":
+            from pipeline.stages import score
+
+            return score
+        case "report":
+            from pipeline.report import page
+
+            return page
+    raise ValueError(f"no stage {stage!r}; one of {', '.join(STAGES)}")
 
 
 def artefacts_of(stage: str) -> tuple[str, ...]:
@@ -75,20 +94,21 @@ def artefacts_of(stage: str) -> tuple[str, ...]:
     return tuple(module_of(stage).ARTEFACTS)
 
 
-def inputs(stage: str, scenario: Scenario, out: Path) -> Inputs:
-    """Everything that a stage's artefacts depend on; ``out`` holds those of the stages before."""
-    read: dict[str, Any] = module_of(stage).inputs(scenario, out)
-    about = {"egvs": __version__, "stage": stage, "inputs": read, "program": _program(stage, scenario)}
-    return Inputs(files.hash_of(about), dict(read["files"]))
+def inputs(stage: str, work: Workspace) -> Inputs:
+    """Everything that a stage's artefacts depend on; ``work`` holds those of the stages before."""
+    read: StageInputs = module_of(stage).inputs(work)
+    about = {"egvs": __version__, "stage": stage, "inputs": read.to_json(), "program": _program(stage, read, work)}
+    return Inputs(files.hash_of(about), dict(read.files), read)
 
 
-def make(stage: str, scenario: Scenario, out: Path, *, jobs: int | None, progress: Progress, **options: Any) -> Made:
-    """Run a stage in ``out``, where the artefacts of the stages before lie."""
-    module = module_of(stage)
+def make(stage: str, work: Workspace, inputs: Inputs, **options: Any) -> Made:
+    """Run a stage in a workspace, where the artefacts of the stages before lie."""
+    module, out = module_of(stage), work.folder
     before = _companions(module, out)
+    work.forget(*module.ARTEFACTS)
     with measured() as cost:
-        summary = module.run(scenario, out, jobs=jobs, progress=progress, **options)
-    artefacts = {name: files.sha256_of(out / name) for name in module.ARTEFACTS if (out / name).exists()}
+        summary = module.run(work, inputs.read, **options)
+    artefacts = work.digests(*(name for name in module.ARTEFACTS if (out / name).exists()))
     written = (name for name, stamp in _companions(module, out).items() if before.get(name) != stamp)
     return Made(artefacts, tuple(sorted(written)), summary, cost)
 
@@ -105,33 +125,24 @@ def _companions(module: ModuleType, out: Path) -> dict[str, tuple[int, int, int]
     return found
 
 
-def _program(stage: str, scenario: Scenario) -> dict[str, Any]:
-    """What a stage's artefacts depend on beside its inputs: its source, that of the effects that the scenario names for
-    it, its schemas and templates, and the libraries."""
-    own, effects = source.of(module_name(stage)), _effects(stage, scenario)
-    libraries = own.libraries.union(*(effect.libraries for _, effect in effects.values()))
+def _program(stage: str, read: StageInputs, work: Workspace) -> dict[str, Any]:
+    """What a stage's artefacts depend on beside its inputs: its source, that of the effects that act in it (and, since
+    its summary names them, of those that turn out to change nothing), its schemas and templates, and the libraries."""
+    named = registry.named(work.scenario, *_ASKS.get(stage, (stage,)))
+    effects = sorted({*read.code, *(type(effect) for effect in named)}, key=lambda effect: effect.__module__)
+    own, theirs = source.of(module_of(stage).__name__), [source.of_object(effect) for effect in effects]
+    libraries = own.libraries.union(*(effect.libraries for effect in theirs))
     return {
         "source": own.digest,
-        "effects": {name: (parameters, effect.digest) for name, (parameters, effect) in effects.items()},
+        "effects": [effect.digest for effect in theirs],
+        "named": registry.settings(named),
         "files": {path.name: files.sha256_of(path) for path in _data(stage)},
         "libraries": source.versions(libraries),
     }
 
 
-def _effects(stage: str, scenario: Scenario) -> dict[str, tuple[dict[str, Any], source.Source]]:
-    """Named effects that a stage may ask, those that turn out to change nothing too: the stage's summary names them.
-
-    Score casts, and the report marches, what the scan does: both ask its effects as well."""
-    if not scenario.effects:
-        return {}
-    from pipeline.effects import registry
-
-    asked = ("scan", "score") if stage in ("score", "report") else (stage,)
-    return {
-        effect.NAME: (effect.parameters.model_dump(mode="json"), source.of_object(type(effect)))
-        for acts_in in asked
-        for effect in registry.of(scenario, acts_in)
-    }
+_ASKS = {"score": ("scan", "score"), "report": ("scan", "score")}
+"""Score casts, and the report marches, what the scan does: both ask its effects as well."""
 
 
 def _data(stage: str) -> list[Path]:

@@ -18,16 +18,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from pipeline.artefacts.run_record import RECORD, STAGES, RunRecord, StageRecord
 from pipeline.core import files
 from pipeline.core.errors import InputError
 from pipeline.core.progress import Progress, silent
+from pipeline.core.version import __version__
 from pipeline.runs import stages
 from pipeline.runs.locking import alone
-from pipeline.runs.record import RECORD, RunRecord, StageRecord
-from pipeline.runs.stages import STAGES, Inputs, Made
+from pipeline.runs.stages import Inputs, Made
 from pipeline.runs.store import Store
 from pipeline.scenario.loading import from_values
 from pipeline.scenario.models import Scenario
+from pipeline.stages.base import Workspace
 
 StageListener = Callable[[str, str, StageRecord | None], None]
 """Called with (stage, state, its record) as a run goes on. States: "runs" (no record yet), then "done"; or "skipped"
@@ -68,10 +70,10 @@ def run(
     """
     folder = Path(out) if out is not None else default_folder(scenario)
     with alone(folder):
-        work = _Work(scenario, folder, Store.default(), jobs, progress, listener)
-        record = RunRecord.going_on(scenario, folder)
+        run = _Run(Workspace(scenario, folder, jobs=jobs, progress=progress), Store.default(), listener)
+        record = _going_on(scenario, folder)
         for name in STAGES:
-            record = work.bring(name, record, **(options or {}).get(name, {}))
+            record = run.bring(name, record, **(options or {}).get(name, {}))
         return record
 
 
@@ -87,9 +89,10 @@ def run_one(
 ) -> RunRecord:
     """Run a single stage, whether its inputs changed or not, and note it in ``run.json``."""
     with alone(out):
-        work = _Work(scenario, out, Store.default(), jobs, progress, listener)
-        record = work.bring(name, RunRecord.going_on(scenario, out), again=True, **options)
-        for other in [stage for stage in record.stages if stage != name and not _is_of(stage, scenario, out, record)]:
+        work = Workspace(scenario, out, jobs=jobs, progress=progress)
+        run = _Run(work, Store.default(), listener)
+        record = run.bring(name, _going_on(scenario, out), again=True, **options)
+        for other in [stage for stage in record.stages if stage != name and not _is_of(stage, work, record)]:
             record = record.having(other, None)  # of other settings: the record would contradict itself
         record.write(out)
         return record
@@ -109,9 +112,10 @@ def refresh_report(out: Path) -> Path | None:
     if not all(name in record.stages for name in STAGES) or not source.is_dir():
         return None
     scenario = from_values(record.scenario, source, str(out / RECORD))
-    if not all(_is_of(name, scenario, out, record) for name in STAGES if name != "report"):
+    work = Workspace(scenario, out)
+    if not all(_is_of(name, work, record) for name in STAGES if name != "report"):
         return None
-    _Work(scenario, out, Store.default(), None, silent, unheard).bring("report", record)
+    _Run(work, Store.default(), unheard).bring("report", record)
     return out / "report.html"
 
 
@@ -121,21 +125,15 @@ def default_folder(scenario: Scenario) -> Path:
 
 
 def fetch_or_make(
-    name: str,
-    scenario: Scenario,
-    out: Path,
-    key: str,
-    store: Store,
-    make: Callable[[], Made],
-    *,
-    progress: Progress = silent,
-    link: bool = False,
+    name: str, work: Workspace, key: str, store: Store, make: Callable[[], Made], *, link: bool = False
 ) -> tuple[Made, bool]:
-    """A stage's artefacts in ``out``: from the store, else made, and kept there; of several processes that want the
+    """A stage's artefacts in a workspace: from the store, else made, and kept there; of several processes that want the
     same, one makes it. Returns what came of it, and whether it came from the store."""
+    out = work.folder
+    work.forget(*stages.artefacts_of(name))
     entry = store.take(name, key, out, link=link)
     if entry is None:
-        with store.maker(name, key, progress=progress):
+        with store.maker(name, key, progress=work.progress):
             entry = store.take(name, key, out, link=link)  # another one has made it meanwhile
             if entry is None:
                 made = make()
@@ -147,59 +145,70 @@ def fetch_or_make(
 
 
 @dataclass(frozen=True)
-class _Work:
+class _Run:
     """One scenario in one folder."""
 
-    scenario: Scenario
-    out: Path
+    work: Workspace
     store: Store
-    jobs: int | None
-    progress: Progress
     listener: StageListener
 
     def bring(self, name: str, record: RunRecord, *, again: bool = False, **options: Any) -> RunRecord:
         """Bring one stage up to date; the record of the run with it, written.
 
         A stage with ``options`` is always run, and its artefacts are not kept in the store; ``again``: always run."""
-        inputs = stages.inputs(name, self.scenario, self.out)
+        work, out = self.work, self.work.folder
+        inputs = stages.inputs(name, work)
         last = record.stages.get(name)
-        if last and not (again or options) and last.inputs == inputs.key and _intact(self.out, last.artefacts):
+        if last and not (again or options) and last.inputs == inputs.key and _intact(work, last.artefacts):
             self.listener(name, "skipped", last)
             return record
-        record = replace(record.having(name, None), scenario=self.scenario.model_dump(mode="json"))
-        record.write(self.out)
+        record = replace(record.having(name, None), scenario=work.scenario.model_dump(mode="json"))
+        record.write(out)
         made, fetched = self._made(name, inputs, again, options)
         done = StageRecord(inputs.key, inputs.files, made.artefacts, made.summary, made.cost)
         record = record.having(name, done)
-        record.write(self.out)
+        record.write(out)
         self.listener(name, "fetched" if fetched else "done", done)
         return record
 
     def _made(self, name: str, inputs: Inputs, again: bool, options: dict[str, Any]) -> tuple[Made, bool]:
+        work = self.work
+
         def make() -> Made:
             self.listener(name, "runs", None)
-            return stages.make(name, self.scenario, self.out, jobs=self.jobs, progress=self.progress, **options)
+            return stages.make(name, work, inputs, **options)
 
         if not (again or options):
-            return fetch_or_make(name, self.scenario, self.out, inputs.key, self.store, make, progress=self.progress)
+            return fetch_or_make(name, work, inputs.key, self.store, make)
         made = make()
         if not options:
             with self.store.maker(name, inputs.key, wait=False) as mine:
                 if mine:
-                    self.store.put(name, inputs.key, self.out, made)
+                    self.store.put(name, inputs.key, work.folder, made)
         return made, False
 
 
-def _is_of(name: str, scenario: Scenario, out: Path, record: RunRecord) -> bool:
+def _before_the_first_stage(scenario: Scenario, folder: Path) -> RunRecord:
+    home = Path(os.path.relpath(scenario.folder, folder)).as_posix()
+    return RunRecord(__version__, scenario.seed, scenario.model_dump(mode="json"), home, {})
+
+
+def _going_on(scenario: Scenario, folder: Path) -> RunRecord:
+    """What is known of earlier work in this folder, with the scenario as it is now."""
+    record = _before_the_first_stage(scenario, folder)
+    return replace(record, stages=RunRecord.read(folder).stages) if (folder / RECORD).is_file() else record
+
+
+def _is_of(name: str, work: Workspace, record: RunRecord) -> bool:
     """Whether a stage's last run is what this scenario, and the artefacts as they are now, would give."""
     try:
-        return record.stages[name].inputs == stages.inputs(name, scenario, out).key
+        return record.stages[name].inputs == stages.inputs(name, work).key
     except InputError:
         return False
 
 
-def _intact(out: Path, artefacts: dict[str, str]) -> bool:
-    return all((out / name).is_file() and files.sha256_of(out / name) == digest for name, digest in artefacts.items())
+def _intact(work: Workspace, artefacts: dict[str, str]) -> bool:
+    return all(work.path(name).is_file() and work.digest(name) == digest for name, digest in artefacts.items())
 
 
 def verify(
@@ -233,17 +242,20 @@ def verify(
     wrong = [f"{name} was altered after the run" for name in _altered(folder, record)]
     with tempfile.TemporaryDirectory(prefix="egvs-verify-") as temporary:
         elsewhere = Path(temporary)
-        again = RunRecord.of(scenario, elsewhere)
+        again, work = (
+            _before_the_first_stage(scenario, elsewhere),
+            Workspace(scenario, elsewhere, jobs=jobs, progress=progress),
+        )
         made_by_stages = {artefact for stage in record.stages.values() for artefact in stage.artefacts}
         for name, before in record.stages.items():
             beside = before.files.keys() - made_by_stages
             _lay_beside(folder, elsewhere, {file: before.files[file] for file in beside})
-            inputs = stages.inputs(name, scenario, elsewhere)
+            inputs = stages.inputs(name, work)
             for file in sorted(file for file in beside if inputs.files.get(file) != before.files[file]):
                 made_of_it = " and ".join(before.artefacts) or f"the stage {name}"
                 wrong.append(f"{made_of_it} shows {file}, which was replaced since; egvs {name} makes it anew")
             listener(name, "runs", None)
-            made = stages.make(name, scenario, elsewhere, jobs=jobs, progress=progress)
+            made = stages.make(name, work, inputs)
             after = StageRecord(inputs.key, inputs.files, made.artefacts, made.summary, made.cost)
             listener(name, "done", after)
             again = again.having(name, replace(after, cost=before.cost))  # which the report shows

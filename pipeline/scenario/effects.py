@@ -208,9 +208,9 @@ class EffectsModel(StrictModel):
     divergence: DivergenceParameters | None = None
     mount_sway: MountSwayParameters | None = None
     foliage: FoliageParameters | None = None
-    slope: SlopeParameters | None = None
-    articulated: ArticulatedParameters | None = None
     pedestrians_bicycles: PedestriansBicyclesParameters | None = None
+    articulated: ArticulatedParameters | None = None
+    slope: SlopeParameters | None = None
 
     __pydantic_extra__: dict[str, Any]
     OWN: ClassVar[tuple[str, ...]]

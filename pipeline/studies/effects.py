@@ -87,7 +87,7 @@ def catalogue() -> list[Call]:
 
 def called(scenario: Scenario) -> list[Call]:
     """Every effect before ``scenario``: on, off, skipped because it provably changes nothing, or refused; and why."""
-    scene = effects.Scene(scenario, statics.build(scenario, statics.Tally.empty()), sites.of(scenario))
+    scene = effects.Scene(scenario, statics.build(scenario)[0], sites.of(scenario))
     return [_call(name, scene) for name in effects.KINDS]
 
 
@@ -108,8 +108,8 @@ def prices(scenario: Scenario, out: Path) -> dict[str, Price] | None:
 
 def _call(name: str, scene: effects.Scene) -> Call:
     stage, kind = effects.KINDS[name]
-    if name == effects.SELF_ACTING:
-        on, why = _module(name).decide(scene.scenario)
+    if name in effects.SELF_ACTING:
+        on, why = _module(name).EFFECT(effects.Parameters()).acts(scene.scenario)
         return Call(name, stage, kind, "on" if on else "off", why, _source(name))
     if name not in scene.scenario.effects:
         return Call(name, stage, kind, "off", "not named", _source(name))

@@ -228,9 +228,9 @@ def _others(scenario: Scenario) -> Iterator[str]:
     """Effects that are not named, need no parameter, and would act."""
     place, scene = f"{scenario.file}: effects", None
     for name in effects.KINDS:
-        if name in scenario.effects or name == effects.SELF_ACTING or effects.needs(name):
+        if name in scenario.effects or name in effects.SELF_ACTING or effects.needs(name):
             continue
-        scene = scene or effects.Scene(scenario, statics.build(scenario, statics.Tally.empty()), sites.of(scenario))
+        scene = scene or effects.Scene(scenario, statics.build(scenario)[0], sites.of(scenario))
         effect = effects.make(name, {}, place)
         if effect.idle(scene) is None and effect.lacks(scene) is None:
             yield name

@@ -1,4 +1,4 @@
-"""How does SUMO's point on a front bumper become a box, and how do the boxes of a recording behave?
+"""Turns SUMO's points on front bumpers into boxes.
 
 SUMO gives x, y (and z on networks with heights) of the middle of the front bumper, an angle a in degrees clockwise from
 north, and a slope p in degrees, uphill positive. The box of length L and height H has its centre at
@@ -11,7 +11,6 @@ degrees, exact at multiples of 90. Positions are rounded to 1 micrometre, angles
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -21,14 +20,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from pipeline.core.errors import InputError
-from pipeline.traffic.fcd import Group
-
-STANDING_M_S = 0.1
-"""A vehicle slower than this stands."""
-
-_SHRINK_M = 1e-3
-_MOST_CELLS = 2**20
-"""Along x and along y, so that the number of a cell in a frame of a group fits 64 bits."""
+from pipeline.traffic.frames import FrameGroup
 
 _POSITION_DIGITS, _ANGLE_DIGITS = 6, 9
 Floats = NDArray[np.float64]
@@ -46,7 +38,7 @@ class Size:
 
 
 @dataclass(frozen=True)
-class Boxes:
+class VehicleBoxes:
     """Vehicle boxes of consecutive frames, sorted by frame, then vehicle. Arrays have one element a row."""
 
     first_frame: int
@@ -72,8 +64,8 @@ class Boxes:
     """Position in ``types``, SUMO's vehicle types."""
     part: Ints | None = None
     """0, or 1.. for the rear parts of an articulated vehicle; None where every vehicle is one box."""
-    apart: NDArray[np.bool_] | None = None
-    """Those who do not count as vehicles of the scenario (an effect's pedestrians and bicycles); None where all
+    uncounted: NDArray[np.bool_] | None = None
+    """Those who do not count as vehicles of the scenario (an extension's pedestrians and bicycles); None where all
     count."""
 
     def rows(self, index: Ints) -> dict[str, Any]:
@@ -81,7 +73,7 @@ class Boxes:
         arrays = {name: value for name, value in self.__dict__.items() if isinstance(value, np.ndarray)}
         return {name: value[index] for name, value in arrays.items()}
 
-    def only(self, kept: NDArray[np.bool_]) -> Boxes:
+    def only(self, kept: NDArray[np.bool_]) -> VehicleBoxes:
         """Some of the rows."""
         return replace(self, **self.rows(np.flatnonzero(kept)))
 
@@ -100,10 +92,14 @@ class Boxes:
         }
 
 
-def boxes(
-    group: Group, sizes: Mapping[str, Size], period_s: float, place: str, apart: frozenset[str] = frozenset()
-) -> Boxes:
-    """The boxes of a group of whole frames. Vehicles of the types in ``apart`` do not count as the scenario's.
+def from_bumpers(
+    group: FrameGroup,
+    sizes: Mapping[str, Size],
+    period_s: float,
+    place: str,
+    uncounted_types: frozenset[str] = frozenset(),
+) -> VehicleBoxes:
+    """The boxes of a group of whole frames. Those of ``uncounted_types`` do not count as vehicles of the scenario.
 
     Raises
     ------
@@ -136,7 +132,7 @@ def boxes(
         group.rows[key].to_numpy()[order] for key in ("x", "y", "z", "angle", "slope", "speed")
     )
     centre = centres(x, y, z, angle, slope, length, height)
-    found = Boxes(
+    boxes = VehicleBoxes(
         group.first_frame,
         group.frames,
         frame,
@@ -153,9 +149,13 @@ def boxes(
         speed,
         types,
         type_code,
-        apart=np.array([name in apart for name in types], dtype=np.bool_)[type_code] if apart else None,
+        uncounted=_is_one_of(uncounted_types, types)[type_code] if uncounted_types else None,
     )
-    return found if not np.isnan(speed).any() else _with_speed(found, period_s)
+    return boxes if not np.isnan(speed).any() else _with_speed(boxes, period_s)
+
+
+def _is_one_of(some: frozenset[str], types: list[str]) -> NDArray[np.bool_]:
+    return np.array([name in some for name in types], dtype=np.bool_)
 
 
 def centres(
@@ -196,18 +196,18 @@ def tidy_rad(values: Floats) -> Floats:
     return _tidy(values, _ANGLE_DIGITS)
 
 
-def _with_speed(found: Boxes, period_s: float) -> Boxes:
+def _with_speed(boxes: VehicleBoxes, period_s: float) -> VehicleBoxes:
     """Fill speeds that the file does not give from the way to the next frame, or from the last one where there is
     none."""
-    order = np.lexsort((found.frame, found.code))
-    follows = (np.diff(found.code[order]) == 0) & (np.diff(found.frame[order]) == 1)
-    way = np.hypot(np.diff(found.x_m[order]), np.diff(found.y_m[order])) / period_s
+    order = np.lexsort((boxes.frame, boxes.code))
+    follows = (np.diff(boxes.code[order]) == 0) & (np.diff(boxes.frame[order]) == 1)
+    way = np.hypot(np.diff(boxes.x_m[order]), np.diff(boxes.y_m[order])) / period_s
     way = np.where(follows, way, np.nan)
     onward, back = np.append(way, np.nan), np.insert(way, 0, np.nan)
     speed = np.empty(order.size)
     speed[order] = np.where(np.isnan(onward), back, onward)
-    speed = np.where(np.isnan(found.speed_m_s), speed, found.speed_m_s)
-    return replace(found, speed_m_s=speed)
+    speed = np.where(np.isnan(boxes.speed_m_s), speed, boxes.speed_m_s)
+    return replace(boxes, speed_m_s=speed)
 
 
 def _sorted_codes(column: pa.ChunkedArray) -> tuple[list[str], Ints]:
@@ -224,175 +224,3 @@ def _sorted_codes(column: pa.ChunkedArray) -> tuple[list[str], Ints]:
 
 def _strings(values: list[str], code: Ints) -> pa.Array:
     return pa.array(values, type=pa.string()).take(pa.array(code))
-
-
-def overlapping(found: Boxes) -> NDArray[np.int64]:
-    """Pairs of rows (n, 2) in the same frame whose boxes, made 1 mm smaller on each side, share area and height.
-
-    Exact for rectangles (separating axes). Candidates come from square cells, at least as wide as the longest diagonal:
-    a pair that overlaps lies in one cell or in two that touch. Cells are numbered along y, then x, then by frame, with
-    an empty row and column between, so that a box's later neighbours are two runs: its own cell and the next, and three
-    cells of the next column."""
-    if not found.frame.size:
-        return np.empty((0, 2), dtype=np.int64)
-    half = np.hypot(found.length_m, found.width_m) / 2
-    side = max(2 * half.max(), max(np.ptp(found.x_m), np.ptp(found.y_m)) / _MOST_CELLS)
-    column, row = (np.floor((m - m.min()) / side).astype(np.int64) for m in (found.x_m, found.y_m))
-    high, wide = int(row.max()) + 3, int(column.max()) + 2
-    cell = ((found.frame - found.first_frame) * wide + column) * high + row + 1
-    order = np.argsort(cell, kind="stable")
-    cell, x, y, half = cell[order], found.x_m[order], found.y_m[order], half[order]
-    everyone = np.arange(order.size)
-    runs = (
-        (everyone + 1, np.searchsorted(cell, cell + 1, side="right")),
-        (np.searchsorted(cell, cell + high - 1), np.searchsorted(cell, cell + high + 1, side="right")),
-    )
-    hits = []
-    for second, end in runs:
-        first = everyone
-        while (left := second < end).any():
-            first, second, end = first[left], second[left], end[left]
-            near = (x[second] - x[first]) ** 2 + (y[second] - y[first]) ** 2 < (half[first] + half[second]) ** 2
-            a, b = order[first[near]], order[second[near]]
-            hit = _share_space(found, a, b)
-            hits.append(np.column_stack([np.minimum(a, b)[hit], np.maximum(a, b)[hit]]))
-            second = second + 1
-    return np.concatenate([np.empty((0, 2), dtype=np.int64), *hits])
-
-
-def _share_space(found: Boxes, a: Ints, b: Ints) -> NDArray[np.bool_]:
-    dx, dy = found.x_m[b] - found.x_m[a], found.y_m[b] - found.y_m[a]
-    cos_a, sin_a = np.cos(found.yaw_rad[a]), np.sin(found.yaw_rad[a])
-    cos_b, sin_b = np.cos(found.yaw_rad[b]), np.sin(found.yaw_rad[b])
-    # of the angle between both headings: how much of the one's length and width points along the other's
-    along, across = np.abs(cos_a * cos_b + sin_a * sin_b), np.abs(cos_a * sin_b - sin_a * cos_b)
-    (long_a, wide_a), (long_b, wide_b) = (
-        (found.length_m[i] / 2 - _SHRINK_M, found.width_m[i] / 2 - _SHRINK_M) for i in (a, b)
-    )
-    apart = np.abs(dx * cos_a + dy * sin_a) >= long_a + long_b * along + wide_b * across
-    apart |= np.abs(dy * cos_a - dx * sin_a) >= wide_a + long_b * across + wide_b * along
-    apart |= np.abs(dx * cos_b + dy * sin_b) >= long_b + long_a * along + wide_a * across
-    apart |= np.abs(dy * cos_b - dx * sin_b) >= wide_b + long_a * across + wide_a * along
-    apart |= np.abs(found.z_m[a] - found.z_m[b]) >= (found.height_m[a] + found.height_m[b]) / 2 - 2 * _SHRINK_M
-    together: NDArray[np.bool_] = np.logical_not(apart)
-    return together
-
-
-def _whole_pairs(found: Boxes, pairs: Ints) -> Ints:
-    """Pairs of parts -> pairs of vehicles, each once, as rows of the boxes that are left when only first parts are
-    kept."""
-    assert found.part is not None
-    vehicle = np.cumsum(found.part == 0) - 1
-    return np.unique(vehicle[pairs], axis=0).reshape(-1, 2)
-
-
-@dataclass
-class Tally:
-    """What a recording amounts to, added up group by group."""
-
-    frames: int
-    vehicles: Ints = field(init=False)
-    """Vehicles in each frame."""
-    different: set[str] = field(default_factory=set)
-    rows: int = 0
-    speed_sum: float = 0.0
-    standing: int = 0
-    overlapping_pairs: int = 0
-    frames_with_overlap: int = 0
-    longest_standing_frames: int = 0
-    stands_since: dict[str, int] = field(default_factory=dict)
-    """Vehicles that stand in the last frame added, and the frame since when."""
-    apart: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Of each kind that does not count as a vehicle: how many in a frame, and which different ones."""
-    mixed_overlaps: Counter[str] = field(default_factory=Counter)
-    """Overlapping pairs in which one at least does not count as a vehicle, by their kinds."""
-
-    def __post_init__(self) -> None:
-        self.vehicles = np.zeros(self.frames, dtype=np.int64)
-
-    def add(self, found: Boxes) -> None:
-        """Count the next group."""
-        end, pairs = found.first_frame + found.frames, overlapping(found)
-        if found.part is not None:  # the parts of one vehicle touch at their joint
-            pairs = pairs[found.code[pairs[:, 0]] != found.code[pairs[:, 1]]]
-            pairs, found = _whole_pairs(found, pairs), found.only(found.part == 0)
-        self._add_standing(found, end)
-        if found.apart is not None:
-            pairs, found = self._add_apart(found, pairs)
-        self.vehicles[found.first_frame : end] = np.bincount(found.frame - found.first_frame, minlength=found.frames)
-        self.different.update(found.names if found.apart is None else (found.names[i] for i in np.unique(found.code)))
-        self.rows += found.frame.size
-        self.speed_sum += float(np.nansum(found.speed_m_s))
-        self.standing += int(np.count_nonzero(found.speed_m_s < STANDING_M_S))
-        self.overlapping_pairs += len(pairs)
-        self.frames_with_overlap += np.unique(found.frame[pairs[:, 0]]).size
-
-    def _add_apart(self, found: Boxes, pairs: Ints) -> tuple[Ints, Boxes]:
-        """Count who does not count as a vehicle; what is left: vehicles, and the pairs of them that overlap."""
-        assert found.apart is not None
-        end = found.first_frame + found.frames
-        for kind in np.unique(found.kind[found.apart]):
-            mine = found.apart & (found.kind == kind)
-            about = self.apart.setdefault(
-                found.kinds[kind], {"frame": np.zeros(self.frames, np.int64), "different": set()}
-            )
-            about["frame"][found.first_frame : end] = np.bincount(
-                found.frame[mine] - found.first_frame, minlength=found.frames
-            )
-            about["different"].update(found.names[i] for i in np.unique(found.code[mine]))
-        mixed = found.apart[pairs].any(axis=1)
-        self.mixed_overlaps.update(
-            " and ".join(sorted(found.kinds[found.kind[i]] for i in pair)) for pair in pairs[mixed]
-        )
-        counted = ~found.apart
-        return (np.cumsum(counted) - 1)[pairs[~mixed]], found.only(counted)
-
-    def _add_standing(self, found: Boxes, end: int) -> None:
-        """Follow each vehicle's runs of standing frames, across groups."""
-        order = np.lexsort((found.frame, found.code))
-        stands = order[found.speed_m_s[order] < STANDING_M_S]
-        frame, code = found.frame[stands], found.code[stands]
-        begins = np.flatnonzero((np.diff(code, prepend=-1) != 0) | (np.diff(frame, prepend=-2) != 1))
-        ends = np.append(begins[1:], stands.size) - 1
-        still: dict[str, int] = {}
-        for first, last in zip(begins.tolist(), ends.tolist(), strict=True) if stands.size else ():
-            name, since = found.names[code[first]], int(frame[first])
-            if since == found.first_frame:
-                since = self.stands_since.get(name, since)
-            self.longest_standing_frames = max(self.longest_standing_frames, int(frame[last]) - since)
-            if frame[last] == end - 1:
-                still[name] = since
-        self.stands_since = still
-
-    def result(self, period_s: float) -> dict[str, Any]:
-        """As the stage reports it."""
-        return {
-            "frames": self.frames,
-            "vehicles": {
-                "fewest": int(self.vehicles.min()),
-                "most": int(self.vehicles.max()),
-                "different": len(self.different),
-            },
-            "rows": self.rows,
-            "mean_speed_m_s": round(self.speed_sum / self.rows, 4) if self.rows else 0.0,
-            "share_standing": round(self.standing / self.rows, 4) if self.rows else 0.0,
-            "longest_standing_s": round(self.longest_standing_frames * period_s, 3),
-            "overlapping_pairs": self.overlapping_pairs,
-            "frames_with_overlap": self.frames_with_overlap,
-            **self._apart_result(),
-        }
-
-    def _apart_result(self) -> dict[str, Any]:
-        """Nothing where everybody counts as a vehicle."""
-        if not self.apart:
-            return {}
-        about = {
-            kind: {
-                "fewest": int(values["frame"].min()),
-                "most": int(values["frame"].max()),
-                "mean": round(float(values["frame"].mean()), 3),
-                "different": len(values["different"]),
-            }
-            for kind, values in sorted(self.apart.items())
-        }
-        return {"beside_vehicles": about | {"overlapping_pairs": dict(sorted(self.mixed_overlaps.items()))}}

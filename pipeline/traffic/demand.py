@@ -1,4 +1,4 @@
-"""Which trips are drawn when the scenario names a network but no routes?
+"""Draws trips for a scenario that names a network but no routes.
 
 Steps: for each kind of vehicle, find the pairs of edges that a trip may join; draw, for each departure, a kind by its
 share and one of its pairs by the weights of both ends (their lanes, unless the scenario says otherwise); write trips
@@ -61,18 +61,18 @@ def pairs(network: Network, kind: VehicleKind, traffic: TrafficModel, rng: np.ra
     min_trip_m, weights = traffic.min_trip_m, _weights(network, lanes, traffic, place)
     links = network.links(kind.vclass)
     sources, sinks = _fringe(lanes, links)
-    if not (found := _reachable(network, weights, links, sources, sinks, min_trip_m)).origin.size:
+    if not (trips := _reachable(network, weights, links, sources, sinks, min_trip_m)).origin.size:
         far = max(min_trip_m, _FAR_SHARE * network.diagonal_m)
         anywhere = np.flatnonzero(lanes)
         some = np.sort(rng.choice(anywhere, min(_MAX_ORIGINS, anywhere.size), replace=False))
-        found = _reachable(network, weights, links, some, anywhere, far, fringe=False)
-    if not found.weight.any():
+        trips = _reachable(network, weights, links, some, anywhere, far, fringe=False)
+    if not trips.weight.any():
         raise InputError(
             f"{place}.kinds",
             f"kind {kind.name!r} (vClass {kind.vclass}) can go from no edge to another that is {min_trip_m:g} m away",
             "a connected network, or a smaller min_trip_m",
         )
-    return found
+    return trips
 
 
 def _weights(network: Network, lanes: NDArray[np.float64], traffic: TrafficModel, place: str) -> NDArray[np.float64]:
@@ -133,9 +133,9 @@ def draw(
     shares = np.array([kind.share for kind in kinds])
     chosen = rng.choice(len(kinds), size=departs_s.size, p=shares / shares.sum())
     pick = np.empty(departs_s.size, dtype=np.int64)
-    for index, found in enumerate(all_pairs):
-        mine = chosen == index
-        pick[mine] = rng.choice(found.origin.size, size=int(mine.sum()), p=found.weight / found.weight.sum())
+    for index, trips in enumerate(all_pairs):
+        of_kind = chosen == index
+        pick[of_kind] = rng.choice(trips.origin.size, size=int(of_kind.sum()), p=trips.weight / trips.weight.sum())
     return [
         (kinds[k].name, network.edges[all_pairs[k].origin[i]].id, network.edges[all_pairs[k].target[i]].id)
         for k, i in zip(chosen, pick, strict=True)

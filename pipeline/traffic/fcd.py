@@ -1,8 +1,7 @@
-"""What does a file of floating car data (FCD) say, whatever its format?
+"""Reads files of floating car data (FCD), whatever their format.
 
 Reads what SUMO writes with ``--fcd-output``: CSV, XML or Parquet, each maybe gzipped, told apart by their first bytes.
 Hands out Arrow tables with the columns of :data:`SCHEMA`, piece by piece, so that memory does not grow with the file.
-Then cuts the stream into groups of whole frames.
 
 Positions are SUMO's own: the middle of the front bumper in metres, the angle in degrees clockwise from north, the slope
 in degrees. Times are whole milliseconds, SUMO's own unit. Rows without a vehicle (SUMO writes one for an empty step)
@@ -12,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +47,8 @@ _BLOCK_BYTES = 1 << 20
 """Arrow reads dozens of blocks ahead: with 4 MiB they take 150 MB, and reading is no faster."""
 
 _BATCH_ROWS = 1 << 16
-_RIGHT = "FCD with the attributes id, x, y, angle and type (--fcd-output.attributes id,x,y,z,angle,slope,type,speed)"
+RIGHT = "FCD with the attributes id, x, y, angle and type (--fcd-output.attributes id,x,y,z,angle,slope,type,speed)"
+"""What a message asks for where a file is not right."""
 
 
 def read(path: Path, who: str = "vehicle") -> Iterator[pa.Table]:
@@ -71,7 +70,7 @@ def read(path: Path, who: str = "vehicle") -> Iterator[pa.Table]:
     with safexml.opened(path) as file:
         head = file.read(256).lstrip(b"\xef\xbb\xbf \t\r\n")
     if not head:
-        raise InputError(path, "is empty", _RIGHT)
+        raise InputError(path, "is empty", RIGHT)
     if head.startswith(b"PAR1"):
         yield from _checked(_parquet(path, who), path, "row")
     elif head.startswith(b"<"):
@@ -146,9 +145,7 @@ def _xml_batch(rows: list[dict[str, str]], path: Path) -> pa.RecordBatch:
     columns = {name: pa.array([row.get(name) for row in rows], type=pa.string()) for name in names}
     for row in (i for name in _NEEDED if columns[name].null_count for i in _where(pc.is_null(columns[name]))):
         missing = next(name for name in _NEEDED if name not in rows[row])
-        raise InputError(
-            path, f"vehicle {rows[row].get('id')!r} at time {rows[row]['time']!r} has no {missing}", _RIGHT
-        )
+        raise InputError(path, f"vehicle {rows[row].get('id')!r} at time {rows[row]['time']!r} has no {missing}", RIGHT)
     for name in set(names) - set(_STRINGS):
         try:
             columns[name] = pc.cast(columns[name], pa.float64())
@@ -166,7 +163,7 @@ def _columns(names: list[str], path: Path, who: str) -> dict[str, str]:
     }
     for name in _NEEDED:
         if name not in ours:
-            raise InputError(path, f"there is no column for {name!r} among {', '.join(names)[:200]}", _RIGHT)
+            raise InputError(path, f"there is no column for {name!r} among {', '.join(names)[:200]}", RIGHT)
     return {name: ours[name] for name in (*_NEEDED, *_OPTIONAL) if name in ours}
 
 
@@ -261,128 +258,3 @@ def _where(mask: Any) -> NDArray[np.int64]:
 
 def _damaged(path: Path, what: str, error: Exception) -> InputError:
     return InputError(path, f"cannot be read as {what} ({str(error).splitlines()[0]})", "a whole file; make it again")
-
-
-@dataclass(frozen=True)
-class Window:
-    """Which time steps are frames: ``count`` of them, ``period_ms`` apart.
-
-    The first is at ``first_ms``; where that is None, ``skip_ms`` after the file's own first time step. ``complete``
-    says that every step was recorded, so that a time step without rows is an empty frame and not the end of the file.
-    """
-
-    count: int
-    period_ms: int
-    first_ms: int | None = None
-    skip_ms: int = 0
-    complete: bool = False
-
-
-@dataclass(frozen=True)
-class Group:
-    """Consecutive whole frames: ``rows`` has :data:`SCHEMA` and, at ``frame``, each row's frame."""
-
-    first_frame: int
-    frames: int
-    frame: NDArray[np.int64]
-    rows: pa.Table
-
-
-@dataclass
-class _Cut:
-    window: Window
-    place: str
-    first_ms: int | None = None
-    last_ms: int = 0
-    step_ms: int = 0
-    seen: int = 0
-    start: int = 0
-    frames: list[NDArray[np.int64]] = field(default_factory=list)
-    tables: list[pa.Table] = field(default_factory=list)
-
-    def add(self, table: pa.Table) -> int:
-        """Keep the rows of the window's frames; return how many frames are whole now."""
-        window, time_ms = self.window, table["time_ms"].to_numpy()
-        if self.first_ms is None:
-            own = int(time_ms[0])
-            self.first_ms, self.last_ms = (own + window.skip_ms if window.first_ms is None else window.first_ms), own
-            self.seen = 1
-        steps = np.diff(time_ms, prepend=self.last_ms)
-        steps = steps[steps > 0]
-        self.seen += steps.size
-        self.step_ms = int(np.gcd.reduce(steps, initial=self.step_ms))
-        self.last_ms = int(time_ms[-1])
-        frame, off = np.divmod(time_ms - self.first_ms, window.period_ms)
-        kept = np.flatnonzero((off == 0) & (frame >= 0) & (frame < window.count))
-        if kept.size:
-            self.frames.append(frame[kept])
-            self.tables.append(
-                table.slice(int(kept[0]), int(kept[-1] - kept[0] + 1)) if _solid(kept) else table.take(kept)
-            )
-        return int(np.clip(-((self.first_ms - self.last_ms) // window.period_ms), 0, window.count))
-
-    def take(self, frames: int) -> Group:
-        """The next ``frames`` frames."""
-        end = self.start + frames
-        frame = np.concatenate([np.empty(0, np.int64), *self.frames])
-        rows = pa.concat_tables([SCHEMA.empty_table(), *self.tables])
-        cut = int(np.searchsorted(frame, end))
-        group = Group(self.start, frames, frame[:cut], rows.slice(0, cut).combine_chunks())
-        self.frames, self.tables, self.start = [frame[cut:]], [rows.slice(cut)], end
-        return group
-
-    def finish(self) -> None:
-        """Check that the file held every frame."""
-        window = self.window
-        if window.complete:
-            return
-        if self.first_ms is None:
-            raise InputError(self.place, "holds no vehicle", _RIGHT)
-        if self.step_ms and window.period_ms % self.step_ms:
-            raise InputError(
-                f"{self.place}: frame_period_s = {window.period_ms / 1000:g}",
-                f"the file's time steps are {self.step_ms / 1000:g} s apart",
-                "a multiple of that",
-            )
-        there = max(0, (self.last_ms - self.first_ms) // window.period_ms + 1)
-        if there < window.count:
-            raise InputError(
-                f"{self.place}: frames = {window.count}",
-                f"the file has {there} frames {window.period_ms / 1000:g} s apart after a warm-up of"
-                f" {window.skip_ms / 1000:g} s ({self.seen} time steps in all)",
-                f"at most {there} frames, or a shorter warmup_s",
-            )
-
-
-def together(some: Group, others: Group) -> Group:
-    """Two streams' rows of the same frames as one group."""
-    return Group(
-        some.first_frame,
-        some.frames,
-        np.concatenate([some.frame, others.frame]),
-        pa.concat_tables([some.rows, others.rows]).combine_chunks(),
-    )
-
-
-def _solid(kept: NDArray[np.int64]) -> bool:
-    return bool(kept[-1] - kept[0] + 1 == kept.size)
-
-
-def groups(tables: Iterable[pa.Table], window: Window, frames_each: int, place: str) -> Iterator[Group]:
-    """Cut a stream of rows into groups of ``frames_each`` whole frames (the last may be shorter).
-
-    Raises
-    ------
-    InputError
-        When the stream ends before the window does, or its time steps do not fit the window's period.
-    """
-    cut = _Cut(window, place)
-    for table in tables:
-        whole = cut.add(table)
-        while whole - cut.start >= frames_each:
-            yield cut.take(frames_each)
-        if whole == window.count:
-            break
-    cut.finish()
-    while cut.start < window.count:
-        yield cut.take(min(frames_each, window.count - cut.start))

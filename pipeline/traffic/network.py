@@ -1,18 +1,18 @@
-"""Which roads does a SUMO network have, and who may drive from where to where?
+"""Reads SUMO networks: roads, lanes, connections, junctions, signals, sidewalks.
 
-Reads a ``.net.xml`` (gzipped or not) straight into the few things that demand and checks need: the roads, their lanes'
-permissions, the connections between them, the longest signal cycle, and whether shapes have heights. Further readings
-of the same file, for effects only: the lanes' shapes with their heights (:func:`lanes`), and where people may walk
-(:func:`walkways`). World frame, metres, seconds.
+Steps of :func:`read`: go through a ``.net.xml`` (gzipped or not) once, child by child; check what every reader needs;
+keep the text of shapes, which become arrays only when somebody asks for them. World frame, metres, seconds.
 
 The graph of a vClass has an edge's successors as SUMO's own router sees them: a connection counts when the class may
-use the lane that it leaves, the lane that it reaches, and the connection itself."""
+use the lane that it leaves, the lane that it reaches, and the connection itself.
+
+sumolib's own reader is not used: it takes any XML, entities included, and a damaged file ends in a traceback.
+"""
 
 from __future__ import annotations
 
-import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -22,18 +22,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core.errors import InputError
-from pipeline.formats import safe_xml as safexml
-from pipeline.scenario.models import Scenario
+from pipeline.formats import safe_xml
+
+LANE_WIDTH_M = 3.2
+"""A lane's width where the network names none: SUMO's default."""
 
 _TURNAROUNDS = ("t", "T")
 _HEIGHT = re.compile(rb'[" ][^", ]+,[^", ]+,[^", ]+[" ]')
 """A point with a third coordinate. (SUMO writes none where a height is 0.)"""
 
-_LANE_M = 3.2
-"""A lane's width where the network names none."""
-
 _PEDESTRIAN = "pedestrian"
-_OSM = (".osm", ".osm.xml")
+_OSM = (".osm", ".osm.xml", ".osm.pbf")
+_RIGHT = "a file that netconvert wrote"
 
 
 @dataclass(frozen=True)
@@ -44,9 +44,9 @@ class Permission:
     disallow: frozenset[str]
 
     @classmethod
-    def of(cls, element: Element) -> Permission:
-        """From a ``<lane>`` or a ``<connection>``."""
-        allow, disallow = element.get("allow"), element.get("disallow")
+    def of(cls, attributes: Mapping[str, str]) -> Permission:
+        """From those of a ``<lane>`` or a ``<connection>``."""
+        allow, disallow = attributes.get("allow"), attributes.get("disallow")
         return cls(
             None if allow in (None, "", "all") else frozenset(str(allow).split()), frozenset((disallow or "").split())
         )
@@ -59,21 +59,69 @@ class Permission:
 
 
 @dataclass(frozen=True)
+class Shape:
+    """A line or outline as the file writes it ("x,y x,y,z ..."); ``place`` is what messages point to."""
+
+    text: str
+    place: str
+
+    @cached_property
+    def points_m(self) -> NDArray[np.float64]:
+        """(n, 3) float64; z is 0 where the file names none. InputError when the text holds no coordinates."""
+        try:
+            points = [[float(v) for v in point.split(",")] for point in self.text.split()]
+            return np.array([[*point, 0.0][:3] for point in points], dtype=np.float64).reshape(-1, 3)
+        except ValueError as error:
+            raise InputError(self.place, f"a shape holds no coordinates ({error})", _RIGHT) from None
+
+    @property
+    def has_heights(self) -> bool:
+        """Whether any point has a third coordinate."""
+        return self.text.count(",") > len(self.text.split())
+
+
+@dataclass(frozen=True)
+class Lane:
+    """A lane: its middle line, or a walking area's outline.
+
+    ``width_m`` is None where the file names none; ``length_m`` is as SUMO counts.
+    """
+
+    shape: Shape
+    width_m: float | None
+    length_m: float
+    permission: Permission
+
+    @property
+    def shape_m(self) -> NDArray[np.float64]:
+        """(n, 3) float64, metres."""
+        return self.shape.points_m
+
+
+@dataclass(frozen=True)
 class Edge:
-    """A road in one direction."""
+    """A road in one direction; or, where ``function`` says so, a piece of a junction, a crossing, a walking area."""
 
     id: str
+    function: str
     from_node: str
     to_node: str
-    lanes: tuple[Permission, ...]
-    start_m: tuple[float, float]
-    end_m: tuple[float, float]
-    lengths_m: tuple[float, ...] = ()
-    """Of each lane, as SUMO counts."""
+    name: str
+    lanes: tuple[Lane, ...]
+
+    @cached_property
+    def start_m(self) -> tuple[float, float]:
+        """Where its first lane starts."""
+        return _point(self.lanes[0].shape.text.split()[0])
+
+    @cached_property
+    def end_m(self) -> tuple[float, float]:
+        """Where its first lane ends."""
+        return _point(self.lanes[0].shape.text.split()[-1])
 
     def lanes_for(self, vclass: str) -> int:
         """How many of its lanes ``vclass`` may use."""
-        return sum(lane.admits(vclass) for lane in self.lanes)
+        return sum(lane.permission.admits(vclass) for lane in self.lanes)
 
 
 @dataclass(frozen=True)
@@ -89,182 +137,27 @@ class Connection:
 
 
 @dataclass(frozen=True)
-class Network:
-    """What demand and checks need of a network."""
+class Junction:
+    """Where edges meet; ``type`` is SUMO's ("traffic_light", "dead_end", "internal", ...)."""
 
-    edges: tuple[Edge, ...]
-    connections: tuple[Connection, ...]
-    cycle_s: float
-    has_heights: bool
+    id: str
+    type: str
+    at_m: tuple[float, float]
+    shape: Shape
+    incoming_lanes: tuple[str, ...]
 
-    @cached_property
-    def diagonal_m(self) -> float:
-        """From the south-west to the north-east corner of all roads' ends."""
-        ends = np.array([p for e in self.edges for p in (e.start_m, e.end_m)])
-        return float(np.hypot(*(ends.max(axis=0) - ends.min(axis=0))))
-
-    def links(self, vclass: str) -> NDArray[np.int64]:
-        """(n, 3) of source edge, target edge, and 1 for a turnaround, for ``vclass``."""
-        edges = self.edges
-        found = [
-            (c.source, c.target, int(c.turnaround))
-            for c in self.connections
-            if edges[c.source].lanes[c.source_lane].admits(vclass)
-            and edges[c.target].lanes[c.target_lane].admits(vclass)
-            and c.permission.admits(vclass)
-        ]
-        return np.array(found, dtype=np.int64).reshape(-1, 3)
-
-
-@dataclass
-class _Reading:
-    edges: list[Edge] = field(default_factory=list)
-    index: dict[str, int] = field(default_factory=dict)
-    connections: list[Element] = field(default_factory=list)
-    cycle_s: float = 0.0
-    has_heights: bool = False
-
-
-def read(path: Path, name: Path | None = None) -> Network:
-    """Read a network; messages call it ``name`` where it is a copy of what the user named.
-
-    Raises
-    ------
-    InputError
-        When the file is no SUMO network, is damaged, or has no road.
-    """
-    reading, copy = _Reading(), path
-    path = name or path
-    for element in safexml.children(copy, "net", path):
-        try:
-            _take(reading, element)
-        except (KeyError, ValueError, IndexError) as error:
-            what = f"<{element.tag} id={element.get('id', element.get('from', ''))!r}>"
-            raise InputError(
-                path, f"{what} is not as in a SUMO network ({error!r})", "a file that netconvert wrote"
-            ) from None
-    if not reading.edges:
-        raise InputError(path, "the network has no road", "a network with at least one edge")
-    return Network(tuple(reading.edges), tuple(_connections(reading, path)), reading.cycle_s, reading.has_heights)
-
-
-def _take(reading: _Reading, element: Element) -> None:
-    match element.tag:
-        case "edge" if not element.get("function"):
-            reading.index[element.attrib["id"]] = len(reading.edges)
-            reading.edges.append(_edge(reading, element))
-        case "connection" if not element.attrib["from"].startswith(":"):
-            reading.connections.append(element)
-        case "tlLogic":
-            reading.cycle_s = max(reading.cycle_s, cycle_s(element.iter("phase")))
-
-
-def cycle_s(phases: Iterable[Element]) -> float:
-    """How long a signal program takes at most to come round."""
-    return sum(float(p.get("maxDur", p.attrib["duration"])) for p in phases)
-
-
-def _edge(reading: _Reading, element: Element) -> Edge:
-    lanes = list(element.iter("lane"))
-    shape = [point.split(",") for point in lanes[0].attrib["shape"].split()]
-    first, last = ([float(v) for v in shape[i]] for i in (0, -1))
-    reading.has_heights |= any(len(point) > 2 for point in shape)
-    return Edge(
-        element.attrib["id"],
-        element.attrib["from"],
-        element.attrib["to"],
-        tuple(Permission.of(lane) for lane in lanes),
-        (first[0], first[1]),
-        (last[0], last[1]),
-        tuple(float(lane.get("length", 0)) for lane in lanes),
-    )
-
-
-def _connections(reading: _Reading, path: Path) -> Iterable[Connection]:
-    for element in reading.connections:
-        try:
-            source, target = (reading.index.get(element.attrib[key]) for key in ("from", "to"))
-            lanes = int(element.attrib["fromLane"]), int(element.attrib["toLane"])
-        except (KeyError, ValueError) as error:
-            raise InputError(
-                path,
-                f"a <connection> from {element.get('from')!r} is damaged ({error!r})",
-                "a file that netconvert wrote",
-            ) from None
-        if source is None or target is None:
-            continue  # to or from a walking area or a crossing
-        if lanes[0] >= len(reading.edges[source].lanes) or lanes[1] >= len(reading.edges[target].lanes):
-            raise InputError(
-                path,
-                f"a <connection> from {element.get('from')!r} names a lane that is not there",
-                "a file that netconvert wrote",
-            )
-        yield Connection(source, lanes[0], target, lanes[1], element.get("dir") in _TURNAROUNDS, Permission.of(element))
-
-
-def is_osm(path: Path) -> bool:
-    """Whether a network is still a map of OpenStreetMap."""
-    return path.name.removesuffix(".gz").endswith(_OSM)
-
-
-def path_of(scenario: Scenario) -> Path | None:
-    """The network that a scenario, or the configuration that it names, simulates; None where it names a finished
-    file."""
-    traffic = scenario.traffic
-    if traffic.network is not None:
-        return scenario.find(traffic.network, "traffic.network")
-    if traffic.sumocfg is None:
-        return None
-    config = scenario.find(traffic.sumocfg, "traffic.sumocfg")
-    for child in safexml.children(config, ""):
-        for element in child.iter():
-            value = element.get("value", element.get("v"))
-            if element.tag in ("net-file", "net", "n") and value:
-                return config.parent / os.path.expandvars(value)
-    return None
-
-
-def may_have_heights(path: Path) -> bool:
-    """Whether any shape of the file has a third coordinate: a quick look, so that flat networks need no second
-    reading."""
-    if is_osm(path) or not path.is_file():
-        return False
-    with safexml.opened(path) as file:
-        return any(_HEIGHT.search(line, line.find(b"shape=")) is not None for line in file if b"shape=" in line)
+    @property
+    def shape_m(self) -> NDArray[np.float64]:
+        """Its outline, (n, 3) float64, metres; (0, 3) where it has none."""
+        return self.shape.points_m
 
 
 @dataclass(frozen=True)
-class Lane:
-    """A lane's middle line, (n, 3) float64 in metres, and its width. A walking area has its outline, and no width."""
+class Location:
+    """How longitude and latitude became x, y: (x, y) = projection(lon, lat) + ``offset_m``."""
 
-    shape_m: NDArray[np.float64]
-    width_m: float
-
-
-def lanes(path: Path) -> list[Lane]:
-    """All lanes, those inside junctions and people's too.
-
-    Raises
-    ------
-    InputError
-        When the file is no SUMO network, or damaged.
-    """
-    found = []
-    for element in safexml.children(path, "net"):
-        if element.tag != "edge":
-            continue
-        for lane in element.iter("lane"):
-            try:
-                points = [[float(v) for v in point.split(",")] for point in lane.attrib["shape"].split()]
-                shape = np.array([[*point, 0.0][:3] for point in points], dtype=np.float64).reshape(-1, 3)
-                width = 0.0 if element.get("function") == "walkingarea" else float(lane.get("width", _LANE_M))
-            except (KeyError, ValueError) as error:
-                what = f"<lane id={lane.get('id', '')!r}>"
-                raise InputError(
-                    path, f"{what} is not as in a SUMO network ({error!r})", "a file that netconvert wrote"
-                ) from None
-            found.append(Lane(shape, width))
-    return found
+    projection: str
+    offset_m: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -287,48 +180,223 @@ class Walkways:
     crossings: int
 
 
-def walkways(path: Path) -> Walkways:
-    """The sidewalks of a network, and how they hang together (people walk both ways)."""
-    roads, functions, joined = [], [], _Joined()
-    for element in safexml.children(path, "net"):
-        if element.tag == "edge":
-            functions.append(element.get("function"))
-            if functions[-1] is None:
-                roads += list(_sidewalks(element))
-        elif element.tag == "connection":
-            joined.join(element.get("from", ""), element.get("to", ""), element.get("fromLane"), element.get("toLane"))
-    whole: dict[str, int] = {}
-    sidewalks = [
-        Sidewalk(edge, start, end, length, whole.setdefault(joined.find(f"{edge}_{index}"), len(whole)))
-        for edge, start, end, length, index in roads
-    ]
-    return Walkways(tuple(sidewalks), functions.count("walkingarea"), functions.count("crossing"))
+@dataclass(frozen=True)
+class Network:
+    """A network as its file has it.
+
+    Attributes
+    ----------
+    all_edges
+        Those inside junctions and people's too, in the order of the file.
+    connections
+        From road to road.
+    cycle_s
+        The longest time that a signal program takes at most to come round; 0 without signals.
+    """
+
+    all_edges: tuple[Edge, ...]
+    connections: tuple[Connection, ...]
+    junctions: tuple[Junction, ...] = ()
+    cycle_s: float = 0.0
+    location: Location | None = None
+    lane_links: tuple[tuple[str, str], ...] = ()
+    """Lanes between which a walking area's or a crossing's connection leads, either way."""
+
+    @cached_property
+    def edges(self) -> tuple[Edge, ...]:
+        """The roads."""
+        return tuple(edge for edge in self.all_edges if not edge.function)
+
+    @cached_property
+    def has_heights(self) -> bool:
+        """Whether any lane has heights."""
+        return any(lane.shape.has_heights for edge in self.all_edges for lane in edge.lanes)
+
+    @cached_property
+    def diagonal_m(self) -> float:
+        """From the south-west to the north-east corner of all roads' ends."""
+        ends = np.array([p for e in self.edges for p in (e.start_m, e.end_m)])
+        return float(np.hypot(*(ends.max(axis=0) - ends.min(axis=0))))
+
+    def links(self, vclass: str) -> NDArray[np.int64]:
+        """(n, 3) of source edge, target edge, and 1 for a turnaround, for ``vclass``."""
+        edges = self.edges
+        usable = [
+            (c.source, c.target, int(c.turnaround))
+            for c in self.connections
+            if edges[c.source].lanes[c.source_lane].permission.admits(vclass)
+            and edges[c.target].lanes[c.target_lane].permission.admits(vclass)
+            and c.permission.admits(vclass)
+        ]
+        return np.array(usable, dtype=np.int64).reshape(-1, 3)
+
+    @cached_property
+    def walkways(self) -> Walkways:
+        """The sidewalks, and how they hang together (people walk both ways)."""
+        walked = [
+            (edge, index)
+            for edge in self.edges
+            if (index := next((i for i, lane in enumerate(edge.lanes) if _is_sidewalk(lane)), None)) is not None
+        ]
+        parts = _parts([f"{edge.id}_{index}" for edge, index in walked], self.lane_links)
+        sidewalks = [
+            Sidewalk(edge.id, edge.from_node, edge.to_node, edge.lanes[index].length_m, part)
+            for (edge, index), part in zip(walked, parts, strict=True)
+        ]
+        functions = [edge.function for edge in self.all_edges]
+        return Walkways(tuple(sidewalks), functions.count("walkingarea"), functions.count("crossing"))
 
 
-def _sidewalks(edge: Element) -> Iterator[tuple[str, str, str, float, int]]:
-    """The lane of a road that people, but no cars, may use."""
-    for index, lane in enumerate(edge.iter("lane")):
-        permission = Permission.of(lane)
-        if permission.admits(_PEDESTRIAN) and not permission.admits("passenger"):
-            yield edge.attrib["id"], edge.attrib["from"], edge.attrib["to"], float(lane.get("length", 0)), index
-            return
+def read(path: Path, name: Path | None = None) -> Network:
+    """Read a network; messages call it ``name`` where it is a copy of what the user named.
+
+    Raises
+    ------
+    InputError
+        When the file is no SUMO network, is damaged, or has no road.
+    """
+    copy, path = path, name or path
+    reading = _Reading(path)
+    for element in safe_xml.children(copy, "net", path):
+        try:
+            reading.take(element)
+        except (KeyError, ValueError, IndexError) as error:
+            what = f"<{element.tag} id={element.get('id', element.get('from', ''))!r}>"
+            raise InputError(path, f"{what} is not as in a SUMO network ({error!r})", _RIGHT) from None
+    if not reading.index:
+        raise InputError(path, "the network has no road", "a network with at least one edge")
+    return reading.network()
 
 
-class _Joined:
-    """Which lanes hang together (union-find)."""
+@dataclass
+class _Reading:
+    """What was read so far."""
 
-    def __init__(self) -> None:
-        self._parent: dict[str, str] = {}
+    path: Path
+    edges: list[Edge] = field(default_factory=list)
+    roads: list[Edge] = field(default_factory=list)
+    index: dict[str, int] = field(default_factory=dict)
+    connections: list[dict[str, str]] = field(default_factory=list)
+    junctions: list[Junction] = field(default_factory=list)
+    lane_links: list[tuple[str, str]] = field(default_factory=list)
+    cycle_s: float = 0.0
+    location: Location | None = None
 
-    def find(self, lane: str) -> str:
-        """The lane that stands for all that hang together with this one."""
-        while (above := self._parent.get(lane, lane)) != lane:
-            self._parent[lane] = self._parent.get(above, above)
-            lane = above
-        return lane
+    def take(self, element: Element) -> None:
+        match element.tag:
+            case "edge":
+                self._take_edge(element)
+            case "connection":
+                self._take_connection(element.attrib)
+            case "junction":
+                self.junctions.append(self._junction(element.attrib))
+            case "tlLogic":
+                self.cycle_s = max(self.cycle_s, cycle_s(element.iter("phase")))
+            case "location":
+                offset_m = _point(element.attrib["netOffset"])
+                self.location = Location(element.get("projParameter", ""), offset_m)
 
-    def join(self, start: str, end: str, start_lane: str | None, end_lane: str | None) -> None:
-        """Take note of a connection; only those of walking areas and crossings, whose names begin with a colon, join
-        sidewalks."""
+    def _take_edge(self, element: Element) -> None:
+        function, of = element.get("function", ""), element.get
+        edge = Edge(
+            element.attrib["id"], function, of("from", ""), of("to", ""), of("name", ""),
+            tuple(self._lane(lane.attrib) for lane in element.iter("lane")),
+        )  # fmt: skip
+        self.edges.append(edge)
+        if not function:
+            if not edge.from_node or not edge.to_node:
+                raise KeyError("to" if edge.from_node else "from")
+            _ = edge.start_m, edge.end_m  # a road has a lane with coordinates
+            self.index[edge.id] = len(self.roads)
+            self.roads.append(edge)
+
+    def _lane(self, lane: dict[str, str]) -> Lane:
+        width = lane.get("width")
+        return Lane(
+            Shape(lane["shape"], f"{self.path}: lane {lane.get('id', '')}"),
+            None if width is None else float(width),
+            float(lane.get("length", 0)),
+            Permission.of(lane),
+        )
+
+    def _take_connection(self, connection: dict[str, str]) -> None:
+        start, end = connection["from"], connection.get("to", "")
+        if not start.startswith(":"):
+            self.connections.append(connection)
         if start.startswith(":") or end.startswith(":"):
-            self._parent[self.find(f"{start}_{start_lane}")] = self.find(f"{end}_{end_lane}")
+            self.lane_links.append((f"{start}_{connection.get('fromLane')}", f"{end}_{connection.get('toLane')}"))
+
+    def _junction(self, junction: dict[str, str]) -> Junction:
+        name = junction["id"]
+        return Junction(
+            name,
+            junction.get("type", ""),
+            (float(junction["x"]), float(junction["y"])),
+            Shape(junction.get("shape", ""), f"{self.path}: junction {name}"),
+            tuple(junction.get("incLanes", "").split()),
+        )
+
+    def network(self) -> Network:
+        return Network(
+            tuple(self.edges),
+            tuple(self._road_connections()),
+            tuple(self.junctions),
+            self.cycle_s,
+            self.location,
+            tuple(self.lane_links),
+        )
+
+    def _road_connections(self) -> Iterator[Connection]:
+        for connection in self.connections:
+            start = connection["from"]
+            try:
+                source, target = (self.index.get(connection[key]) for key in ("from", "to"))
+                lanes = int(connection["fromLane"]), int(connection["toLane"])
+            except (KeyError, ValueError) as error:
+                raise InputError(self.path, f"a <connection> from {start!r} is damaged ({error!r})", _RIGHT) from None
+            if source is None or target is None:
+                continue  # to or from a walking area or a crossing
+            if lanes[0] >= len(self.roads[source].lanes) or lanes[1] >= len(self.roads[target].lanes):
+                raise InputError(self.path, f"a <connection> from {start!r} names a lane that is not there", _RIGHT)
+            turnaround = connection.get("dir") in _TURNAROUNDS
+            yield Connection(source, lanes[0], target, lanes[1], turnaround, Permission.of(connection))
+
+
+def _point(text: str) -> tuple[float, float]:
+    x, y = text.split(",")[:2]
+    return float(x), float(y)
+
+
+def cycle_s(phases: Iterable[Element]) -> float:
+    """How long a signal program takes at most to come round."""
+    return sum(float(p.get("maxDur", p.attrib["duration"])) for p in phases)
+
+
+def is_osm(path: Path) -> bool:
+    """Whether a network is still a map of OpenStreetMap."""
+    return path.name.removesuffix(".gz").endswith(_OSM)
+
+
+def may_have_heights(path: Path) -> bool:
+    """Whether any shape of the file has a third coordinate: a quick look, so that a flat network need not be read to
+    know that it is flat."""
+    if is_osm(path) or not path.is_file():
+        return False
+    with safe_xml.opened(path) as file:
+        return any(_HEIGHT.search(line, line.find(b"shape=")) is not None for line in file if b"shape=" in line)
+
+
+def _is_sidewalk(lane: Lane) -> bool:
+    """Whether people, but no cars, may use it."""
+    return lane.permission.admits(_PEDESTRIAN) and not lane.permission.admits("passenger")
+
+
+def _parts(lanes: list[str], links: Sequence[tuple[str, str]]) -> list[int]:
+    """For each lane, the number of the part that it belongs to: the same for lanes that hang together."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    index = {lane: i for i, lane in enumerate(dict.fromkeys([*lanes, *(lane for pair in links for lane in pair)]))}
+    rows, columns = ([index[pair[i]] for pair in links] for i in (0, 1))
+    graph = coo_array((np.ones(len(links)), (rows, columns)), shape=(len(index), len(index)))
+    return [int(part) for part in connected_components(graph, directed=False)[1][: len(lanes)]] if lanes else []

@@ -1,4 +1,4 @@
-"""How is SUMO found, started and asked?
+"""Finds, starts and asks SUMO.
 
 The only module that locates SUMO's programs or imports its Python tools (sumolib, traci), each inside the function that
 needs it. Programs run as subprocesses in the folder that holds their files, so that no path gets into what they write.
@@ -47,10 +47,10 @@ def binary(name: str) -> Path:
 
     import sumolib
 
-    found = shutil.which(sumolib.checkBinary(name))
-    if found is None:
+    program = shutil.which(sumolib.checkBinary(name))
+    if program is None:
         raise MissingBackendError(f"SUMO's program '{name}' was not found: set SUMO_HOME, or pip install eclipse-sumo")
-    return Path(found)
+    return Path(program)
 
 
 def environment() -> dict[str, str]:
@@ -79,10 +79,10 @@ def version() -> str:
 
 def version_in(text: str) -> str:
     """The version number in what SUMO says about itself ("Eclipse SUMO sumo 1.28.0", or traci's "SUMO 1.28.0")."""
-    found = re.search(r"\b[vV]?(\d+[._]\d+[._]\d+\S*)", text)
-    if found is None:
+    number = re.search(r"\b[vV]?(\d+[._]\d+[._]\d+\S*)", text)
+    if number is None:
         raise RunError(f"SUMO does not tell its version: {text.strip().splitlines()[:1]}")
-    return found.group(1).replace("_", ".")
+    return number.group(1).replace("_", ".")
 
 
 def vehicle_classes() -> frozenset[str]:
@@ -126,17 +126,17 @@ def run(
         process = _start(name, arguments, folder, subprocess.PIPE, capture)
         with process:
             try:
-                printed, said = _wait(process, watch)
+                printed, complaint = _wait(process, watch)
             except BaseException:
                 process.kill()
                 raise
     if process.returncode:
-        text = said if capture == subprocess.PIPE else log.read_bytes()
+        text = complaint if capture == subprocess.PIPE else log.read_bytes()
         raise failure(name, process.returncode, (text or b"").decode("utf-8", "replace"))
     return printed.decode("utf-8", "replace")
 
 
-def _start(name: str, arguments: Sequence[str], folder: Path, printed: Any, said: Any) -> subprocess.Popen[bytes]:
+def _start(name: str, arguments: Sequence[str], folder: Path, printed: Any, complaints: Any) -> subprocess.Popen[bytes]:
     program = binary(name)
     try:
         return subprocess.Popen(
@@ -145,7 +145,7 @@ def _start(name: str, arguments: Sequence[str], folder: Path, printed: Any, said
             env=environment(),
             stdin=subprocess.DEVNULL,
             stdout=printed,
-            stderr=said,
+            stderr=complaints,
         )
     except OSError as error:
         raise MissingBackendError(f"{program} cannot be started: {error.strerror}") from None
@@ -216,8 +216,8 @@ def served(arguments: Sequence[str], folder: Path) -> Iterator[Any]:
 
     port = getFreeSocketPort()
     # a file, because SUMO would wait for ever on a full pipe that nobody reads
-    with tempfile.TemporaryFile() as said:
-        process = _start("sumo", [*arguments, "--remote-port", str(port)], folder, subprocess.DEVNULL, said)
+    with tempfile.TemporaryFile() as complaints:
+        process = _start("sumo", [*arguments, "--remote-port", str(port)], folder, subprocess.DEVNULL, complaints)
         with process:
             try:
                 connection = _attach(process, port)
@@ -226,19 +226,19 @@ def served(arguments: Sequence[str], folder: Path) -> Iterator[Any]:
                 finally:
                     _close(connection)
             except traci.exceptions.FatalTraCIError:
-                raise _hung_up(process, said) from None
+                raise _hung_up(process, complaints) from None
             finally:
                 process.kill()
 
 
-def _hung_up(process: subprocess.Popen[bytes], said: IO[bytes]) -> RunError:
+def _hung_up(process: subprocess.Popen[bytes], complaints: IO[bytes]) -> RunError:
     """Why SUMO closed its end: it says so on its way out."""
     try:
         process.wait(_ENDS_WITHIN_S)
     except subprocess.TimeoutExpired:
         return RunError("sumo closed its TraCI port, and did not say why")
-    said.seek(0)
-    return failure("sumo", process.returncode, said.read().decode("utf-8", "replace"))
+    complaints.seek(0)
+    return failure("sumo", process.returncode, complaints.read().decode("utf-8", "replace"))
 
 
 def _attach(process: subprocess.Popen[bytes], port: int) -> Any:

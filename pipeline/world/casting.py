@@ -1,16 +1,14 @@
-"""Which static surface does each beam meet first, and where?
+"""Finds the static surface that each beam meets first, and where.
 
 Embree (float32) answers *which triangle*, float64 *where*:
 
 1. The world is moved to the region of interest's own frame in float64.
 2. Embree holds every triangle enlarged by a rim that is wider than float32's error, and a low fin upright on each side
-   that is not
-   shared with a steep neighbour. What a beam truly meets, it meets there too: none leaks through a shared edge or
-   vertex, and none slips in along a surface that it sees at a fraction of a degree.
+   that is not shared with a steep neighbour. What a beam truly meets, it meets there too: none leaks through a shared
+   edge or vertex, and none slips in along a surface that it sees at a fraction of a degree.
 3. Each proposed hit is placed in float64 on the true triangle. A beam that met only a rim or fin, came within 0.02 mm
-   of an
-   edge, or met a surface at less than 0.6 degrees, is doubtful (one in a thousand); its first hit is searched among all
-   true triangles in float64.
+   of an edge, or met a surface at less than 0.6 degrees, is doubtful (one in a thousand); its first hit is searched
+   among all true triangles in float64.
 
 What is left to float32: where a surface stands on the middle of another (a wall on the ground), a beam within some 1e-5
 m of the line between them may be given the farther of the two, which then lies less than 1 mm behind the nearer."""
@@ -138,8 +136,8 @@ class Caster:
         if self._scene is None or len(d) == 0:
             return ranges, 0
         start = np.broadcast_to(o_roi_m.astype(np.float32), d.shape)
-        found = self._scene.run(np.ascontiguousarray(start), d.astype(np.float32))
-        proposed = self._owner[found]
+        nearest = self._scene.run(np.ascontiguousarray(start), d.astype(np.float32))
+        proposed = self._owner[nearest]
         doubtful = np.empty(len(d), dtype=np.int64)
         count = rays.settle(proposed, self._triangles, self._planes, o_roi_m, d, range_m, ranges, doubtful)
         rays.search(doubtful[:count], self._triangles, self._planes, self._boxes, self._starts, o_roi_m, d, ranges)
@@ -170,10 +168,10 @@ def between(shapes: NDArray[np.float64], roi: Roi, sites_m: NDArray[np.float64])
     origin = np.asarray(roi.origin_m)
     heights = np.column_stack([((shapes - origin) @ normal).max(axis=1) for normal in _FAN])
     box, sites = (_corners(roi) @ _FAN.T).min(axis=0), (sites_m - origin) @ _FAN.T
-    found = np.zeros(len(shapes), dtype=np.bool_)
+    reaching = np.zeros(len(shapes), dtype=np.bool_)
     for site in sites:
-        found |= (heights >= np.minimum(site, box) - _PAD_M).all(axis=1)
-    return found
+        reaching |= (heights >= np.minimum(site, box) - _PAD_M).all(axis=1)
+    return reaching
 
 
 def _corners(roi: Roi) -> NDArray[np.float64]:
@@ -204,9 +202,9 @@ def _cross(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _planes(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
     """The four planes of each triangle, see :func:`pipeline.kernels.rays.planes`."""
-    cross, found = _cross(triangles), np.empty((len(triangles), 4, 4))
-    rays.planes(triangles, cross / np.sqrt((cross**2).sum(axis=1))[:, None], found)
-    return found
+    cross, planes = _cross(triangles), np.empty((len(triangles), 4, 4))
+    rays.planes(triangles, cross / np.sqrt((cross**2).sum(axis=1))[:, None], planes)
+    return planes
 
 
 def _along_curve(points: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -1,8 +1,11 @@
-"""What does the static world look like on disk and in memory?
+"""Holds the static world in memory and on disk.
 
 ``statics.ply`` is one binary triangle mesh in the world frame (float64 vertices, metres) that any viewer opens. Each
 face has an extra ``int solid``; the header's comments name the solids, so that a message can say which building a site
-stands in."""
+stands in.
+
+PLY is read and written here by hand: the layout, with ``solid`` a face, is exact to the byte, which plyfile and trimesh
+do not promise, and reading is one view of the file's bytes."""
 
 from __future__ import annotations
 
@@ -111,12 +114,12 @@ def read_ply(path: Path) -> tuple[World, dict[str, Any]]:
     if not path.is_file():
         raise InputError(path, "no such file", f"run the stage that makes {path.name} first")
     data = path.read_bytes()
-    head, found, body = data.partition(b"end_header\n")
+    head, end, body = data.partition(b"end_header\n")
     lines = head.decode("ascii", errors="replace").splitlines()
     comments = [line.removeprefix("comment ").split(" ", 1) for line in lines if line.startswith("comment ")]
     counts = {line.split()[1]: int(line.split()[2]) for line in lines if line.startswith("element ")}
     size = counts.get("vertex", -1) * _VERTEX.itemsize
-    if not found or len(body) != size + counts.get("face", -1) * _FACE.itemsize or comments[0][0] != "egvs":
+    if not end or len(body) != size + counts.get("face", -1) * _FACE.itemsize or comments[0][0] != "egvs":
         raise InputError(path, "is not a whole statics.ply", "run the statics stage again")
     vertices = np.frombuffer(body, dtype=_VERTEX, count=counts["vertex"])
     faces = np.frombuffer(body, dtype=_FACE, offset=size)

@@ -14,7 +14,7 @@ from pipeline.stages import statics, tpog
 
 def test_beams_that_cannot_meet_the_region_are_not_cast_and_would_change_nothing(mini: Path, monkeypatch) -> None:
     scenario = pipeline.load(mini)
-    world = statics.build(scenario, statics.Tally.empty())
+    world = statics.build(scenario)[0]
     lean = [survey.Survey(scenario, world).scan(site).scan for site in survey.Survey(scenario, world).sites]
     monkeypatch.setattr(rays, "can_meet", lambda o, ends, size, reaches: reaches.fill(True))
     surveyed = survey.Survey(scenario, world)

@@ -667,7 +667,7 @@ def test_a_caster_that_knows_no_sites_holds_everything() -> None:
 
 def test_idle_looks_at_simulated_sites_only(mini: Path) -> None:
     scenario = pipeline.load(place(mini, *TREES))
-    world = statics.build(scenario, statics.Tally.empty())
+    world, _ = statics.build(scenario)
     scene = Scene(scenario, world, survey.sites.of(scenario))
     assert Foliage(Foliage.Model()).idle(scene) is None
     assert Divergence(Divergence.Model()).idle(scene) is None

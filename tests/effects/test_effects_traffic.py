@@ -26,7 +26,10 @@ from pipeline.effects.traffic import articulated, pedestrians_bicycles, slope
 from pipeline.scenario.loading import from_values, load
 from pipeline.sensing.scanner import Survey
 from pipeline.stages import statics, tpog, traffic
-from pipeline.traffic import network, sumo
+from pipeline.traffic import boxes, fcd, network, sumo, trajectories
+from pipeline.traffic.boxes import Size
+from pipeline.traffic.frames import FrameGroup
+from pipeline.world import terrain
 from pipeline.world.mesh import read_ply
 
 HILL = Path(__file__).resolve().parents[2] / "scenarios" / "hill"
@@ -159,17 +162,21 @@ def test_each_switch_acts(flat, plain, climbed, tmp_path):
 # ---- slope
 
 
+def acts(scene):
+    return make("slope", {}, "place").acts(scene)
+
+
 def test_whether_a_network_has_relief_is_told(flat, hill, tmp_path):
-    assert slope.decide(scenario(flat, **SMALL)) == (False, "the network is flat")
-    assert slope.decide(scenario(hill, **SMALL)) == (True, "the network has 12.0 m of relief")
+    assert acts(scenario(flat, **SMALL)) == (False, "the network is flat")
+    assert acts(scenario(hill, **SMALL)) == (True, "the network has 12.0 m of relief")
     text = (hill / "road.net.xml").read_text()
     (tmp_path / "low.net.xml").write_text(
         re.sub(r",12\.00\b", ",0.05", re.sub(r"(,[-\d.]+),(?!12\.00)[\d.]+(?=[ \"])", r"\1", text))
     )
-    on, why = slope.decide(scenario(tmp_path, **(SMALL | {"network": "low.net.xml"})))
+    on, why = acts(scenario(tmp_path, **(SMALL | {"network": "low.net.xml"})))
     assert not on and "no more than 0.1 m" in why
     (tmp_path / "f.csv").write_text("x")
-    assert slope.decide(scenario(tmp_path, fcd="f.csv"))[0] is False
+    assert acts(scenario(tmp_path, fcd="f.csv"))[0] is False
 
 
 def test_one_uphill_lane_from_zero_is_relief(tmp_path):
@@ -180,7 +187,7 @@ def test_one_uphill_lane_from_zero_is_relief(tmp_path):
     (tmp_path / "e.edg.xml").write_text('<edges><edge id="ab" from="a" to="b"/></edges>')
     sumo.run("netconvert", ["-n", "n.nod.xml", "-e", "e.edg.xml", "-o", "road.net.xml"], tmp_path)
     assert network.may_have_heights(tmp_path / "road.net.xml") and network.read(tmp_path / "road.net.xml").has_heights
-    assert slope.decide(scenario(tmp_path, **SMALL))[0]
+    assert acts(scenario(tmp_path, **SMALL))[0]
 
 
 def height_m(x):
@@ -188,7 +195,7 @@ def height_m(x):
 
 
 def test_the_surface_is_the_road_and_goes_on_level_beside_it(hill):
-    ground = slope.ground(hill / "road.net.xml")
+    ground = terrain.ground(network.read(hill / "road.net.xml"))
     x = np.linspace(5, 595, 400)
     for y in (-6.0, 0.0, 3.0, 6.0):
         off = np.abs(ground.height_m(x, np.full(400, y)) - height_m(x))
@@ -213,7 +220,7 @@ def test_on_the_grade_the_pitch_is_its_angle_and_the_centre_half_a_height_above_
 
 
 def test_over_the_ends_of_the_grade_both_ends_of_every_box_are_on_the_road(climbed, hill):
-    r, ground = climbed[1], slope.ground(hill / "road.net.xml")
+    r, ground = climbed[1], terrain.ground(network.read(hill / "road.net.xml"))
     wheels = r["kind"] != "pedestrian"
     for side in (1, -1):
         reach = side * r["length_m"] / 2
@@ -265,17 +272,13 @@ def test_footprints_stand_on_the_hill_and_sites_below_it_are_refused(hill, tmp_p
 
 def test_a_bridge_keeps_sumos_own_slope(climbed, hill):
     """A box well above the surface stands on something else."""
-    from pipeline.traffic import boxes as motion
-    from pipeline.traffic import fcd
-    from pipeline.traffic.boxes import Size
-
     table = fcd.SCHEMA.empty_table().from_pylist(
         [{"time_ms": 0, "id": "v", "type": "car", "x": 300, "y": 2, "z": 20, "angle": 90, "slope": 1.0, "speed": 1}],
         schema=fcd.SCHEMA,
     )
-    group = fcd.Group(0, 1, np.zeros(1, np.int64), table)
-    found = motion.boxes(group, {"car": Size(4, 2, 1.5, "passenger")}, 1.0, "place")
-    seated = slope.ground(hill / "road.net.xml").seat(found)
+    group = FrameGroup(0, 1, np.zeros(1, np.int64), table)
+    found = boxes.from_bumpers(group, {"car": Size(4, 2, 1.5, "passenger")}, 1.0, "place")
+    seated = slope.Seating(terrain.ground(network.read(hill / "road.net.xml"))).change(found)
     assert (seated.z_m, seated.pitch_rad) == (found.z_m, found.pitch_rad)
 
 
@@ -377,7 +380,7 @@ def test_groups_of_frames_do_not_show_and_a_vehicle_that_was_away_starts_straigh
     whole = bytes_of(finished(tmp_path, poses, PARTS), tmp_path / "whole")[0]
     front, rear = bus_rows(tmp_path / "whole", 0), bus_rows(tmp_path / "whole", 1)
     assert front["yaw_rad"][70] == rear["yaw_rad"][70] and abs(front["yaw_rad"][69] - rear["yaw_rad"][69]) > 0.2
-    monkeypatch.setattr(traffic, "GROUP_FRAMES", 7)
+    monkeypatch.setattr(trajectories, "GROUP_FRAMES", 7)
     assert bytes_of(finished(tmp_path, poses, PARTS), tmp_path / "cut")[0] == whole
     one, other = rows(tmp_path / "whole"), rows(tmp_path / "cut")
     assert all(np.array_equal(one[name], other[name]) for name in one)
@@ -400,7 +403,7 @@ def test_longer_axles_cut_less_and_three_parts_follow_one_another(tmp_path):
 
 def test_a_long_bus_gets_parts_by_itself_and_a_short_one_does_not():
     sizes = {
-        name: articulated.Size(length, 2.5, 3, vclass)
+        name: Size(length, 2.5, 3, vclass)
         for name, vclass, length in (
             ("a", "bus", 18.75),
             ("b", "bus", 12),

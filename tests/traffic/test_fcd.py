@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from pipeline.core.errors import InputError
 from pipeline.traffic import fcd
+from pipeline.traffic.frames import Window, groups
 
 HEADER = "timestep_time;vehicle_id;vehicle_x;vehicle_y;vehicle_angle;vehicle_type;vehicle_speed"
 CSV = f"""{HEADER}
@@ -158,7 +159,7 @@ def steps(*times_s, vehicle="v"):
 
 
 def picked(tables, window, each=2):
-    found = list(fcd.groups(tables, window, each, "place"))
+    found = list(groups(tables, window, each, "place"))
     assert [g.first_frame for g in found] == list(np.cumsum([0] + [g.frames for g in found[:-1]]))
     assert sum(g.frames for g in found) == window.count
     return [(int(f), t) for g in found for f, t in zip(g.frame, g.rows["time_ms"].to_pylist(), strict=True)]
@@ -166,7 +167,7 @@ def picked(tables, window, each=2):
 
 def test_warm_up_and_period_choose_the_time_steps():
     times = np.arange(25_200, 25_205, 0.25)
-    assert picked([steps(*times)], fcd.Window(3, 500, skip_ms=1000)) == [
+    assert picked([steps(*times)], Window(3, 500, skip_ms=1000)) == [
         (0, 25_201_000),
         (1, 25_201_500),
         (2, 25_202_000),
@@ -174,7 +175,7 @@ def test_warm_up_and_period_choose_the_time_steps():
 
 
 def test_an_empty_step_of_a_complete_recording_is_an_empty_frame():
-    window = fcd.Window(5, 1000, first_ms=1000, complete=True)
+    window = Window(5, 1000, first_ms=1000, complete=True)
     assert picked([steps(0, 1, 3)], window) == [(0, 1000), (2, 3000)]
     assert picked([], window) == []
 
@@ -183,17 +184,17 @@ def test_too_few_frames_are_counted():
     with pytest.raises(
         InputError, match=r"frames = 5: the file has 3 frames 1 s apart after a warm-up of 1 s \(4 time steps in all"
     ):
-        list(fcd.groups([steps(0, 1, 2, 3)], fcd.Window(5, 1000, skip_ms=1000), 10, "place"))
+        list(groups([steps(0, 1, 2, 3)], Window(5, 1000, skip_ms=1000), 10, "place"))
 
 
 def test_a_period_between_the_files_steps_is_refused():
     with pytest.raises(InputError, match=r"frame_period_s = 0.25: the file's time steps are 1 s apart"):
-        list(fcd.groups([steps(0, 1, 2, 3)], fcd.Window(2, 250), 10, "place"))
+        list(groups([steps(0, 1, 2, 3)], Window(2, 250), 10, "place"))
 
 
 def test_a_file_without_vehicles_is_refused():
     with pytest.raises(InputError, match="holds no vehicle"):
-        list(fcd.groups([], fcd.Window(2, 250), 10, "place"))
+        list(groups([], Window(2, 250), 10, "place"))
 
 
 @given(
@@ -205,7 +206,7 @@ def test_groups_do_not_depend_on_how_rows_arrive(present, cuts, each):
     whole = steps(*np.repeat(np.arange(len(present)), present).tolist())
     edges = sorted({0, whole.num_rows, *(c for c in cuts if c < whole.num_rows)})
     pieces = [whole.slice(a, b - a) for a, b in pairwise(edges) if b > a]
-    window = fcd.Window(len(present), 1000, first_ms=0, complete=True)
+    window = Window(len(present), 1000, first_ms=0, complete=True)
     expected = [(f, f * 1000) for f, n in enumerate(present) for _ in range(n)]
     assert picked(pieces, window, each) == expected
 

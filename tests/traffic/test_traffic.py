@@ -24,9 +24,10 @@ from pipeline.core.errors import InputError, MissingBackendError, RunError
 from pipeline.scenario.loading import from_values
 from pipeline.scenario.traffic import TrafficModel, VehicleKind
 from pipeline.stages import traffic
-from pipeline.traffic import boxes as motion
-from pipeline.traffic import demand, fcd, network, simulation, sumo
-from pipeline.traffic.boxes import Size, Tally
+from pipeline.traffic import boxes, demand, fcd, network, recording, sumo, tally
+from pipeline.traffic.boxes import Size
+from pipeline.traffic.frames import FrameGroup
+from pipeline.traffic.tally import TrafficTally
 
 SMALL = {"vehicles": 12, "frames": 240, "warmup_s": 60.0, "trips_per_s": 1.0}
 
@@ -85,33 +86,33 @@ def recorded(town, tmp_path_factory):
 )
 def test_box_lies_half_a_length_behind_the_front_bumper(angle, centre, yaw):
     one = np.ones(1)
-    x, y, z = motion.centres(0 * one, 10 * one, 0 * one, angle * one, 0 * one, 4 * one, 1.5 * one)
+    x, y, z = boxes.centres(0 * one, 10 * one, 0 * one, angle * one, 0 * one, 4 * one, 1.5 * one)
     assert (x[0], y[0], z[0]) == (*centre, 0.75)
     assert not np.signbit([v for v in (x[0], y[0], z[0]) if v == 0]).any()
-    assert motion.yaw_rad(angle * one)[0] == pytest.approx(yaw, abs=1e-9)
+    assert boxes.yaw_rad(angle * one)[0] == pytest.approx(yaw, abs=1e-9)
 
 
 def test_uphill_the_centre_is_lower_than_the_bumper():
     one = np.ones(1)
-    x, y, z = motion.centres(0 * one, 0 * one, 100 * one, 90 * one, 30 * one, 4 * one, 2 * one)
+    x, y, z = boxes.centres(0 * one, 0 * one, 100 * one, 90 * one, 30 * one, 4 * one, 2 * one)
     assert (x[0], y[0], z[0]) == pytest.approx((-2 * math.cos(math.pi / 6), 0, 100 - 1 + 1), abs=1e-6)
 
 
 @given(st.floats(-720, 720))
 def test_yaw_is_in_its_interval_and_points_where_the_angle_points(angle):
-    yaw = motion.yaw_rad(np.array([angle]))[0]
+    yaw = boxes.yaw_rad(np.array([angle]))[0]
     assert -math.pi < yaw <= math.pi
     assert math.cos(yaw) == pytest.approx(math.sin(math.radians(angle)), abs=2e-9)
     assert math.sin(yaw) == pytest.approx(math.cos(math.radians(angle)), abs=2e-9)
 
 
 def group_of(rows):
-    """rows of (frame, id, type, x, y, angle, speed) -> a Group."""
+    """rows of (frame, id, type, x, y, angle, speed) -> a FrameGroup."""
     frame, names, types, x, y, angle, speed = zip(*rows, strict=True)
     frame = np.array(frame, dtype=np.int64)
     numbers = [np.array(v, dtype=float) for v in (x, y, np.zeros(len(rows)), angle, np.zeros(len(rows)), speed)]
     table = pa.table([frame * 1000, pa.array(names), pa.array(types), *numbers], schema=fcd.SCHEMA)
-    return fcd.Group(int(frame.min()), int(np.ptp(frame)) + 1, frame, table)
+    return FrameGroup(int(frame.min()), int(np.ptp(frame)) + 1, frame, table)
 
 
 SIZES = {"car": Size(4.0, 2.0, 1.5, "passenger"), "bus": Size(12.0, 2.5, 3.0, "bus")}
@@ -124,7 +125,7 @@ def test_boxes_are_sorted_by_frame_and_vehicle_and_carry_their_types_size():
         (0, "a9", "car", 20, 0, 0, 1),
         (1, "b", "car", 0, 1, 0, 1),
     ]
-    found = motion.boxes(group_of(rows), SIZES, 1.0, "place")
+    found = boxes.from_bumpers(group_of(rows), SIZES, 1.0, "place")
     columns = found.columns()
     assert columns["vehicle"].to_pylist() == ["a10", "a9", "b", "b"]
     assert columns["kind"].to_pylist() == ["bus", "passenger", "passenger", "passenger"]
@@ -135,12 +136,12 @@ def test_boxes_are_sorted_by_frame_and_vehicle_and_carry_their_types_size():
 
 def test_a_type_without_a_size_is_named():
     with pytest.raises(InputError, match=r"vehicle type 'tram' has no known size; .*known: bus, car"):
-        motion.boxes(group_of([(0, "v", "tram", 0, 0, 0, 1)]), SIZES, 1.0, "place")
+        boxes.from_bumpers(group_of([(0, "v", "tram", 0, 0, 0, 1)]), SIZES, 1.0, "place")
 
 
 def test_a_vehicle_twice_in_a_frame_is_named():
     with pytest.raises(InputError, match="vehicle 'v' is twice in frame 3"):
-        motion.boxes(group_of([(3, "v", "car", 0, 0, 0, 1)] * 2), SIZES, 1.0, "place")
+        boxes.from_bumpers(group_of([(3, "v", "car", 0, 0, 0, 1)] * 2), SIZES, 1.0, "place")
 
 
 def test_speed_comes_from_the_way_where_the_file_gives_none():
@@ -151,7 +152,7 @@ def test_speed_comes_from_the_way_where_the_file_gives_none():
         (2, "v", "car", 0, 4, 0, nan),
         (2, "w", "car", 9, 9, 0, nan),
     ]
-    found = motion.boxes(group_of(rows), SIZES, 0.5, "place")
+    found = boxes.from_bumpers(group_of(rows), SIZES, 0.5, "place")
     assert found.speed_m_s[:3].tolist() == [6, 2, 2]
     assert np.isnan(found.speed_m_s[3])
 
@@ -175,13 +176,13 @@ def test_overlap_of_two_cars(other, expected):
     if angle == 90:
         y -= 2  # level with the first car's middle
     rows = [(0, "a", "car", 0, 0, 0, 1), (0, "b", "car", x, y, angle, 1)]
-    assert len(motion.overlapping(motion.boxes(group_of(rows), SIZES, 1.0, "place"))) == expected
+    assert len(tally.overlapping(boxes.from_bumpers(group_of(rows), SIZES, 1.0, "place"))) == expected
 
 
 def test_vehicles_on_a_bridge_and_below_it_do_not_overlap():
     group = group_of([(0, "a", "car", 0, 0, 0, 1), (0, "b", "car", 0, 0, 90, 1)])
     raised = group.rows.set_column(5, "z", pa.array([0.0, 5.0]))
-    assert len(motion.overlapping(motion.boxes(fcd.Group(0, 1, group.frame, raised), SIZES, 1.0, "place"))) == 0
+    assert len(tally.overlapping(boxes.from_bumpers(FrameGroup(0, 1, group.frame, raised), SIZES, 1.0, "place"))) == 0
 
 
 def footprint(found, i):
@@ -199,7 +200,7 @@ def test_overlaps_are_those_that_polygons_find(seed):
         for f in range(3)
         for i in range(10)
     ]
-    found = motion.boxes(group_of(rows), SIZES, 1.0, "place")
+    found = boxes.from_bumpers(group_of(rows), SIZES, 1.0, "place")
     shapes = [footprint(found, i) for i in range(30)]
     expected = {
         (i, j)
@@ -207,7 +208,7 @@ def test_overlaps_are_those_that_polygons_find(seed):
         for j in range(i)
         if found.frame[i] == found.frame[j] and shapes[i].intersection(shapes[j]).area > 1e-7
     }
-    got = {(int(b), int(a)) for a, b in motion.overlapping(found)}
+    got = {(int(b), int(a)) for a, b in tally.overlapping(found)}
     for i, j in got ^ expected:  # a contact thinner than the polygons' own rounding may go either way
         assert shapes[i].distance(shapes[j]) < 1e-6
         assert shapes[i].intersection(shapes[j]).area < 1e-5
@@ -224,25 +225,25 @@ def test_overlaps_are_those_of_all_pairs(spread_m):
         for f in range(3)
         for i, (x, y) in enumerate(places.tolist())
     ]
-    found = motion.boxes(group_of(rows), SIZES, 1.0, "place")
+    found = boxes.from_bumpers(group_of(rows), SIZES, 1.0, "place")
     a, b = np.triu_indices(found.frame.size, 1)
     a, b = a[found.frame[a] == found.frame[b]], b[found.frame[a] == found.frame[b]]
-    hit = motion._share_space(found, a, b)
+    hit = tally._share_space(found, a, b)
     expected = set(zip(a[hit].tolist(), b[hit].tolist(), strict=True))
-    got = [tuple(pair) for pair in motion.overlapping(found).tolist()]
+    got = [tuple(pair) for pair in tally.overlapping(found).tolist()]
     assert len(got) == len(set(got)) > 20
     assert set(got) == expected
 
 
 def test_standing_is_followed_across_groups():
-    tally = Tally(6)
+    counted = TrafficTally(6)
     for frames in ((0, 1), (2, 3), (4, 5)):
         rows = [(f, "still", "car", 0, 0, 0, 0.0) for f in frames]
         rows += [(f, "goes", "car", 50, 0, 0, 5.0 if f == 4 else 0.0) for f in frames]
-        tally.add(motion.boxes(group_of(rows), SIZES, 1.0, "place"))
-    assert tally.stands_since == {"still": 0, "goes": 5}
-    assert tally.longest_standing_frames == 5
-    result = tally.result(0.5)
+        counted.add(boxes.from_bumpers(group_of(rows), SIZES, 1.0, "place"))
+    assert counted.stands_since == {"still": 0, "goes": 5}
+    assert counted.longest_standing_frames == 5
+    result = counted.counts(0.5).to_json()
     assert result["vehicles"] == {"fewest": 2, "most": 2, "different": 2}
     assert result["longest_standing_s"] == 2.5
     assert result["share_standing"] == round(11 / 12, 4)
@@ -310,7 +311,7 @@ def test_a_kind_that_can_go_nowhere_is_refused(tmp_path):
     roads, rng = network.read(path), np.random.default_rng(0)
     with pytest.raises(InputError, match=r"kind 'boat' \(vClass ship\) can go from no edge to another"):
         demand.pairs(roads, car(name="boat", vclass="ship"), drawn(min_trip_m=300), rng, "place")
-    roads = network.Network(tuple(e for e in roads.edges if e.id == "in"), (), 0.0, False)
+    roads = network.Network(tuple(e for e in roads.edges if e.id == "in"), ())
     with pytest.raises(InputError, match=r"kind 'bus' \(vClass bus\) may use no lane"):
         demand.pairs(roads, car(name="bus", vclass="bus"), drawn(), rng, "place")
 
@@ -580,8 +581,8 @@ def test_a_jam_without_end_fails_with_its_numbers(town, tmp_path):
 
 
 def test_patience_is_two_cycles_and_three_minutes_at_least():
-    assert traffic.patience_s(70) == 180
-    assert traffic.patience_s(120) == 240
+    assert recording.patience_s(70) == 180
+    assert recording.patience_s(120) == 240
 
 
 def test_more_vehicles_than_the_town_holds_fail_with_the_numbers(town, tmp_path):
@@ -779,11 +780,11 @@ def test_progress_goes_on_to_the_end(town, tmp_path):
 
 def test_the_time_of_a_growing_file_is_that_of_its_last_whole_row(tmp_path):
     path = tmp_path / "fcd.csv"
-    assert simulation._last_time_ms(path) is None
+    assert recording._last_time_ms(path) is None
     path.write_text("timestep_time;vehicle_id\n")
-    assert simulation._last_time_ms(path) is None
+    assert recording._last_time_ms(path) is None
     path.write_text("timestep_time;vehicle_id\n1.250;a\n1.5")
-    assert simulation._last_time_ms(path) == 1250
+    assert recording._last_time_ms(path) == 1250
 
 
 def test_inputs_depend_on_what_the_stage_reads_and_on_nothing_else(town, tmp_path):

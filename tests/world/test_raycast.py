@@ -388,7 +388,7 @@ def test_shipped_scene_agrees_with_brute_force(name, site):
     """Every fifth beam of a site against all triangles; ``make numerics`` holds every beam of every site against
     them."""
     loaded = loading.load(f"scenarios/{name}")
-    world = statics.build(loaded, statics.Tally.empty())
+    world = statics.build(loaded)[0]
     surveyed = survey.Survey(loaded, world)
     place = surveyed.sites[site]
     scan = surveyed.scan(place).scan

@@ -13,6 +13,7 @@ from pipeline.scenario import loading
 from pipeline.scenario.loading import from_values
 from pipeline.sensing import scanner as survey
 from pipeline.stages import statics
+from pipeline.world import building
 from pipeline.world.mesh import World, read_ply, write_ply
 from tests.conftest import collection, feature
 
@@ -36,10 +37,9 @@ def load(folder, **settings):
 
 
 def built(folder, *features):
-    """The world and the tally of a GeoJSON file."""
+    """The world and the counts of a GeoJSON file."""
     (folder / "s.geojson").write_text(collection(*features))
-    tally = statics.Tally.empty()
-    return statics.build(load(folder, footprints=["s.geojson"]), tally), tally
+    return statics.build(load(folder, footprints=["s.geojson"]))
 
 
 def volumes(world):
@@ -50,10 +50,9 @@ def volumes(world):
 
 
 def mesh_of(folder, mesh, **settings):
-    """The world and the tally of a mesh file."""
+    """The world and the counts of a mesh file."""
     mesh.export(folder / "m.ply")
-    tally = statics.Tally.empty()
-    return statics.build(load(folder, meshes=[{"file": "m.ply", **settings}]), tally), tally
+    return statics.build(load(folder, meshes=[{"file": "m.ply", **settings}]))
 
 
 @pytest.mark.parametrize(
@@ -70,17 +69,17 @@ def mesh_of(folder, mesh, **settings):
     ],
 )
 def test_a_prism_is_closed_faces_outwards_and_has_its_volume(tmp_path, rings, area):
-    world, tally = built(tmp_path, polygon(*rings, base_m=2.5, height_m=7.0))
+    world, counts = built(tmp_path, polygon(*rings, base_m=2.5, height_m=7.0))
     assert world.closed.all()
     assert volumes(world) == pytest.approx([area * 4.5], rel=1e-9)
     assert world.triangles_m[..., 2].min() == 2.5
     assert world.triangles_m[..., 2].max() == 7.0
-    assert not tally.mended
-    assert not tally.left_out
+    assert not counts.mended
+    assert not counts.left_out
 
 
 def test_points_are_discs_and_lines_are_strips(tmp_path):
-    world, tally = built(
+    world, counts = built(
         tmp_path,
         feature({"type": "Point", "coordinates": [5, 5]}, height_m=3, radius_m=0.5, kind="pole"),
         feature(
@@ -92,7 +91,7 @@ def test_points_are_discs_and_lines_are_strips(tmp_path):
     disc = 16 / 2 * 0.25 * math.sin(2 * math.pi / 16) * 3
     assert volumes(world)[[0, 2, 3]] == pytest.approx([disc] * 3, rel=1e-12)
     assert volumes(world)[1] == pytest.approx(10.0, rel=0.02)  # the bend is mitred, the ends are flat
-    assert tally.built == {"pole": 3, "wall": 1}
+    assert counts.built == {"pole": 3, "wall": 1}
 
 
 @pytest.mark.parametrize(
@@ -107,8 +106,8 @@ def test_points_are_discs_and_lines_are_strips(tmp_path):
     ],
 )  # fmt: skip
 def test_dirt_with_one_meaning_is_mended_and_counted(tmp_path, features, mended, area):
-    world, tally = built(tmp_path, *features)
-    assert dict(tally.mended) == mended
+    world, counts = built(tmp_path, *features)
+    assert dict(counts.mended) == mended
     assert world.closed.all()
     assert sorted(volumes(world)) == pytest.approx(sorted(5 * a for a in area), rel=1e-12)
 
@@ -166,14 +165,13 @@ def test_poly_xml(tmp_path):
         '<additional><poly id="a" type="building" fill="1" shape="{a}"><param key="height" value="3"/></poly>'
         '<poly id="c" fill="0" shape="{c}"/><poi id="p" x="0" y="0"/></additional>'.format(**shapes)
     )
-    tally = statics.Tally.empty()
-    world = statics.build(load(tmp_path, polygons=["s.poly.xml"]), tally)
+    world, counts = statics.build(load(tmp_path, polygons=["s.poly.xml"]))
     assert volumes(world) == pytest.approx([48], rel=1e-12)
-    assert sum(tally.left_out.values()) == 2
+    assert sum(counts.left_out.values()) == 2
     for name in "bd":
         (tmp_path / "s.poly.xml").write_text(f'<additional><poly id="x" fill="1" shape="{shapes[name]}"/></additional>')
         with pytest.raises(InputError, match="poly x"):
-            statics.build(load(tmp_path, polygons=["s.poly.xml"]), statics.Tally.empty())
+            statics.build(load(tmp_path, polygons=["s.poly.xml"]))
 
 
 BOX = trimesh.creation.box((4, 6, 8))
@@ -181,12 +179,12 @@ BOX = trimesh.creation.box((4, 6, 8))
 
 def test_a_mesh_is_taken_apart_into_closed_pieces(tmp_path):
     two = trimesh.util.concatenate([BOX, BOX.copy().apply_translation([10, 0, 0])])
-    world, tally = mesh_of(tmp_path, two, offset_m=(100, 200, 300), kind="city")
+    world, counts = mesh_of(tmp_path, two, offset_m=(100, 200, 300), kind="city")
     assert len(world.solids) == 2
     assert world.closed.all()
     assert world.triangles_m.min(axis=(0, 1)).tolist() == [98, 197, 296]
-    assert tally.built == {"city": 2}
-    assert not tally.mended
+    assert counts.built == {"city": 2}
+    assert not counts.mended
 
 
 def test_an_inverted_solid_is_still_a_solid(tmp_path):
@@ -201,17 +199,17 @@ def test_an_inverted_solid_is_still_a_solid(tmp_path):
 def test_a_mesh_with_a_hole_or_a_turned_triangle_stays_a_surface(tmp_path, spoil):
     faces = np.array(BOX.faces)
     faces = faces[1:] if spoil == "hole" else np.concatenate([faces[:1, ::-1], faces[1:]])
-    world, tally = mesh_of(tmp_path, trimesh.Trimesh(BOX.vertices, faces, process=False))
+    world, counts = mesh_of(tmp_path, trimesh.Trimesh(BOX.vertices, faces, process=False))
     assert len(world.faces) == len(faces)
     assert not world.closed.any()
-    assert tally.built == {"mesh (open surface)": 1}
+    assert counts.built == {"mesh (open surface)": 1}
 
 
 def test_doubled_and_degenerate_triangles_are_dropped_and_counted(tmp_path):
     faces = np.concatenate([BOX.faces, BOX.faces[:3], BOX.faces[:2, [0, 0, 1]]])
-    world, tally = mesh_of(tmp_path, trimesh.Trimesh(BOX.vertices, faces, process=False))
+    world, counts = mesh_of(tmp_path, trimesh.Trimesh(BOX.vertices, faces, process=False))
     assert world.closed.all()
-    assert dict(tally.mended) == {"degenerate or doubled triangles dropped": 5}
+    assert dict(counts.mended) == {"degenerate or doubled triangles dropped": 5}
 
 
 def test_a_soup_of_separate_triangles_is_sewn(tmp_path):
@@ -225,28 +223,28 @@ def test_a_soup_of_separate_triangles_is_sewn(tmp_path):
 def test_a_vertex_that_is_no_number_is_refused(tmp_path, value):
     (tmp_path / "m.obj").write_text(f"v 0 0 0\nv 1 0 0\nv 0 {value} 0\nf 1 2 3\n")
     with pytest.raises(InputError, match=r"m\.obj: vertex 2"):
-        statics.build(load(tmp_path, meshes=[{"file": "m.obj"}]), statics.Tally.empty())
+        statics.build(load(tmp_path, meshes=[{"file": "m.obj"}]))
 
 
 def test_a_mesh_without_triangles_is_refused(tmp_path):
     (tmp_path / "m.obj").write_text("v 0 0 0\nv 1 0 0\n")
     with pytest.raises(InputError, match=r"m\.obj"):
-        statics.build(load(tmp_path, meshes=[{"file": "m.obj"}]), statics.Tally.empty())
+        statics.build(load(tmp_path, meshes=[{"file": "m.obj"}]))
 
 
 def test_a_mesh_of_nothing_but_degenerate_triangles_is_refused(tmp_path):
     (tmp_path / "m.obj").write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 1 2\nf 1 2 3\n")
     with pytest.raises(InputError, match=r"m\.obj"):
-        statics.build(load(tmp_path, meshes=[{"file": "m.obj"}]), statics.Tally.empty())
+        statics.build(load(tmp_path, meshes=[{"file": "m.obj"}]))
 
 
 def test_ground_reaches_beyond_everything(tmp_path):
     (tmp_path / "s.geojson").write_text(collection(polygon([[p[0] + 300, p[1]] for p in SQUARE])))
     loaded = load(tmp_path, footprints=["s.geojson"], ground=True)
-    world = statics.build(loaded, statics.Tally.empty())
+    world, _ = statics.build(loaded)
     ground = world.triangles_m[world.solid_of_face == 1]
     assert (ground[..., 2] == 0).all()
-    assert ground[..., 0].max() == 304 + statics.GROUND_MARGIN_M
+    assert ground[..., 0].max() == 304 + building.GROUND_MARGIN_M
     assert world.closed.tolist() == [True, False]
     assert (np.cross(ground[:, 1] - ground[:, 0], ground[:, 2] - ground[:, 0])[:, 2] > 0).all()
 
@@ -280,7 +278,7 @@ def survey_at(folder, *sites, features, ground=True):
         "site,x_m,y_m,z_m\n" + "".join(f"s{i},{x!r},{y!r},{z!r}\n" for i, (x, y, z) in enumerate(sites))
     )
     loaded = load(folder, footprints=["s.geojson"], ground=ground)
-    return survey.Survey(loaded, statics.build(loaded, statics.Tally.empty()))
+    return survey.Survey(loaded, statics.build(loaded)[0])
 
 
 HOUSES = (
@@ -379,12 +377,11 @@ def test_closed_means_each_side_met_by_its_opposite():
 
 def test_shipped_statics_are_closed_and_clean():
     for name in ("nishishinjuku", "ingolstadt"):
-        tally = statics.Tally.empty()
-        world = statics.build(loading.load(f"scenarios/{name}"), tally)
+        world, counts = statics.build(loading.load(f"scenarios/{name}"))
         kinds = [kind for _, kind in world.solids]
         assert [k for k, closed in zip(kinds, world.closed, strict=True) if not closed] == ["ground"]
         assert (world.signs[world.closed] == 1).all()
-        assert not tally.mended
-        assert not tally.left_out
+        assert not counts.mended
+        assert not counts.left_out
         features = json.loads((statics.Path("scenarios") / name / "statics.geojson").read_text())["features"]
-        assert sum(tally.built.values()) >= len(features)
+        assert sum(counts.built.values()) >= len(features)

@@ -1,4 +1,4 @@
-r"""Where are the rear parts of an articulated vehicle?
+r"""Lets the rear parts of an articulated vehicle follow its front.
 
 SUMO gives one point a vehicle, on its front bumper, and moves the whole length as one. This effect takes the pose that
 SUMO gives as that of the front part, and lets each rear part follow the joint that pulls it, as a tractrix: its axle
@@ -32,20 +32,19 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
 
 from pipeline.core.errors import InputError
-from pipeline.effects.registry import Parameters, Scene, Traffic
+from pipeline.effects.base import Traffic
+from pipeline.scenario.effects import ArticulatedParameters, EffectParameters, VehicleParts
 from pipeline.scenario.models import Scenario
-from pipeline.traffic import boxes as motion
-from pipeline.traffic.boxes import Boxes, Size
+from pipeline.traffic.boxes import Size, VehicleBoxes, tidy_m, tidy_rad
+from pipeline.traffic.recording import kind_sizes
 
 Floats = NDArray[np.float64]
-Metres = Annotated[float, Field(gt=0)]
 
 _PIECE_RAD = math.radians(1.0)
 _STILL_M = 1e-6
@@ -55,46 +54,6 @@ _ROUNDING_M = 1e-9
 _BUSES, _TRAILERS, _LONG_M = ("bus", "coach"), ("trailer", "truck"), 16.0
 _BUS_SHARES = (10.6 / 18.75, 7.5 / 18.75)
 _TRACTOR_M, _FIFTH_WHEEL_M, _BOGIE_SHARE = 6.0, 4.5, 7.7 / 12.0
-
-
-class Parts(Parameters):
-    """How a kind of vehicle is put together; each list from front to rear."""
-
-    parts_m: Annotated[tuple[Metres, ...], Field(min_length=1, max_length=8, description="Length of each part")]
-    hinges_m: Annotated[
-        tuple[Metres, ...],
-        Field(description="Each joint's distance from the front bumper; none: in the middle of its gap"),
-    ] = ()
-    axles_m: Annotated[
-        tuple[Metres, ...],
-        Field(description="From each joint back to the axle of the part behind it; none: 0.75 of that part"),
-    ] = ()
-
-    @model_validator(mode="after")
-    def _fits(self) -> Parts:
-        joints = len(self.parts_m) - 1
-        for key in ("hinges_m", "axles_m"):
-            if len(values := getattr(self, key)) not in (0, joints):
-                raise ValueError(
-                    f"{key} has {len(values)} values for {joints + 1} parts, {joints} are needed (or none)"
-                )
-        if list(self.hinges_m) != sorted(self.hinges_m):
-            raise ValueError("hinges_m run back; they count from the front bumper")
-        return self
-
-
-class Model(Parameters):
-    """Parameters of ``[effects.articulated]``."""
-
-    kinds: Annotated[dict[str, Parts], Field(description="Kind of vehicle (name of its SUMO vType) -> its parts")] = (
-        Field(default_factory=dict)
-    )
-    auto: Annotated[
-        bool,
-        Field(
-            description="Whether buses, coaches, trucks and trailers of 16 m and more that `kinds` leaves out get parts"
-        ),
-    ] = True
 
 
 @dataclass(frozen=True)
@@ -107,30 +66,30 @@ class Geometry:
     axles_m: tuple[float, ...]
 
 
-class Articulated(Traffic):
+class Articulated(Traffic[ArticulatedParameters]):
     """Rear parts that follow the front."""
 
     NAME: ClassVar[str] = "articulated"
     SOURCE: ClassVar[str] = "Sayers 1991, Vehicle System Dynamics 20(5), 297-308 (tractrix)"
-    Model: ClassVar[type[Parameters]] = Model
+    Model: ClassVar[type[EffectParameters]] = ArticulatedParameters
 
-    def idle(self, scene: Scene) -> str | None:
+    def acts(self, scenario: Scenario) -> tuple[bool, str]:
         """Where each known kind is one part, nothing changes; of a user's own SUMO demand the kinds are not known
-        beforehand."""
-        return self.changes_nothing(scene.scenario)
-
-    def changes_nothing(self, scenario: Scenario) -> str | None:
-        """Why no vehicle gets a rear part, judged from the scenario alone; None when one may.
+        beforehand.
 
         Raises
         ------
         InputError
             When parts do not fit the scenario's kinds.
         """
-        if (sizes := known_sizes(scenario)) is None:
-            return None
-        found = self.geometries(sizes, place_of(scenario))
-        return None if found else "no kind of vehicle has more than one part"
+        sizes = known_sizes(scenario)
+        if sizes is not None and not self.geometries(sizes, place_of(scenario)):
+            return False, "no kind of vehicle has more than one part"
+        return True, "named"
+
+    def box_change(self, scenario: Scenario, sizes: Mapping[str, Size]) -> Follower:
+        """Each box of several parts becomes one box a part."""
+        return Follower(self.geometries(sizes, place_of(scenario)))
 
     def geometries(self, sizes: Mapping[str, Size], place: str) -> dict[str, Geometry]:
         """Kind -> its parts, for kinds of more than one.
@@ -145,14 +104,14 @@ class Articulated(Traffic):
                 raise InputError(
                     f"{place}.kinds", f"there is no kind of vehicle {name!r}", f"one of {', '.join(sorted(sizes))}"
                 )
-        found = {}
+        geometries = {}
         for name, size in sizes.items():
             parts = self.parameters.kinds.get(name) or (_by_class(size) if self.parameters.auto else None)
             if parts is not None:
                 geometry = _geometry(parts, size.length_m, f"{place}.kinds.{name}")
                 if len(geometry.lengths_m) > 1:
-                    found[name] = geometry
-        return found
+                    geometries[name] = geometry
+        return geometries
 
 
 def place_of(scenario: Scenario) -> str:
@@ -165,22 +124,24 @@ def known_sizes(scenario: Scenario) -> dict[str, Size] | None:
     traffic = scenario.traffic
     if traffic.sumocfg is not None or traffic.routes:
         return None
-    return {k.name: Size(k.length_m, k.width_m, k.height_m, k.vclass) for k in traffic.kinds}
+    return kind_sizes(scenario)
 
 
-def _by_class(size: Size) -> Parts | None:
+def _by_class(size: Size) -> VehicleParts | None:
     """Parts of a kind that is long for its vClass."""
     if size.length_m < _LONG_M:
         return None
     if size.vclass in _BUSES:
-        return Parts(parts_m=tuple(share * size.length_m for share in _BUS_SHARES))
+        return VehicleParts(parts_m=tuple(share * size.length_m for share in _BUS_SHARES))
     if size.vclass in _TRAILERS:
         axle = _BOGIE_SHARE * (size.length_m - _FIFTH_WHEEL_M)
-        return Parts(parts_m=(_TRACTOR_M, size.length_m - _TRACTOR_M), hinges_m=(_FIFTH_WHEEL_M,), axles_m=(axle,))
+        return VehicleParts(
+            parts_m=(_TRACTOR_M, size.length_m - _TRACTOR_M), hinges_m=(_FIFTH_WHEEL_M,), axles_m=(axle,)
+        )
     return None
 
 
-def _geometry(parts: Parts, length_m: float, place: str) -> Geometry:
+def _geometry(parts: VehicleParts, length_m: float, place: str) -> Geometry:
     """Gaps of equal length between the parts take up what is left of the vehicle's length."""
     lengths, joints = parts.parts_m, len(parts.parts_m) - 1
     left = length_m - sum(lengths)
@@ -215,39 +176,41 @@ class Follower:
     vehicles: set[str] = field(default_factory=set)
     _states: dict[str, _State] = field(default_factory=dict)
 
-    def parts(self, found: Boxes) -> Boxes:
+    def change(self, boxes: VehicleBoxes) -> VehicleBoxes:
         """The boxes with each articulated vehicle's row replaced by one row a part."""
-        shapes = [self.geometries.get(name) for name in found.types]
+        shapes = [self.geometries.get(name) for name in boxes.types]
         parts = np.array([1 if shape is None else len(shape.lengths_m) for shape in shapes], dtype=np.int64)[
-            found.type_code
+            boxes.type_code
         ]
         rows = np.repeat(np.arange(parts.size), parts)
         part = np.arange(rows.size) - np.repeat(np.cumsum(parts) - parts, parts)
-        whole = replace(found, **found.rows(rows), part=part)
-        boxes = {name: getattr(whole, name) for name in ("x_m", "y_m", "z_m", "yaw_rad", "length_m")}
+        whole = replace(boxes, **boxes.rows(rows), part=part)
+        columns = {name: getattr(whole, name) for name in ("x_m", "y_m", "z_m", "yaw_rad", "length_m")}
         first = np.cumsum(parts) - parts
         for row in np.flatnonzero(parts > 1).tolist():
-            shape = shapes[found.type_code[row]]
+            shape = shapes[boxes.type_code[row]]
             assert shape is not None
-            for i, values in enumerate(self._follow(found, row, shape)):
-                for name, value in zip(boxes, values, strict=True):
-                    boxes[name][first[row] + i] = value
+            for i, values in enumerate(self._follow(boxes, row, shape)):
+                for name, value in zip(columns, values, strict=True):
+                    columns[name][first[row] + i] = value
         self._states = {
-            name: state for name, state in self._states.items() if state.frame == found.first_frame + found.frames - 1
+            name: state for name, state in self._states.items() if state.frame == boxes.first_frame + boxes.frames - 1
         }
         for name in ("x_m", "y_m", "z_m"):
-            boxes[name] = np.where(parts[rows] > 1, motion.tidy_m(boxes[name]), boxes[name])
-        boxes["yaw_rad"] = np.where(part > 0, motion.tidy_rad(boxes["yaw_rad"]), boxes["yaw_rad"])
-        return replace(whole, **boxes)
+            columns[name] = np.where(parts[rows] > 1, tidy_m(columns[name]), columns[name])
+        columns["yaw_rad"] = np.where(part > 0, tidy_rad(columns["yaw_rad"]), columns["yaw_rad"])
+        return replace(whole, **columns)
 
-    def _follow(self, found: Boxes, row: int, shape: Geometry) -> Iterator[tuple[float, float, float, float, float]]:
+    def _follow(
+        self, boxes: VehicleBoxes, row: int, shape: Geometry
+    ) -> Iterator[tuple[float, float, float, float, float]]:
         """x, y, z of the centre, yaw, and length of each part of one vehicle in one frame."""
-        name, frame = found.names[found.code[row]], int(found.frame[row])
-        yaw, pitch, length = float(found.yaw_rad[row]), float(found.pitch_rad[row]), float(found.length_m[row])
+        name, frame = boxes.names[boxes.code[row]], int(boxes.frame[row])
+        yaw, pitch, length = float(boxes.yaw_rad[row]), float(boxes.pitch_rad[row]), float(boxes.length_m[row])
         flat, rise = math.cos(pitch), math.sin(pitch)
-        x = float(found.x_m[row]) + length / 2 * flat * math.cos(yaw)
-        y = float(found.y_m[row]) + length / 2 * flat * math.sin(yaw)
-        z = float(found.z_m[row]) + length / 2 * rise
+        x = float(boxes.x_m[row]) + length / 2 * flat * math.cos(yaw)
+        y = float(boxes.y_m[row]) + length / 2 * flat * math.sin(yaw)
+        z = float(boxes.z_m[row]) + length / 2 * rise
         last = self._states.get(name)
         last = last if last is not None and last.frame == frame - 1 else None
         headings, hinges, pulled_m = [yaw], [], 0.0
@@ -267,9 +230,10 @@ class Follower:
         self._states[name] = _State(frame, headings, hinges)
         self.vehicles.add(name)
 
-    def result(self) -> dict[str, Any]:
-        """As the stage reports it."""
-        return {"vehicles": len(self.vehicles), "largest_angle_deg": round(math.degrees(self.largest_rad), 3)}
+    def summary(self) -> dict[str, Any]:
+        """How many vehicles have rear parts, and the largest angle at a joint."""
+        angle_deg = round(math.degrees(self.largest_rad), 3)
+        return {Articulated.NAME: {"vehicles": len(self.vehicles), "largest_angle_deg": angle_deg}}
 
 
 def _pulled(last: _State, leader_rad: float, hinge: tuple[float, float], i: int, axle_m: float) -> float:
@@ -298,6 +262,3 @@ def follow(heading_rad: float, dx_m: float, dy_m: float, turn_rad: float, axle_m
 def _wrapped(angle_rad: float) -> float:
     """Into [-pi, pi]."""
     return math.remainder(angle_rad, math.tau)
-
-
-EFFECT = Articulated

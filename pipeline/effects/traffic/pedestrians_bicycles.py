@@ -1,4 +1,4 @@
-r"""Who else is on the street: people on foot and on bicycles?
+r"""Brings people on foot and on bicycles onto the street.
 
 *Pedestrians* are SUMO's persons. Each walks from one end of a sidewalk at the network's fringe to one at another fringe
 node (in a network without such ends: between any two sidewalks that hang together), over sidewalks, walking areas and
@@ -30,22 +30,22 @@ not vary."""
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from pipeline.core.errors import InputError
-from pipeline.effects.registry import Parameters, Scene, Traffic
+from pipeline.effects.base import Traffic
+from pipeline.scenario.effects import EffectParameters, PedestriansBicyclesParameters
 from pipeline.scenario.models import Scenario
 from pipeline.scenario.traffic import TrafficModel, VehicleKind
-from pipeline.traffic import demand, network
+from pipeline.traffic import demand
 from pipeline.traffic.boxes import Size
+from pipeline.traffic.extensions import TrafficPlan
 from pipeline.traffic.network import Network, Sidewalk
 
 PEDESTRIAN, BICYCLE = "egvs_pedestrian", "egvs_bicycle"
@@ -67,63 +67,29 @@ _MAKES_WALKS = (
 )
 _MAKES_LANES = "a network with lanes for bicycles, for example from netconvert --bikelanes.guess"
 
-Size3 = Annotated[
-    tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]],
-    Field(description="Length, width and height of the box"),
-]
-Rate = Annotated[float, Field(ge=0, le=100_000, description="Departures in an hour, in the whole network")]
 
-
-class Model(Parameters):
-    """Parameters of ``[effects.pedestrians_bicycles]``."""
-
-    pedestrians_per_h: Rate = 0.0
-    bicycles_per_h: Rate = 0.0
-    pedestrian_m: Size3 = (0.8, 0.6, 1.73)
-    bicycle_m: Size3 = (1.76, 0.6, 1.73)
-
-
-@dataclass(frozen=True)
-class Plan:
-    """What SUMO gets: a route file, and by how many vehicles it exceeds the scenario's; persons and trips are those of
-    bicycles."""
-
-    xml: str
-    slots: int
-    persons: int
-    trips: int
-    notes: tuple[str, ...]
-
-
-class PedestriansBicycles(Traffic):
+class PedestriansBicycles(Traffic[PedestriansBicyclesParameters]):
     """People on foot and on bicycles beside the scenario's vehicles."""
 
     NAME: ClassVar[str] = "pedestrians_bicycles"
     SOURCE: ClassVar[str] = (
         "Erdmann and Krajzewicz 2015 (SUMO's striping model); box sizes: Lang et al. 2019, arXiv 1812.05784"
     )
-    Model: ClassVar[type[Parameters]] = Model
+    Model: ClassVar[type[EffectParameters]] = PedestriansBicyclesParameters
+    ADDS_TRAFFIC: ClassVar[bool] = True
 
-    def idle(self, scene: Scene) -> str | None:
-        """Rates of 0 bring nobody."""
-        return self.changes_nothing(scene.scenario)
-
-    def lacks(self, scene: Scene) -> InputError | None:
-        """A network to walk in."""
-        return self.refusal(scene.scenario)
-
-    def refusal(self, scenario: Scenario) -> InputError | None:
+    def refuses(self, scenario: Scenario) -> InputError | None:
         """Nobody can be added to a finished file."""
-        if scenario.traffic.fcd is None or self.changes_nothing(scenario) is not None:
+        if scenario.traffic.fcd is None or not self.acts(scenario)[0]:
             return None
-        found = "the scenario names a finished FCD file, so nobody can be added"
-        return InputError(f"{scenario.file}: effects.{self.NAME}", found, "network or sumocfg in [traffic]")
+        reason = "the scenario names a finished FCD file, so nobody can be added"
+        return InputError(f"{scenario.file}: effects.{self.NAME}", reason, "network or sumocfg in [traffic]")
 
-    def changes_nothing(self, scenario: Scenario) -> str | None:
-        """Why nobody comes; None when somebody may."""
+    def acts(self, scenario: Scenario) -> tuple[bool, str]:
+        """Rates of 0 bring nobody."""
         del scenario
         both = self.parameters.pedestrians_per_h == 0 and self.parameters.bicycles_per_h == 0
-        return "both rates are 0" if both else None
+        return (False, "both rates are 0") if both else (True, "named")
 
     def sizes(self) -> dict[str, Size]:
         """Sizes of the types that this effect adds."""
@@ -131,17 +97,14 @@ class PedestriansBicycles(Traffic):
         named = ((PEDESTRIAN, "pedestrian", p.pedestrian_m), (BICYCLE, "bicycle", p.bicycle_m))
         return {name: Size(length, width, height, vclass) for name, vclass, (length, width, height) in named}
 
-    def plan(
-        self, scenario: Scenario, path: Path, roads: Network, begin_s: float, end_s: float, rng: np.random.Generator
-    ) -> Plan:
-        """Draw everybody's trips.
+    def uncounted_types(self, sizes: Mapping[str, Size]) -> frozenset[str]:
+        """What this effect adds, and a user's own persons."""
+        return TYPES | {name for name, size in sizes.items() if size.vclass == "pedestrian"}
 
-        Parameters
-        ----------
-        path, roads
-            The network's file, and what is read of it.
-        begin_s, end_s
-            The simulated time.
+    def plan(
+        self, scenario: Scenario, roads: Network, begin_s: float, end_s: float, rng: np.random.Generator
+    ) -> TrafficPlan:
+        """Draw everybody's trips between two times.
 
         Raises
         ------
@@ -154,11 +117,11 @@ class PedestriansBicycles(Traffic):
             np.sort(begin_s + draw.random(round(rate * hours)) * (end_s - begin_s))
             for draw, rate in ((walkers, self.parameters.pedestrians_per_h), (riders, self.parameters.bicycles_per_h))
         ]
-        persons, notes = _walks(path, times[0], walkers, place) if self.parameters.pedestrians_per_h else ([], [])
+        persons, notes = _walks(roads, times[0], walkers, place) if self.parameters.pedestrians_per_h else ([], [])
         rides = _rides(roads, scenario.traffic, times[1], riders, place) if self.parameters.bicycles_per_h else []
-        slots = list(_strung(rides, begin_s, end_s))
-        lines = ["<routes>", *self._types(), *slots, *persons, "</routes>", ""]
-        return Plan("\n".join(lines), len(slots), len(persons), len(rides), tuple(notes))
+        vehicles = list(_on_few_vehicles(rides, begin_s, end_s))
+        lines = ["<routes>", *self._types(), *vehicles, *persons, "</routes>", ""]
+        return TrafficPlan("\n".join(lines), len(vehicles), tuple(notes))
 
     def _types(self) -> Iterator[str]:
         for name, size in self.sizes().items():
@@ -172,10 +135,10 @@ class PedestriansBicycles(Traffic):
 
 
 def _walks(
-    path: Path, times_s: NDArray[np.float64], rng: np.random.Generator, place: str
+    roads: Network, times_s: NDArray[np.float64], rng: np.random.Generator, place: str
 ) -> tuple[list[str], list[str]]:
     """One ``<person>`` a departure."""
-    ways = network.walkways(path)
+    ways = roads.walkways
     if not ways.sidewalks or not ways.areas:
         raise InputError(f"{place}.pedestrians_per_h", "the network has no sidewalks that hang together", _MAKES_WALKS)
     pairs = _ends(ways.sidewalks) or _anywhere(ways.sidewalks)
@@ -190,16 +153,17 @@ def _walks(
     for number, (depart, pair) in enumerate(zip(times_s, chosen, strict=True)):
         (start, start_m), (end, end_m) = pairs[pair]
         people.append(
-            f'    <person id="{PEDESTRIAN}_{number}" type="{PEDESTRIAN}" depart="{depart:.3f}" departPos="{start_m:.2f}">'
-            f'<walk from={quoteattr(start.edge)} to={quoteattr(end.edge)} arrivalPos="{end_m:.2f}"/></person>'
+            f'    <person id="{PEDESTRIAN}_{number}" type="{PEDESTRIAN}" depart="{depart:.3f}"'
+            f' departPos="{start_m:.2f}"><walk from={quoteattr(start.edge)} to={quoteattr(end.edge)}'
+            f' arrivalPos="{end_m:.2f}"/></person>'
         )
     return people, notes
 
 
-Stand = tuple[Sidewalk, float]
+SidewalkPlace = tuple[Sidewalk, float]
 
 
-def _ends(sidewalks: tuple[Sidewalk, ...]) -> list[tuple[Stand, Stand]]:
+def _ends(sidewalks: tuple[Sidewalk, ...]) -> list[tuple[SidewalkPlace, SidewalkPlace]]:
     """Pairs of sidewalk ends at two nodes of the fringe (which lead to one neighbour only) that people can walk
     between."""
     neighbours: dict[str, set[str]] = {}
@@ -212,7 +176,7 @@ def _ends(sidewalks: tuple[Sidewalk, ...]) -> list[tuple[Stand, Stand]]:
     return [((a, a_m), (b, b_m)) for a, a_m, start in ends for b, b_m, end in ends if start != end and a.part == b.part]
 
 
-def _anywhere(sidewalks: tuple[Sidewalk, ...]) -> list[tuple[Stand, Stand]]:
+def _anywhere(sidewalks: tuple[Sidewalk, ...]) -> list[tuple[SidewalkPlace, SidewalkPlace]]:
     """From the middle of any sidewalk to that of any other that hangs together with it."""
     return [
         ((a, a.length_m / 2), (b, b.length_m / 2)) for a in sidewalks for b in sidewalks if a != b and a.part == b.part
@@ -241,11 +205,11 @@ def _rides(
     if not any(edge.lanes_for(kind.vclass) for edge in roads.edges):
         raise InputError(f"{place}.bicycles_per_h", "the network has no lane that bicycles may use", _MAKES_LANES)
     free = traffic.model_copy(update={"edge_weights": {}, "min_trip_m": 0.0})
-    found = demand.pairs(roads, kind, free, rng, f"{place}.bicycles_per_h")
-    chosen = rng.choice(found.origin.size, size=times_s.size, p=found.weight / found.weight.sum())
+    pairs = demand.pairs(roads, kind, free, rng, f"{place}.bicycles_per_h")
+    chosen = rng.choice(pairs.origin.size, size=times_s.size, p=pairs.weight / pairs.weight.sum())
     router, rides = _Router(roads), []
     for depart, pair in zip(times_s.tolist(), chosen, strict=True):
-        way = router.way(int(found.origin[pair]), int(found.target[pair]))
+        way = router.way(int(pairs.origin[pair]), int(pairs.target[pair]))
         length = sum(router.lengths_m[edge] for edge in way)
         takes = length / _RIDES_M_S + _WAITS_S * len(way)
         rides.append(
@@ -271,8 +235,8 @@ class _Router:
     def lane(self, edge: int) -> tuple[str, float]:
         """The first lane of an edge that bicycles may use, and its length."""
         road = self._roads.edges[edge]
-        index = next(i for i, lane in enumerate(road.lanes) if lane.admits("bicycle"))
-        return f"{road.id}_{index}", road.lengths_m[index]
+        index = next(i for i, lane in enumerate(road.lanes) if lane.permission.admits("bicycle"))
+        return f"{road.id}_{index}", road.lanes[index].length_m
 
     def way(self, origin: int, target: int) -> list[int]:
         """The edges from ``origin`` to ``target``, both included."""
@@ -286,7 +250,7 @@ class _Router:
         return way[::-1]
 
 
-def _strung(rides: list[_Ride], begin_s: float, end_s: float) -> Iterator[str]:
+def _on_few_vehicles(rides: list[_Ride], begin_s: float, end_s: float) -> Iterator[str]:
     """One ``<vehicle>`` for trips one after another: each trip goes to the vehicle that has been free for longest, or
     to a new one.
 
@@ -325,9 +289,6 @@ def _stop(lane: tuple[str, float], start_m: float, end_m: float, until_s: float)
     """Where a vehicle jumps from: anywhere between two places of a lane, so that it need not brake before."""
     name, length_m = lane
     return (
-        f'<stop lane={quoteattr(name)} startPos="{max(0.0, start_m):.2f}" endPos="{min(length_m, end_m):.2f}" duration="0"'
-        f' speed="{_WAYPOINT_M_S:g}" jump="0" jumpUntil="{until_s:.3f}"/>'
+        f'<stop lane={quoteattr(name)} startPos="{max(0.0, start_m):.2f}" endPos="{min(length_m, end_m):.2f}"'
+        f' duration="0" speed="{_WAYPOINT_M_S:g}" jump="0" jumpUntil="{until_s:.3f}"/>'
     )
-
-
-EFFECT = PedestriansBicycles

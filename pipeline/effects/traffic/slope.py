@@ -1,9 +1,6 @@
-r"""How do roads that go up and down change boxes and ground?
+r"""Seats boxes and ground on roads that go up and down.
 
-Steps: take every lane's middle line, and its edges at the same height, a point every few metres; thin them to one a
-cell of half a metre (a mean, so that points of a plane stay on it; where lanes cross at different levels, the lowest
-level counts); lay a triangulated surface through them (Delaunay), which goes on level from the nearest lane beyond the
-roads. Then
+A triangulated surface is laid through the lanes (:mod:`pipeline.world.terrain`). Then
 
 - *boxes* stand with both ends on the road. SUMO gives the slope at the front bumper only: a bus whose front has reached
   the grade would hang with its rear in the ground. With z the surface's height below the front f and the rear r of a
@@ -23,263 +20,109 @@ would be wrong then; never on a flat network. No parameters.
 Source: SUMO's networks with elevation (https://sumo.dlr.de/docs/Networks/Elevation.html); linear interpolation over a
 Delaunay triangulation: Barber, Dobkin, Huhdanpaa 1996, ACM TOMS 22(4), 469-483 (Qhull).
 
-Limits: one surface, so no ground below bridges' ends but a ramp (a box more than 1 m off the surface keeps SUMO's own
-slope); the ground between roads is interpolated, not measured; no camber; vehicles' speeds do not depend on the grade
-in SUMO's car-following."""
+Limits: those of one surface (a box more than 1 m off it, on a bridge, keeps SUMO's own slope); no camber; vehicles'
+speeds do not depend on the grade in SUMO's car-following."""
 
 from __future__ import annotations
 
-import itertools
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.effects.registry import Parameters, Scene, Traffic
+from pipeline.effects.base import Traffic
+from pipeline.scenario.effects import EffectParameters, SlopeParameters
 from pipeline.scenario.models import Scenario
-from pipeline.traffic import boxes as motion
-from pipeline.traffic import network
-from pipeline.traffic.boxes import Boxes
-
-Floats = NDArray[np.float64]
+from pipeline.traffic import configuration, network
+from pipeline.traffic.boxes import Size, VehicleBoxes, tidy_m, tidy_rad
+from pipeline.world import terrain
+from pipeline.world.terrain import Surface
 
 LEAST_M = 0.1
 """Differences in height up to this are no relief."""
 
-_STEP_M = 10.0
-_CELL_M = 0.5
-_LEVEL_M = 1.5
-"""Points of a cell that lie so much above its lowest are another level: a bridge."""
-
-_RING_M = 50.0
 _OFF_M = 1.0
-_MARGIN_M = 100.0
-_HAIR = 1e-12
 _UPRIGHT = "pedestrian"
 
 
-class Model(Parameters):
-    """``[effects.slope]`` has no parameters."""
-
-
-class Slope(Traffic):
+class Slope(Traffic[SlopeParameters]):
     """Pitched boxes and a ground that follows the roads."""
 
     NAME: ClassVar[str] = "slope"
     SOURCE: ClassVar[str] = "SUMO networks with elevation; Delaunay surface (Barber et al. 1996, Qhull)"
-    Model: ClassVar[type[Parameters]] = Model
+    Model: ClassVar[type[EffectParameters]] = SlopeParameters
+    SELF_ACTING: ClassVar[bool] = True
+    LAYS_GROUND: ClassVar[bool] = True
 
-    def idle(self, scene: Scene) -> str | None:
-        """A flat network has no slope, whoever names it."""
-        on, reason = decide(scene.scenario)
-        return None if on else reason
+    def acts(self, scenario: Scenario) -> tuple[bool, str]:
+        """Where the network has relief, whoever names it."""
+        path = configuration.network_path(scenario)
+        if path is None:
+            return False, "a finished FCD file names no network; its own heights and slopes are taken as they are"
+        if not network.may_have_heights(path):
+            return False, "the network is flat"
+        relief = terrain.relief(network.read(path))
+        if relief.span_m > LEAST_M:
+            return True, f"the network has {relief.span_m:.1f} m of relief"
+        if abs(relief.off_m) > LEAST_M:
+            return True, f"the network lies at z = {relief.off_m:.1f} m"
+        return False, f"the network has {relief.span_m:.2g} m of relief, no more than {LEAST_M:g} m"
+
+    def box_change(self, scenario: Scenario, sizes: Mapping[str, Size]) -> Seating:
+        """Boxes are seated on the ground around the network."""
+        del sizes
+        return Seating(self.ground(scenario))
+
+    def ground(
+        self, scenario: Scenario, low_m: NDArray[np.float64] | None = None, high_m: NDArray[np.float64] | None = None
+    ) -> Surface:
+        """The ground through the network's lanes."""
+        path = configuration.network_path(scenario)
+        assert path is not None, "a scenario in which the slope acts has a network"
+        return terrain.ground(network.read(path), low_m, high_m)
 
 
 @dataclass(frozen=True)
-class Surface:
-    """Heights of a triangulated ground.
+class Seating:
+    """Sets boxes on a surface."""
 
-    Attributes
-    ----------
-    vertices_m
-        (n, 3) float64, world frame.
-    faces
-        (m, 3) int64, counter-clockwise seen from above.
-    low_m, high_m
-        The rectangle that the faces cover.
-    """
+    surface: Surface
 
-    vertices_m: Floats
-    faces: NDArray[np.int64]
-    low_m: Floats
-    high_m: Floats
-
-    @cached_property
-    def _triangulation(self) -> Any:
-        from scipy.spatial import Delaunay
-
-        return Delaunay(self.vertices_m[:, :2] - self.low_m)
-
-    def height_m(self, x_m: Floats, y_m: Floats) -> Floats:
-        """The ground's z below points (n,); beyond the rectangle it goes on level."""
-        # a hair inside, since a point on the hull's own edge may count as outside
-        hair = 1e-6 * (self.high_m - self.low_m)
-        at = np.clip(np.column_stack([x_m, y_m]), self.low_m + hair, self.high_m - hair) - self.low_m
-        corners, shares = self._round(at)
-        heights: Floats = (self.vertices_m[corners, 2] * shares).sum(axis=1)
-        return heights
-
-    def _round(self, at: Floats) -> tuple[NDArray[np.int64], Floats]:
-        """The triangle round each point (n, 2): its vertices (n, 3) and their shares in the point (n, 3).
-
-        A walk from the nearest vertex to the neighbour across the side that the point lies beyond; on a Delaunay
-        triangulation it ends. (Qhull's own search asks LAPACK for thousands of 2 x 2 matrices, whose threads may take
-        seconds on a busy machine.)"""
-        net, points = self._triangulation, self.vertices_m[:, :2] - self.low_m
-        face = np.maximum(net.vertex_to_simplex[_nearest(points, at)], 0).astype(np.int64)
-        shares, active = _shares(points[net.simplices[face]], at), np.arange(len(at))
-        for _ in range(len(net.simplices)):
-            beyond = shares[active].argmin(axis=1)
-            onward = net.neighbors[face[active], beyond]
-            goes = (shares[active, beyond] < -_HAIR) & (onward >= 0)
-            if not goes.any():
-                break
-            active = active[goes]
-            face[active] = onward[goes]
-            shares[active] = _shares(points[net.simplices[face[active]]], at[active])
-        return net.simplices[face], shares
-
-    def lowest_m(self, outline_m: Floats) -> float:
-        """The lowest ground along an outline (n, 2), a sample every metre."""
-        points = [outline_m[:1]]
-        for start, end in itertools.pairwise(outline_m):
-            steps = int(np.ceil(np.hypot(*(end - start)))) + 1
-            points.append(start + (end - start) * (np.arange(1, steps + 1) / steps)[:, None])
-        return float(self.height_m(*np.concatenate(points).T).min())
-
-    def seat(self, found: Boxes) -> Boxes:
-        """Boxes with both ends on this ground; those that are far off it (bridges) as they were."""
-        cos, sin = np.cos(found.yaw_rad), np.sin(found.yaw_rad)
-        half, flat = found.length_m / 2, np.cos(found.pitch_rad)
-        front_x, front_y = found.x_m + half * flat * cos, found.y_m + half * flat * sin
-        front_z = found.z_m - found.height_m / 2 + half * np.sin(found.pitch_rad)
-        ground = self.height_m(front_x, front_y)
-        above = (front_z - ground)[_first_parts(found)]
-        pitch = found.pitch_rad
+    def change(self, boxes: VehicleBoxes) -> VehicleBoxes:
+        """Boxes with both ends on the surface; those that are far off it (bridges) as they were."""
+        cos, sin = np.cos(boxes.yaw_rad), np.sin(boxes.yaw_rad)
+        half, flat = boxes.length_m / 2, np.cos(boxes.pitch_rad)
+        front_x, front_y = boxes.x_m + half * flat * cos, boxes.y_m + half * flat * sin
+        front_z = boxes.z_m - boxes.height_m / 2 + half * np.sin(boxes.pitch_rad)
+        ground = self.surface.height_m(front_x, front_y)
+        above = (front_z - ground)[_first_parts(boxes)]
+        pitch = boxes.pitch_rad
         for _ in range(2):  # where the rear is depends on the pitch, a little
-            reach = found.length_m * np.cos(pitch)
-            rise = ground - self.height_m(front_x - reach * cos, front_y - reach * sin)
-            pitch = np.arcsin(np.clip(rise / found.length_m, -1.0, 1.0))
+            reach = boxes.length_m * np.cos(pitch)
+            rise = ground - self.surface.height_m(front_x - reach * cos, front_y - reach * sin)
+            pitch = np.arcsin(np.clip(rise / boxes.length_m, -1.0, 1.0))
         flat = np.cos(pitch)
         seated: dict[str, Any] = {
-            "x_m": motion.tidy_m(front_x - half * flat * cos),
-            "y_m": motion.tidy_m(front_y - half * flat * sin),
-            "z_m": motion.tidy_m(ground + above - half * np.sin(pitch) + found.height_m / 2),
-            "pitch_rad": motion.tidy_rad(pitch),
+            "x_m": tidy_m(front_x - half * flat * cos),
+            "y_m": tidy_m(front_y - half * flat * sin),
+            "z_m": tidy_m(ground + above - half * np.sin(pitch) + boxes.height_m / 2),
+            "pitch_rad": tidy_rad(pitch),
         }
-        upright = np.array([kind == _UPRIGHT for kind in found.kinds], dtype=np.bool_)[found.kind]
+        upright = np.array([kind == _UPRIGHT for kind in boxes.kinds], dtype=np.bool_)[boxes.kind]
         stays = upright | ~(np.abs(above) <= _OFF_M)
         settled: dict[str, Any] = {
-            name: np.where(stays, getattr(found, name), values) for name, values in seated.items()
+            name: np.where(stays, getattr(boxes, name), values) for name, values in seated.items()
         }
-        return replace(found, **settled)
+        return replace(boxes, **settled)
+
+    def summary(self) -> dict[str, Any]:
+        """Nothing beside the note that it acts."""
+        return {}
 
 
-def _first_parts(found: Boxes) -> NDArray[np.int64]:
+def _first_parts(boxes: VehicleBoxes) -> NDArray[np.int64]:
     """For each row, the row of the same vehicle's first part."""
-    rows = np.arange(found.frame.size)
-    return rows if found.part is None else np.maximum.accumulate(np.where(found.part == 0, rows, 0))
-
-
-def decide(scenario: Scenario) -> tuple[bool, str]:
-    """Whether a scenario's network has relief, and what to tell the user."""
-    path = network.path_of(scenario)
-    if path is None:
-        return False, "a finished FCD file names no network; its own heights and slopes are taken as they are"
-    if not network.may_have_heights(path):
-        return False, "the network is flat"
-    return _relief(network.lanes(path))
-
-
-def _relief(lanes: list[network.Lane]) -> tuple[bool, str]:
-    heights = np.concatenate([lane.shape_m[:, 2] for lane in lanes])
-    relief, off = float(np.ptp(heights)), float(heights[np.abs(heights).argmax()])
-    if relief > LEAST_M:
-        return True, f"the network has {relief:.1f} m of relief"
-    if abs(off) > LEAST_M:
-        return True, f"the network lies at z = {off:.1f} m"
-    return False, f"the network has {relief:.2g} m of relief, no more than {LEAST_M:g} m"
-
-
-def ground(path: Path, low_m: Floats | None = None, high_m: Floats | None = None) -> Surface:
-    """The surface through a network's lanes, over the rectangle from ``low_m`` to ``high_m``; around the network when
-    None."""
-    lanes = network.lanes(path)
-    points = _thinned(np.concatenate([_strewn(lane) for lane in lanes]))
-    low = points[:, :2].min(axis=0) - _MARGIN_M if low_m is None else low_m
-    high = points[:, :2].max(axis=0) + _MARGIN_M if high_m is None else high_m
-    inside = np.all((points[:, :2] > low) & (points[:, :2] < high), axis=1)
-    rim = _rim(low, high)
-    rim = np.column_stack([rim, points[_nearest(points[:, :2], rim), 2]])
-    return _triangulated(np.concatenate([points[inside], rim]), low, high)
-
-
-def _shares(triangles: Floats, at: Floats) -> Floats:
-    """Barycentric coordinates (n, 3) of points (n, 2) in triangles (n, 3, 2)."""
-    (ax, ay), (bx, by), (cx, cy) = ((triangles[:, i] - at).T for i in range(3))
-    parts = np.column_stack([bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx])
-    shares: Floats = parts / parts.sum(axis=1)[:, None]
-    return shares
-
-
-def _nearest(points: Floats, at: Floats) -> NDArray[np.int64]:
-    from scipy.spatial import KDTree
-
-    found: NDArray[np.int64] = KDTree(points).query(at)[1]
-    return found
-
-
-def _triangulated(vertices: Floats, low: Floats, high: Floats) -> Surface:
-    from scipy.spatial import Delaunay
-
-    faces = np.asarray(Delaunay(vertices[:, :2] - low).simplices, dtype=np.int64)
-    (ax, ay), (bx, by), (cx, cy) = (vertices[faces[:, i], :2].T for i in range(3))
-    down = (bx - ax) * (cy - ay) < (by - ay) * (cx - ax)
-    faces[down] = faces[down][:, [0, 2, 1]]
-    first = np.argmin(
-        faces, axis=1
-    )  # each face from its lowest vertex, faces in order: the bytes do not depend on Qhull's order
-    faces = np.take_along_axis(faces, (first[:, None] + np.arange(3)) % 3, axis=1)
-    return Surface(vertices, faces[np.lexsort(faces.T[::-1])], low, high)
-
-
-def _strewn(lane: network.Lane) -> Floats:
-    """Points (n, 3) along a lane's middle and both its edges, no further apart than a few metres."""
-    shape = lane.shape_m[np.insert(np.any(np.diff(lane.shape_m, axis=0) != 0, axis=1), 0, True)]
-    if len(shape) < 2:
-        return lane.shape_m[:1]
-    way = np.diff(shape, axis=0)
-    length = np.hypot(way[:, 0], way[:, 1])
-    pieces = [np.empty((0, 3))]
-    for start, along, far in zip(shape[:-1], way, length, strict=True):
-        if not far:
-            continue
-        steps = int(np.ceil(far / _STEP_M))
-        line = start + along * (np.arange(steps + 1) / steps)[:, None]
-        aside = np.array([-along[1], along[0], 0.0]) / far * lane.width_m / 2
-        pieces += [line, line + aside, line - aside] if lane.width_m else [line]
-    return np.concatenate(pieces)
-
-
-def _thinned(points: Floats) -> Floats:
-    """One point a cell: the mean of its lowest level; sorted by cell, rounded to 0.1 mm."""
-    cell = np.floor(points[:, :2] / _CELL_M).astype(np.int64)
-    order = np.lexsort((points[:, 2], cell[:, 1], cell[:, 0]))
-    points, cell = points[order], cell[order]
-    starts = np.insert(np.any(np.diff(cell, axis=0) != 0, axis=1), 0, True)
-    number = np.cumsum(starts) - 1
-    low = points[starts, 2][number]  # sorted by height: the first of a cell is its lowest
-    kept = points[:, 2] <= low + _LEVEL_M
-    count = np.bincount(number[kept])
-    means = [np.bincount(number[kept], weights=points[kept, axis]) / count for axis in range(3)]
-    thinned: Floats = np.asarray(np.round(np.column_stack(means), 4) + 0.0, dtype=np.float64)
-    return thinned
-
-
-def _rim(low: Floats, high: Floats) -> Floats:
-    """Points (n, 2) along the edges of a rectangle."""
-    xs, ys = (np.linspace(a, b, int(np.ceil((b - a) / _RING_M)) + 1) for a, b in zip(low, high, strict=True))
-    return np.concatenate(
-        [
-            np.column_stack([xs, np.full(xs.size, low[1])]),
-            np.column_stack([xs, np.full(xs.size, high[1])]),
-            np.column_stack([np.full(ys.size - 2, low[0]), ys[1:-1]]),
-            np.column_stack([np.full(ys.size - 2, high[0]), ys[1:-1]]),
-        ]
-    )
-
-
-EFFECT = Slope
+    rows = np.arange(boxes.frame.size)
+    return rows if boxes.part is None else np.maximum.accumulate(np.where(boxes.part == 0, rows, 0))

@@ -4,7 +4,6 @@ whole one."""
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,11 +11,12 @@ from typing import Any
 from pipeline.core import files
 from pipeline.core.cost import Cost
 from pipeline.core.errors import InputError
-from pipeline.core.version import __version__
-from pipeline.runs.stages import STAGES
-from pipeline.scenario.models import Scenario
 
 RECORD = "run.json"
+
+STAGES = ("statics", "scan", "traffic", "tpog", "score", "report")
+"""In the order of running. The two branches do not know each other; the quick one comes first, so that a site in a wall
+is told before traffic is simulated."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class StageRecord:
     Attributes
     ----------
     inputs
-        The key of :class:`pipeline.runs.stages.Inputs`.
+        Hash of everything that its artefacts depend on.
     files, artefacts
         Name -> sha256 of what it read and of what it wrote.
     summary
@@ -81,12 +81,6 @@ class RunRecord:
     stages: dict[str, StageRecord]
 
     @classmethod
-    def of(cls, scenario: Scenario, folder: Path) -> RunRecord:
-        """Before the first stage."""
-        home = Path(os.path.relpath(scenario.folder, folder)).as_posix()
-        return cls(__version__, scenario.seed, scenario.model_dump(mode="json"), home, {})
-
-    @classmethod
     def read(cls, folder: Path) -> RunRecord:
         """From ``folder / "run.json"``; InputError when it is none."""
         path = folder / RECORD
@@ -103,12 +97,6 @@ class RunRecord:
                 raise InputError(path, found, "remove it and run again")
         known = {name: stage for name in STAGES if (stage := stages.get(name)) is not None}
         return cls(value["egvs"], value["seed"], value["scenario"], value["scenario_folder"], known)
-
-    @classmethod
-    def going_on(cls, scenario: Scenario, folder: Path) -> RunRecord:
-        """What is known of earlier work in this folder, with the scenario as it is now."""
-        record = cls.of(scenario, folder)
-        return replace(record, stages=cls.read(folder).stages) if (folder / RECORD).is_file() else record
 
     def having(self, name: str, stage: StageRecord | None) -> RunRecord:
         """With a stage as it is now; without it for None."""

@@ -1,0 +1,45 @@
+"""Finds the effects that act on traffic and ground: those that a scenario names, and those that switch themselves on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from pipeline.effects import registry
+from pipeline.effects.base import Traffic
+from pipeline.scenario.models import Scenario
+from pipeline.traffic import configuration
+
+SELF_ACTING: dict[str, Callable[[Scenario], bool]] = {"slope": configuration.may_have_heights}
+"""Effects that switch themselves on where leaving them out would be wrong; and a quick look whether they may, so that
+elsewhere none is imported."""
+
+
+def live(scenario: Scenario) -> tuple[tuple[Traffic[Any], ...], tuple[str, ...]]:
+    """The effects that act, in order; and notes on those that act by themselves or are skipped."""
+    acting, notes = [], []
+    for effect in _asked(scenario):
+        (on, reason), named = effect.acts(scenario), effect.NAME in scenario.effects.named
+        if on:
+            acting.append(effect)
+        if on and effect.SELF_ACTING:
+            notes.append(f"{effect.NAME}: on, {reason}")
+        elif not on:
+            skipped = f"named, but {reason}: skipped, the result is the same"
+            notes.append(f"{effect.NAME}: {skipped if named else f'off, {reason}'}")
+    return tuple(acting), tuple(notes)
+
+
+def ground(scenario: Scenario) -> Traffic[Any] | None:
+    """The effect that lays the ground; None where it is flat."""
+    return next((effect for effect in _asked(scenario) if effect.LAYS_GROUND and effect.acts(scenario)[0]), None)
+
+
+def _asked(scenario: Scenario) -> Iterator[Traffic[Any]]:
+    """The effects on the traffic that are named, or may act by themselves; in the order in which they are composed."""
+    named = scenario.effects.named
+    by_themselves = [name for name, may_act in SELF_ACTING.items() if name not in named and may_act(scenario)]
+    for name in (name for name in registry.names() if name in named or name in by_themselves):
+        effect_class = registry.effect_class(name)
+        if issubclass(effect_class, Traffic):
+            yield effect_class(named[name] if name in named else effect_class.Model())

@@ -1,0 +1,378 @@
+"""Lays out the folder that SUMO runs in.
+
+Steps: find the files that a scenario, or the SUMO configuration that it names, takes its traffic from; check its times;
+copy the files, draw trips where none are given, add the route files of extensions, and write ``run.sumocfg``. The
+folder opens in sumo-gui.
+
+World frame and units as in SUMO; times are whole milliseconds, SUMO's own unit, so that step, period and warm-up are
+compared exactly.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from pipeline.core import files
+from pipeline.core.errors import InputError
+from pipeline.formats import safe_xml
+from pipeline.scenario.models import Scenario
+from pipeline.scenario.traffic import TrafficModel
+from pipeline.traffic import demand, network, sumo
+from pipeline.traffic.extensions import TrafficExtension
+from pipeline.traffic.frames import Window
+
+CONFIG, NETWORK, TRIPS, VTYPES = "run.sumocfg", "network.net.xml", "trips.rou.xml", "vtypes.add.xml"
+FCD, COLLISIONS, STOPS, LOG = "fcd.csv", "collisions.xml", "stops.xml", "sumo.log"
+OTHERS, PERSONS = "others.rou.xml", "persons.csv"
+"""Route file of an extension (those of further ones count up), and what SUMO records of persons."""
+
+_SYNONYMS = {
+    "n": "net-file",
+    "net": "net-file",
+    "r": "route-files",
+    "routes": "route-files",
+    "route": "route-files",
+    "a": "additional-files",
+    "additional": "additional-files",
+    "b": "begin",
+    "e": "end",
+    "F": "weight-files",
+}
+_LEFT_OUT = {
+    "end",
+    "random",
+    "start",
+    "quit-on-end",
+    "human-readable-time",
+    "verbose",
+    "remote-port",
+    "num-clients",
+    "log",
+    "message-log",
+    "error-log",
+    "device.rerouting.threads",
+    "precision",
+    "configuration-file",
+    "game",
+    "demo",
+}
+_LEFT_OUT_STARTS = ("save-", "gui-", "osg-", "device.fcd.", "summary", "game.")
+_TRUE = {"true", "1", "yes", "on", "t", "x"}
+_OSM_FLAGS = (
+    "--geometry.remove",
+    "--junctions.join",
+    "--tls.guess-signals",
+    "--tls.join",
+    "--sidewalks.guess",
+    "--crossings.guess",
+)
+FCD_DIGITS = 8
+"""Decimals that SUMO writes."""
+
+_ATTRIBUTES = "id,x,y,angle,type,speed"
+
+
+@dataclass(frozen=True)
+class Timing:
+    """When frames are recorded, in whole milliseconds from the simulation's zero."""
+
+    begin_ms: int
+    first_ms: int
+    period_ms: int
+    step_ms: int
+    frames: int
+
+    @property
+    def end_ms(self) -> int:
+        """The simulation ends when the last frame is recorded."""
+        return self.first_ms + (self.frames - 1) * self.period_ms + self.step_ms
+
+    def window(self) -> Window:
+        """Every step of this time is recorded."""
+        return Window(self.frames, self.period_ms, self.first_ms, complete=True)
+
+
+@dataclass(frozen=True)
+class Sources:
+    """The files that the traffic comes from: SUMO option -> files, and the other options of a user's configuration."""
+
+    files: dict[str, tuple[Path, ...]]
+    options: dict[str, str] = field(default_factory=dict)
+    begin_s: float = 0.0
+
+    def all(self) -> list[Path]:
+        """Every file, once."""
+        return list(dict.fromkeys(path for paths in self.files.values() for path in paths))
+
+
+def place(scenario: Scenario) -> str:
+    """Where messages about the traffic point to."""
+    return f"{scenario.file}: traffic"
+
+
+def milliseconds(value_s: float, where: str) -> int:
+    """Seconds as whole milliseconds."""
+    exact = value_s * 1000.0
+    if abs(exact - round(exact)) > 1e-6 * max(1.0, exact):
+        raise InputError(f"{where} = {value_s:g}", "is no whole number of milliseconds", "SUMO counts in milliseconds")
+    return round(exact)
+
+
+def timing(traffic: TrafficModel, begin_s: float, where: str) -> Timing:
+    """Check that period and warm-up are whole numbers of steps (SUMO itself only warns, and records the wrong
+    times)."""
+    step = milliseconds(traffic.step_s, f"{where}.step_s")
+    if step < 1:
+        raise InputError(f"{where}.step_s = {traffic.step_s:g}", "is below a millisecond", "at least 0.001")
+    values = []
+    for key in ("frame_period_s", "warmup_s"):
+        value = milliseconds(getattr(traffic, key), f"{where}.{key}")
+        if value % step:
+            near = " or ".join(f"{n * step / 1000:g}" for n in (value // step, value // step + 1) if n)
+            raise InputError(
+                f"{where}.{key} = {value / 1000:g}",
+                f"is no whole number of steps of {step / 1000:g} s",
+                f"for example {near}, or another step_s",
+            )
+        values.append(value)
+    begin = milliseconds(begin_s, f"{where}: begin")
+    return Timing(begin, begin + values[1], values[0], step, traffic.frames)
+
+
+def sources(scenario: Scenario) -> Sources:
+    """The files that a simulation reads.
+
+    Raises
+    ------
+    InputError
+        When the scenario, or a configuration that it names, names a file that is not there.
+    """
+    traffic = scenario.traffic
+    if traffic.sumocfg is not None:
+        return _configured(scenario.find(traffic.sumocfg, "traffic.sumocfg"))
+    assert traffic.network is not None
+    files: dict[str, tuple[Path, ...]] = {"net-file": (scenario.find(traffic.network, "traffic.network"),)}
+    if traffic.routes:
+        files["route-files"] = tuple(scenario.find(name, "traffic.routes") for name in traffic.routes)
+    return Sources(files)
+
+
+def network_path(scenario: Scenario) -> Path | None:
+    """The network that a scenario, or the configuration that it names, simulates; None where it names a finished
+    file."""
+    traffic = scenario.traffic
+    if traffic.network is not None:
+        return scenario.find(traffic.network, "traffic.network")
+    if traffic.sumocfg is None:
+        return None
+    config = scenario.find(traffic.sumocfg, "traffic.sumocfg")
+    return next((config.parent / value for key, value in _options(config) if key == "net-file" and value), None)
+
+
+def may_have_heights(scenario: Scenario) -> bool:
+    """Whether the network may go up and down: a quick look, so that for a flat one nothing more is read or imported."""
+    path = network_path(scenario)
+    return path is not None and network.may_have_heights(path)
+
+
+def _configured(path: Path) -> Sources:
+    """What a user's configuration names. Outputs and what the scenario decides itself are not taken over."""
+    files: dict[str, tuple[Path, ...]] = {}
+    options, begin_s = {}, 0.0
+    for key, value in _options(path):
+        pieces = tuple(path.parent / piece.strip() for piece in value.split(",") if piece.strip())
+        if key == "begin":
+            begin_s = _seconds(value, path)
+        elif key == "no-internal-links" and value.lower() in _TRUE:
+            raise InputError(
+                f"{path}: {key} = {value!r}", "lets vehicles jump over junctions (up to 42 m)", "remove it"
+            )
+        elif key in _LEFT_OUT or key.startswith(_LEFT_OUT_STARTS) or "output" in key:
+            continue
+        elif key.endswith(("-file", "-files")):
+            for piece in pieces:
+                if not piece.is_file():
+                    raise InputError(
+                        f"{path}: {key} = {value!r}", f"no such file ({piece})", "a path relative to the configuration"
+                    )
+            files[key] = pieces
+        else:
+            options[key] = value
+    if "net-file" not in files:
+        raise InputError(path, "names no net-file", "<net-file value=.../> in its <input>")
+    return Sources(files, options, begin_s)
+
+
+def _options(path: Path) -> Iterator[tuple[str, str]]:
+    """Every option with its value; sections are only for readers."""
+    for child in safe_xml.children(path, ""):
+        for element in child.iter():
+            value = element.get("value", element.get("v"))
+            if value is not None:
+                yield _SYNONYMS.get(element.tag, element.tag), os.path.expandvars(value)
+
+
+def _seconds(value: str, path: Path) -> float:
+    try:
+        return float(value)
+    except ValueError:
+        raise InputError(
+            f"{path}: begin = {value!r}", "is no number of seconds", "for example 25200 for seven o'clock"
+        ) from None
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A folder that SUMO can run in."""
+
+    folder: Path
+    options: dict[str, str]
+    timing: Timing
+    roads: network.Network
+    drawn: bool
+    """Whether the trips are drawn here, not a user's."""
+    adds_traffic: bool
+    """Whether extensions added traffic to it."""
+    notes: tuple[str, ...]
+
+    @property
+    def config(self) -> list[str]:
+        """The flags that start this run, without outputs."""
+        return ["-c", CONFIG]
+
+    @property
+    def flags(self) -> list[str]:
+        """Every flag of the run, as one would type it in its folder."""
+        return [word for key, value in (self.options | self.outputs).items() for word in (f"--{key}", value)]
+
+    @property
+    def outputs(self) -> dict[str, str]:
+        """What this program has SUMO write."""
+        attributes = _ATTRIBUTES + (",z,slope" if self.roads.has_heights else "")
+        wanted = {
+            "fcd-output": FCD,
+            "fcd-output.attributes": attributes,
+            "fcd-output.skip-empty": "true",
+            "device.fcd.begin": _text(self.timing.first_ms),
+            "device.fcd.period": _text(self.timing.period_ms),
+            "precision": str(FCD_DIGITS),
+            "collision-output": COLLISIONS,
+        }
+        if self.adds_traffic or not self.drawn:  # else SUMO writes a user's persons among the vehicles
+            wanted |= {"person-fcd-output": PERSONS}
+        return wanted if self.drawn else wanted | {"stop-output": STOPS, "stop-output.write-unfinished": "true"}
+
+
+def prepare(scenario: Scenario, folder: Path, extensions: Iterable[TrafficExtension] = ()) -> Prepared:
+    """Lay out the folder, with the traffic that ``extensions`` add."""
+    traffic, where = scenario.traffic, place(scenario)
+    given = sources(scenario)
+    when = timing(traffic, given.begin_s, where)
+    adding = [extension for extension in extensions if extension.adds_traffic]
+    others = [OTHERS.replace("others", f"others{number or ''}") for number in range(len(adding))]
+    folder.mkdir(parents=True, exist_ok=True)
+    named = _copies(given, folder, others)
+    roads = network.read(folder / named["net-file"], given.files["net-file"][0])
+    demand_seed, sumo_seed, *other_seeds = np.random.SeedSequence(scenario.seed).spawn(2 + len(adding))
+    drawn, notes = traffic.sumocfg is None and not traffic.routes, []
+    if drawn:
+        notes = _draw(scenario, roads, when, np.random.default_rng(demand_seed), folder)
+        named |= {"additional-files": VTYPES, "route-files": TRIPS}
+    vehicles, times = traffic.vehicles, (when.begin_ms / 1000.0, when.end_ms / 1000.0)
+    for extension, name, seed in zip(adding, others, other_seeds, strict=True):
+        plan = extension.plan(scenario, roads, *times, np.random.default_rng(seed))
+        files.write_text(folder / name, plan.xml)
+        named["route-files"] = ",".join(filter(None, (named.get("route-files"), name)))
+        vehicles, notes = vehicles + plan.vehicles, [*notes, *plan.notes]
+    number = int(sumo_seed.generate_state(1)[0]) & 0x7FFFFFFF
+    options = given.options | named | _settings(traffic, when, number, vehicles)
+    files.write_text(folder / CONFIG, _config_xml(options))
+    return Prepared(folder, options, when, roads, drawn, bool(adding), tuple(notes))
+
+
+def _settings(traffic: TrafficModel, when: Timing, seed: int, vehicles: int) -> dict[str, str]:
+    """What the scenario decides, whatever a user's configuration says; see the traps of SUMO behind each."""
+    return {
+        "seed": str(seed),
+        "begin": _text(when.begin_ms),
+        "end": _text(when.end_ms),
+        "step-length": _text(when.step_ms),
+        "threads": "1",
+        "lateral-resolution": f"{traffic.lateral_resolution_m:g}",
+        "max-num-vehicles": str(vehicles),
+        "max-depart-delay": f"{traffic.max_depart_delay_s:g}",
+        "time-to-teleport": "-1",
+        "collision.action": "warn",
+        "collision.check-junctions": "true",
+        "no-step-log": "true",
+        "duration-log.disable": "true",
+    }
+
+
+def _text(time_ms: int) -> str:
+    return f"{time_ms // 1000}.{time_ms % 1000:03d}"
+
+
+def _draw(
+    scenario: Scenario, roads: network.Network, when: Timing, rng: np.random.Generator, folder: Path
+) -> list[str]:
+    traffic, where = scenario.traffic, place(scenario)
+    demand.check_kinds(traffic.kinds, sumo.vehicle_classes(), where)
+    pairs = [demand.pairs(roads, kind, traffic, rng, where) for kind in traffic.kinds]
+    departs_s = (
+        np.arange(int(np.ceil((when.end_ms - when.begin_ms) / 1000.0 * traffic.trips_per_s))) / traffic.trips_per_s
+    )
+    trips = demand.draw(roads, traffic.kinds, pairs, departs_s, rng)
+    files.write_text(folder / TRIPS, demand.trips_xml(trips, departs_s))
+    files.write_text(folder / VTYPES, demand.vtypes_xml(traffic.kinds))
+    return [
+        f"{kind.name}: no trip between fringe edges; trips join any two edges that are far apart"
+        for kind, kind_pairs in zip(traffic.kinds, pairs, strict=True)
+        if not kind_pairs.fringe
+    ]
+
+
+def _copies(given: Sources, folder: Path, others: Iterable[str]) -> dict[str, str]:
+    """Copy every file into the folder, so that it can be moved and opened elsewhere; ``others`` are taken names."""
+    taken, values = {CONFIG, TRIPS, VTYPES, FCD, COLLISIONS, STOPS, LOG, OTHERS, PERSONS, *others}, {}
+    for option, paths in given.files.items():
+        names = []
+        for path in paths:
+            name = path.name.replace(",", "_")
+            if option == "net-file":
+                name = NETWORK + (".gz" if safe_xml.is_gzip(path) and not network.is_osm(path) else "")
+            while name in taken:
+                name = f"_{name}"
+            taken.add(name)
+            if option == "net-file" and network.is_osm(path):
+                convert_osm(path, folder / name)
+            else:
+                shutil.copyfile(path, folder / name)
+            names.append(name)
+        values[option] = ",".join(names)
+    return values
+
+
+def convert_osm(path: Path, network_path: Path) -> None:
+    """Turn a map of OpenStreetMap into a network; its world frame starts at the network's south-west corner."""
+    source = os.path.relpath(_osm_xml(path), network_path.parent)
+    sumo.run("netconvert", ["--osm-files", source, *_OSM_FLAGS, "-o", network_path.name], network_path.parent)
+
+
+def _osm_xml(path: Path) -> Path:
+    """The map as XML, which is all that netconvert reads."""
+    if path.name.endswith(".osm.pbf"):
+        raise InputError(path, "is in the PBF format", "XML; convert it: osmium cat in.osm.pbf -o out.osm")
+    return path
+
+
+def _config_xml(options: Mapping[str, str]) -> str:
+    lines = [f"    <{key} value={quoteattr(value)}/>" for key, value in options.items()]
+    return "\n".join(["<configuration>", *lines, "</configuration>", ""])

@@ -1,0 +1,237 @@
+"""Gets the rows of floating car data of a scenario's traffic, from whichever source it names.
+
+The three sources: SUMO as a subprocess, which writes its FCD file into the run's folder; a SUMO that is already
+running; a finished file, of which nothing is promised.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import pyarrow as pa
+
+from pipeline.core.errors import InputError
+from pipeline.core.progress import Progress
+from pipeline.formats import safe_xml
+from pipeline.scenario.models import Scenario
+from pipeline.traffic import configuration, extensions, fcd, live, network, sumo
+from pipeline.traffic.boxes import Size
+from pipeline.traffic.configuration import COLLISIONS, FCD, LOG, PERSONS, STOPS, Prepared
+from pipeline.traffic.extensions import TrafficExtension
+from pipeline.traffic.frames import Window
+
+_LEAST_PATIENCE_S = 180.0
+
+
+@dataclass(frozen=True)
+class RecordingSummary:
+    """What SUMO did, as far as it is known: version, seconds, flags, collisions.
+
+    ``flags`` and ``seconds`` are None of a SUMO that somebody else started.
+    """
+
+    sumo: str
+    seconds: float | None
+    flags: list[str] | None
+    collisions: int
+    notes: tuple[str, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """As the stage reports it."""
+        return {
+            "sumo": self.sumo,
+            "sumo_seconds": self.seconds,
+            "flags": self.flags,
+            "collisions": self.collisions,
+            "notes": list(self.notes),
+        }
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Rows of FCD as they arrive, and what is known about them.
+
+    Attributes
+    ----------
+    rows, persons
+        Vehicles, and the persons that are recorded beside them; None where they are among the vehicles, or not wanted.
+    sizes
+        Of each type; of a running SUMO filled as rows come.
+    patience_s
+        How long a vehicle may stand through to the last frame; None where nothing is promised.
+    stopped_on_purpose
+        Vehicles that may stand longer; of a running SUMO filled as rows come.
+    summary
+        To be asked for when the rows are through; None of a finished file.
+    """
+
+    rows: Iterable[pa.Table]
+    window: Window
+    sizes: Mapping[str, Size]
+    place: str
+    patience_s: float | None = None
+    stopped_on_purpose: Set[str] = frozenset()
+    persons: Iterable[pa.Table] | None = None
+    summary: Callable[[], RecordingSummary | None] = lambda: None
+
+
+def record(
+    scenario: Scenario,
+    folder: Path,
+    acting: Sequence[TrafficExtension],
+    progress: Progress,
+    traci: tuple[str, int] | None,
+) -> AbstractContextManager[Recording]:
+    """The recording of a scenario's traffic; SUMO runs in ``folder``, or listens at ``traci`` already.
+
+    Raises
+    ------
+    InputError
+        When the scenario has a finished file that was to be recorded live, or an extension refuses it.
+    """
+    if scenario.traffic.fcd is not None and traci is not None:
+        raise InputError("--traci", "the scenario names a finished FCD file", "network or sumocfg in [traffic]")
+    extensions.refuse(acting, scenario)
+    if scenario.traffic.fcd is not None:
+        return _finished(scenario)
+    if traci is not None:
+        return _running(scenario, *traci, acting)
+    return _simulated(scenario, folder, progress, acting)
+
+
+@contextmanager
+def _finished(scenario: Scenario) -> Iterator[Recording]:
+    """From a file; nothing is simulated, so nothing is promised about it."""
+    traffic, place = scenario.traffic, configuration.place(scenario)
+    assert traffic.fcd is not None
+    path = scenario.find(traffic.fcd, "traffic.fcd")
+    window = Window(
+        traffic.frames,
+        max(1, configuration.milliseconds(traffic.frame_period_s, f"{place}.frame_period_s")),
+        skip_ms=configuration.milliseconds(traffic.warmup_s, f"{place}.warmup_s"),
+    )
+    yield Recording(fcd.read(path), window, kind_sizes(scenario), place)
+
+
+@contextmanager
+def _simulated(
+    scenario: Scenario, folder: Path, progress: Progress, acting: Sequence[TrafficExtension]
+) -> Iterator[Recording]:
+    """From SUMO as a subprocess; its FCD file is removed once it is read."""
+    prepared = configuration.prepare(scenario, folder, acting)
+    sizes = kind_sizes(scenario) if prepared.drawn else type_sizes(prepared)
+    for extension in acting:
+        sizes |= extension.sizes()
+    path, persons = folder / FCD, folder / PERSONS
+    try:
+        seconds = simulate(prepared, progress)
+        summary = RecordingSummary(
+            sumo.version(), round(seconds, 3), prepared.flags, _collisions(prepared), prepared.notes
+        )
+        yield Recording(
+            fcd.read(path) if _has_rows(path) else (),
+            prepared.timing.window(),
+            sizes,
+            configuration.place(scenario),
+            patience_s(prepared.roads.cycle_s),
+            _stopped_on_purpose(prepared),
+            None if not prepared.adds_traffic else (fcd.read(persons, "person") if _has_rows(persons) else ()),
+            lambda: summary,
+        )
+    finally:
+        path.unlink(missing_ok=True)
+        persons.unlink(missing_ok=True)
+
+
+@contextmanager
+def _running(scenario: Scenario, host: str, port: int, acting: Sequence[TrafficExtension]) -> Iterator[Recording]:
+    """From a SUMO that somebody else started."""
+    given = configuration.sources(scenario)
+    when = configuration.timing(scenario.traffic, given.begin_s, configuration.place(scenario))
+    net_file = given.files["net-file"][0]
+    cycle_s = 0.0 if network.is_osm(net_file) else network.read(net_file).cycle_s
+    observations = live.LiveObservations()
+    persons = any(extension.adds_traffic for extension in acting)
+    with sumo.connected(host, port) as connection:
+        version = sumo.version_in(connection.getVersion()[1])
+        yield Recording(
+            live.poll(connection, when, observations, f"{host}:{port}", persons=persons),
+            when.window(),
+            observations.sizes,
+            configuration.place(scenario),
+            patience_s(cycle_s),
+            observations.stopped_on_purpose,
+            summary=lambda: RecordingSummary(version, None, None, len(observations.collided)),
+        )
+
+
+def kind_sizes(scenario: Scenario) -> dict[str, Size]:
+    """Sizes of the fleet's kinds."""
+    return {k.name: Size(k.length_m, k.width_m, k.height_m, k.vclass) for k in scenario.traffic.kinds}
+
+
+def patience_s(cycle_s: float) -> float:
+    """How long a vehicle may stand through to the last frame: two signal cycles, and not less than three minutes."""
+    return max(_LEAST_PATIENCE_S, 2.0 * cycle_s)
+
+
+def simulate(prepared: Prepared, progress: Progress) -> float:
+    """Run SUMO in the folder; return the seconds that it took."""
+    when, path = prepared.timing, prepared.folder / FCD
+
+    def watch() -> None:
+        if (now_ms := _last_time_ms(path)) is not None:
+            progress(
+                "frames simulated", min(when.frames, max(0, (now_ms - when.first_ms) // when.period_ms)), when.frames
+            )
+
+    start = perf_counter()
+    flags = [word for key, value in prepared.outputs.items() for word in (f"--{key}", value)]
+    sumo.run("sumo", [*prepared.config, *flags], prepared.folder, prepared.folder / LOG, watch)
+    return perf_counter() - start
+
+
+def _last_time_ms(path: Path) -> int | None:
+    """The time of the last whole row of a CSV that is being written."""
+    if not path.is_file():
+        return None
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - 512))
+        lines = file.read().split(b"\n")
+    try:
+        return round(float(lines[-2].split(b";")[0]) * 1000) if len(lines) > 2 else None
+    except ValueError:
+        return None
+
+
+def type_sizes(prepared: Prepared) -> dict[str, Size]:
+    """Ask SUMO for the sizes of all vehicle types of a user's demand, since its defaults depend on the vClass."""
+    with sumo.served([*prepared.config, "--route-steps", "0"], prepared.folder) as connection:
+        return {name: live.ask_size(connection, name) for name in connection.vehicletype.getIDList()}
+
+
+def _collisions(prepared: Prepared) -> int:
+    """Different pairs of vehicles that SUMO saw collide while frames were recorded."""
+    pairs = {
+        (c.get("collider"), c.get("victim"))
+        for c in safe_xml.children(prepared.folder / COLLISIONS, "collisions")
+        if float(c.get("time", "0")) * 1000.0 >= prepared.timing.first_ms
+    }
+    return len(pairs)
+
+
+def _stopped_on_purpose(prepared: Prepared) -> set[str]:
+    """Vehicles of a user's demand that stop where a ``<stop>`` tells them to."""
+    if prepared.drawn:
+        return set()
+    return {s.get("id", "") for s in safe_xml.children(prepared.folder / STOPS, "stops")}
+
+
+def _has_rows(path: Path) -> bool:
+    """Where nobody moved, SUMO writes no header, only a line's end."""
+    return path.stat().st_size > 1

@@ -1,0 +1,251 @@
+"""Adds up how the boxes of a recording behave: how many there are, how fast, who stands, who overlaps.
+
+World frame, metres, metres per second. Vehicles that stand are followed from group to group.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.traffic.boxes import Ints, VehicleBoxes
+
+STANDING_M_S = 0.1
+"""A vehicle slower than this stands."""
+
+_SHRINK_M = 1e-3
+_MOST_CELLS = 2**20
+"""Along x and along y, so that the number of a cell in a frame of a group fits 64 bits."""
+
+
+def overlapping(boxes: VehicleBoxes) -> NDArray[np.int64]:
+    """Pairs of rows (n, 2) in the same frame whose boxes, made 1 mm smaller on each side, share area and height.
+
+    Exact for rectangles (separating axes). Candidates come from square cells, at least as wide as the longest diagonal:
+    a pair that overlaps lies in one cell or in two that touch. Cells are numbered along y, then x, then by frame, with
+    an empty row and column between, so that a box's later neighbours are two runs: its own cell and the next, and three
+    cells of the next column."""
+    if not boxes.frame.size:
+        return np.empty((0, 2), dtype=np.int64)
+    half = np.hypot(boxes.length_m, boxes.width_m) / 2
+    side = max(2 * half.max(), max(np.ptp(boxes.x_m), np.ptp(boxes.y_m)) / _MOST_CELLS)
+    column, row = (np.floor((m - m.min()) / side).astype(np.int64) for m in (boxes.x_m, boxes.y_m))
+    high, wide = int(row.max()) + 3, int(column.max()) + 2
+    cell = ((boxes.frame - boxes.first_frame) * wide + column) * high + row + 1
+    order = np.argsort(cell, kind="stable")
+    cell, x, y, half = cell[order], boxes.x_m[order], boxes.y_m[order], half[order]
+    everyone = np.arange(order.size)
+    runs = (
+        (everyone + 1, np.searchsorted(cell, cell + 1, side="right")),
+        (np.searchsorted(cell, cell + high - 1), np.searchsorted(cell, cell + high + 1, side="right")),
+    )
+    overlaps = [np.empty((0, 2), dtype=np.int64)]
+    for second, end in runs:
+        first = everyone
+        while (left := second < end).any():
+            first, second, end = first[left], second[left], end[left]
+            near = (x[second] - x[first]) ** 2 + (y[second] - y[first]) ** 2 < (half[first] + half[second]) ** 2
+            a, b = order[first[near]], order[second[near]]
+            hit = _share_space(boxes, a, b)
+            overlaps.append(np.column_stack([np.minimum(a, b)[hit], np.maximum(a, b)[hit]]))
+            second = second + 1
+    return np.concatenate(overlaps)
+
+
+def _share_space(boxes: VehicleBoxes, a: Ints, b: Ints) -> NDArray[np.bool_]:
+    dx, dy = boxes.x_m[b] - boxes.x_m[a], boxes.y_m[b] - boxes.y_m[a]
+    cos_a, sin_a = np.cos(boxes.yaw_rad[a]), np.sin(boxes.yaw_rad[a])
+    cos_b, sin_b = np.cos(boxes.yaw_rad[b]), np.sin(boxes.yaw_rad[b])
+    # of the angle between both headings: how much of the one's length and width points along the other's
+    along, across = np.abs(cos_a * cos_b + sin_a * sin_b), np.abs(cos_a * sin_b - sin_a * cos_b)
+    (long_a, wide_a), (long_b, wide_b) = (
+        (boxes.length_m[i] / 2 - _SHRINK_M, boxes.width_m[i] / 2 - _SHRINK_M) for i in (a, b)
+    )
+    separate = np.abs(dx * cos_a + dy * sin_a) >= long_a + long_b * along + wide_b * across
+    separate |= np.abs(dy * cos_a - dx * sin_a) >= wide_a + long_b * across + wide_b * along
+    separate |= np.abs(dx * cos_b + dy * sin_b) >= long_b + long_a * along + wide_a * across
+    separate |= np.abs(dy * cos_b - dx * sin_b) >= wide_b + long_a * across + wide_a * along
+    separate |= np.abs(boxes.z_m[a] - boxes.z_m[b]) >= (boxes.height_m[a] + boxes.height_m[b]) / 2 - 2 * _SHRINK_M
+    together: NDArray[np.bool_] = np.logical_not(separate)
+    return together
+
+
+def _whole_pairs(boxes: VehicleBoxes, pairs: Ints) -> Ints:
+    """Pairs of parts -> pairs of vehicles, each once, as rows of the boxes that are left when only first parts are
+    kept."""
+    assert boxes.part is not None
+    vehicle = np.cumsum(boxes.part == 0) - 1
+    return np.unique(vehicle[pairs], axis=0).reshape(-1, 2)
+
+
+@dataclass(frozen=True)
+class UncountedKind:
+    """How many of a kind that does not count as a vehicle are in a frame, and how many different ones there are."""
+
+    fewest: int
+    most: int
+    mean: float
+    different: int
+
+
+@dataclass(frozen=True)
+class TrafficCounts:
+    """What a recording amounts to.
+
+    Attributes
+    ----------
+    fewest, most
+        Vehicles in a frame.
+    different
+        Vehicles that are in any frame.
+    rows
+        Vehicles, added up over the frames.
+    share_standing
+        Of ``rows``, slower than ``STANDING_M_S``.
+    uncounted
+        Of each kind that does not count as a vehicle; empty where all count.
+    mixed_overlaps
+        Overlapping pairs in which one at least does not count as a vehicle, by their kinds.
+    """
+
+    frames: int
+    fewest: int
+    most: int
+    different: int
+    rows: int
+    mean_speed_m_s: float
+    share_standing: float
+    longest_standing_s: float
+    overlapping_pairs: int
+    frames_with_overlap: int
+    uncounted: dict[str, UncountedKind]
+    mixed_overlaps: dict[str, int]
+
+    def to_json(self) -> dict[str, Any]:
+        """As the stage reports it; nothing about uncounted kinds where all count."""
+        values: dict[str, Any] = {
+            "frames": self.frames,
+            "vehicles": {"fewest": self.fewest, "most": self.most, "different": self.different},
+            "rows": self.rows,
+            "mean_speed_m_s": self.mean_speed_m_s,
+            "share_standing": self.share_standing,
+            "longest_standing_s": self.longest_standing_s,
+            "overlapping_pairs": self.overlapping_pairs,
+            "frames_with_overlap": self.frames_with_overlap,
+        }
+        if self.uncounted:
+            kinds = {kind: asdict(counts) for kind, counts in sorted(self.uncounted.items())}
+            values["beside_vehicles"] = kinds | {"overlapping_pairs": dict(sorted(self.mixed_overlaps.items()))}
+        return values
+
+
+@dataclass
+class _Presence:
+    """Of a kind that does not count as a vehicle: how many in each frame, and which different ones."""
+
+    in_frame: Ints
+    different: set[str] = field(default_factory=set)
+
+    def counts(self) -> UncountedKind:
+        n = self.in_frame
+        return UncountedKind(int(n.min()), int(n.max()), round(float(n.mean()), 3), len(self.different))
+
+
+@dataclass
+class TrafficTally:
+    """Adds up a recording group by group."""
+
+    frames: int
+    vehicles: Ints = field(init=False)
+    """Vehicles in each frame."""
+    different: set[str] = field(default_factory=set)
+    rows: int = 0
+    speed_sum: float = 0.0
+    standing: int = 0
+    overlapping_pairs: int = 0
+    frames_with_overlap: int = 0
+    longest_standing_frames: int = 0
+    stands_since: dict[str, int] = field(default_factory=dict)
+    """Vehicles that stand in the last frame added, and the frame since when."""
+    uncounted: dict[str, _Presence] = field(default_factory=dict)
+    mixed_overlaps: Counter[str] = field(default_factory=Counter)
+
+    def __post_init__(self) -> None:
+        self.vehicles = np.zeros(self.frames, dtype=np.int64)
+
+    def add(self, boxes: VehicleBoxes) -> None:
+        """Count the next group."""
+        end, pairs = boxes.first_frame + boxes.frames, overlapping(boxes)
+        if boxes.part is not None:  # the parts of one vehicle touch at their joint
+            pairs = pairs[boxes.code[pairs[:, 0]] != boxes.code[pairs[:, 1]]]
+            pairs, boxes = _whole_pairs(boxes, pairs), boxes.only(boxes.part == 0)
+        self._add_standing(boxes, end)
+        if boxes.uncounted is not None:
+            pairs, boxes = self._add_uncounted(boxes, boxes.uncounted, pairs)
+        self.vehicles[boxes.first_frame : end] = _in_each_frame(boxes, boxes.frame)
+        named = boxes.names if boxes.uncounted is None else (boxes.names[i] for i in np.unique(boxes.code))
+        self.different.update(named)
+        self.rows += boxes.frame.size
+        self.speed_sum += float(np.nansum(boxes.speed_m_s))
+        self.standing += int(np.count_nonzero(boxes.speed_m_s < STANDING_M_S))
+        self.overlapping_pairs += len(pairs)
+        self.frames_with_overlap += np.unique(boxes.frame[pairs[:, 0]]).size
+
+    def _add_uncounted(
+        self, boxes: VehicleBoxes, uncounted: NDArray[np.bool_], pairs: Ints
+    ) -> tuple[Ints, VehicleBoxes]:
+        """Count who does not count as a vehicle; what is left: vehicles, and the pairs of them that overlap."""
+        end = boxes.first_frame + boxes.frames
+        for kind in np.unique(boxes.kind[uncounted]):
+            of_kind = uncounted & (boxes.kind == kind)
+            presence = self.uncounted.setdefault(boxes.kinds[kind], _Presence(np.zeros(self.frames, np.int64)))
+            presence.in_frame[boxes.first_frame : end] = _in_each_frame(boxes, boxes.frame[of_kind])
+            presence.different.update(boxes.names[i] for i in np.unique(boxes.code[of_kind]))
+        mixed = uncounted[pairs].any(axis=1)
+        self.mixed_overlaps.update(
+            " and ".join(sorted(boxes.kinds[boxes.kind[i]] for i in pair)) for pair in pairs[mixed]
+        )
+        return (np.cumsum(~uncounted) - 1)[pairs[~mixed]], boxes.only(~uncounted)
+
+    def _add_standing(self, boxes: VehicleBoxes, end: int) -> None:
+        """Follow each vehicle's runs of standing frames, across groups."""
+        order = np.lexsort((boxes.frame, boxes.code))
+        stands = order[boxes.speed_m_s[order] < STANDING_M_S]
+        frame, code = boxes.frame[stands], boxes.code[stands]
+        begins = np.flatnonzero((np.diff(code, prepend=-1) != 0) | (np.diff(frame, prepend=-2) != 1))
+        ends = np.append(begins[1:], stands.size) - 1
+        still: dict[str, int] = {}
+        for first, last in zip(begins.tolist(), ends.tolist(), strict=True) if stands.size else ():
+            name, since = boxes.names[code[first]], int(frame[first])
+            if since == boxes.first_frame:
+                since = self.stands_since.get(name, since)
+            self.longest_standing_frames = max(self.longest_standing_frames, int(frame[last]) - since)
+            if frame[last] == end - 1:
+                still[name] = since
+        self.stands_since = still
+
+    def counts(self, period_s: float) -> TrafficCounts:
+        """What was added up, with frames ``period_s`` apart."""
+        return TrafficCounts(
+            frames=self.frames,
+            fewest=int(self.vehicles.min()),
+            most=int(self.vehicles.max()),
+            different=len(self.different),
+            rows=self.rows,
+            mean_speed_m_s=round(self.speed_sum / self.rows, 4) if self.rows else 0.0,
+            share_standing=round(self.standing / self.rows, 4) if self.rows else 0.0,
+            longest_standing_s=round(self.longest_standing_frames * period_s, 3),
+            overlapping_pairs=self.overlapping_pairs,
+            frames_with_overlap=self.frames_with_overlap,
+            uncounted={kind: presence.counts() for kind, presence in self.uncounted.items()},
+            mixed_overlaps=dict(self.mixed_overlaps),
+        )
+
+
+def _in_each_frame(boxes: VehicleBoxes, frame: Ints) -> Ints:
+    """How many rows of ``frame`` each frame of the group has."""
+    return np.bincount(frame - boxes.first_frame, minlength=boxes.frames)

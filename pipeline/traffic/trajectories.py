@@ -1,0 +1,116 @@
+"""Makes ``trajectories.parquet`` of recorded rows, and checks what the scenario promises of them.
+
+Steps, for each group of whole frames: rows become boxes; extensions change them; they are written as a row group, and
+counted. Then the promises: N vehicles in each frame, and nobody standing for good. World frame (x east, y north, z up),
+metres, radians.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pipeline.artefacts.tables import TableWriter
+from pipeline.core.errors import RunError
+from pipeline.core.progress import Progress
+from pipeline.scenario.models import Scenario
+from pipeline.scenario.traffic import TrafficModel
+from pipeline.traffic import boxes, extensions, frames
+from pipeline.traffic.extensions import BoxChange, TrafficExtension
+from pipeline.traffic.frames import FrameGroup
+from pipeline.traffic.recording import Recording
+from pipeline.traffic.tally import TrafficCounts, TrafficTally
+
+GROUP_FRAMES = 500
+"""Frames in a row group; fixed, so that the bytes do not depend on how the rows arrive."""
+
+
+@dataclass(frozen=True)
+class Trajectories:
+    """What was written."""
+
+    counts: TrafficCounts
+    of_extensions: dict[str, Any]
+    """What extensions report, as JSON."""
+
+
+def write(
+    scenario: Scenario, recording: Recording, acting: Sequence[TrafficExtension], file: TableWriter, progress: Progress
+) -> Trajectories:
+    """Write a recording's boxes, changed by the extensions that act.
+
+    Raises
+    ------
+    InputError
+        When a vehicle's size is unknown, or the file has too few frames.
+    RunError
+        When N vehicles are not held, or a vehicle stands without end.
+    """
+    tally, period_s = TrafficTally(scenario.traffic.frames), recording.window.period_ms / 1000.0
+    changes: list[BoxChange] | None = None
+    for group in _groups(recording):
+        uncounted = extensions.uncounted_types(acting, recording.sizes)
+        if changes is None:  # a running SUMO tells sizes with its first rows
+            own = {name: size for name, size in recording.sizes.items() if name not in uncounted}
+            changes = [c for extension in acting if (c := extension.box_change(scenario, own)) is not None]
+        made = boxes.from_bumpers(group, recording.sizes, period_s, recording.place, uncounted)
+        for change in changes:
+            made = change.change(made)
+        if made.frame.size:
+            file.write(made.columns())
+        tally.add(made)
+        progress("frames written", group.first_frame + group.frames, tally.frames)
+    _check(scenario.traffic, tally, recording)
+    reports = [change.summary() for change in changes or ()]
+    return Trajectories(tally.counts(period_s), {key: value for report in reports for key, value in report.items()})
+
+
+def _groups(recording: Recording) -> Iterator[FrameGroup]:
+    """Groups of whole frames, persons among the vehicles where they are recorded beside."""
+    groups = frames.groups(recording.rows, recording.window, GROUP_FRAMES, recording.place)
+    if recording.persons is None:
+        return groups
+    persons = frames.groups(recording.persons, recording.window, GROUP_FRAMES, recording.place)
+    return (frames.together(some, others) for some, others in zip(groups, persons, strict=True))
+
+
+def _check(traffic: TrafficModel, tally: TrafficTally, recording: Recording) -> None:
+    """Whether a simulated recording keeps the scenario's promises."""
+    if not tally.rows:
+        raise RunError(
+            f"{recording.place}: no vehicle is in any of {tally.frames} frames; check the demand and warmup_s"
+        )
+    if traffic.fcd is None and traffic.hold == "exactly":
+        _check_held(traffic, tally, recording.place)
+    if recording.patience_s is not None:
+        _check_moving(tally, recording, recording.patience_s)
+
+
+def _check_held(traffic: TrafficModel, tally: TrafficTally, place: str) -> None:
+    wrong = tally.vehicles != traffic.vehicles
+    if wrong.any():
+        first = int(wrong.argmax())
+        raise RunError(
+            f"{place}: {traffic.vehicles} vehicles are in {tally.frames - int(wrong.sum())} of {tally.frames} frames"
+            f" only; the fewest are {tally.vehicles.min()}, the most {tally.vehicles.max()}, frame {first} has"
+            f" {tally.vehicles[first]}. Lower traffic.vehicles, lengthen warmup_s, raise trips_per_s or the demand,"
+            ' or set hold = "at_most"'
+        )
+
+
+def _check_moving(tally: TrafficTally, recording: Recording, patience_s: float) -> None:
+    period_s = recording.window.period_ms / 1000.0
+    stands_s = {
+        name: (tally.frames - 1 - frame) * period_s
+        for name, frame in tally.stands_since.items()
+        if name not in recording.stopped_on_purpose
+    }
+    stuck = [name for name, seconds in stands_s.items() if seconds > patience_s]
+    if stuck:
+        longest = max(stuck, key=lambda name: stands_s[name])
+        raise RunError(
+            f"{recording.place}: {len(stuck)} vehicles stand for more than {patience_s:g} s and through to the last"
+            f" frame, {longest!r} for {stands_s[longest]:g} s: the traffic is jammed for good. Lower traffic.vehicles,"
+            " or mend the network's signals and connections"
+        )

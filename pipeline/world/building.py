@@ -1,0 +1,192 @@
+"""Builds the static world of a scenario as one triangle mesh.
+
+Steps: read footprints (:mod:`pipeline.world.footprints`) and extrude them between ``base_m`` and ``height_m``; take
+meshes apart into closed solids and open surfaces; lay a ground plane at z = 0. World frame, metres.
+
+Where a ground that goes up and down is given, it is laid instead, and both heights of a footprint count from the ground
+below its centre; what stands on the ground reaches down to the lowest of it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.core.errors import InputError
+from pipeline.core.progress import Progress, silent
+from pipeline.scenario.models import MeshModel, Scenario
+from pipeline.scenario.types import FARTHEST_M
+from pipeline.world.footprints import Footprint, read_geojson, read_poly_xml
+from pipeline.world.mesh import World
+from pipeline.world.terrain import Surface
+
+GROUND_MARGIN_M = 500.0
+"""How far the ground plane goes on beyond everything; more than any sensor in the catalogue reaches."""
+
+
+class GroundSource(Protocol):
+    """Something that lays a ground which goes up and down."""
+
+    NAME: ClassVar[str]
+
+    def ground(
+        self, scenario: Scenario, low_m: NDArray[np.float64] | None = None, high_m: NDArray[np.float64] | None = None
+    ) -> Surface:
+        """The ground over a rectangle."""
+        ...
+
+
+@dataclass(frozen=True)
+class BuildCounts:
+    """What was built (solids a kind), mended and left out; shown to the user and kept in ``run.json``."""
+
+    built: dict[str, int]
+    mended: dict[str, int]
+    left_out: dict[str, int]
+
+    def to_json(self) -> dict[str, Any]:
+        """As the stage reports it."""
+        return {key: dict(sorted(counts.items())) for key, counts in vars(self).items()}
+
+
+def build(
+    scenario: Scenario, ground: GroundSource | None = None, progress: Progress = silent
+) -> tuple[World, BuildCounts]:
+    """The static world of a scenario, on a flat ground where no other is given; and what went into it.
+
+    Raises
+    ------
+    InputError
+        When a file that the scenario names is not sound.
+    """
+    model, builder = scenario.statics, _Builder()
+    read = [read_geojson(scenario.find(name, "statics.footprints")) for name in model.footprints]
+    read += [read_poly_xml(scenario.find(name, "statics.polygons"), model.polygon_height_m) for name in model.polygons]
+    for file in read:
+        builder.mended.update(file.mended)
+        builder.left_out.update(file.left_out)
+    footprints = [footprint for file in read for footprint in file.footprints]
+    surface = None if ground is None else ground.ground(scenario, *_extent_m(scenario, footprints))
+    for done, footprint in enumerate(footprints):
+        standing = footprint if surface is None else _on(surface, footprint)
+        builder.add(*_extrude(standing), footprint.name, footprint.kind)
+        builder.built[footprint.kind] += 1
+        progress("footprints", done + 1, len(footprints))
+    for mesh in model.meshes:
+        _add_mesh(builder, scenario.find(mesh.file, "statics.meshes"), mesh)
+    if model.ground:
+        laid = _plane(builder, scenario) if surface is None else (surface.vertices_m, surface.faces)
+        builder.add(*laid, "ground", "ground")
+        builder.built["ground"] += 1
+    return builder.world(), BuildCounts(dict(builder.built), dict(builder.mended), dict(builder.left_out))
+
+
+@dataclass
+class _Builder:
+    """Collects solids into one mesh, and counts."""
+
+    vertices: list[NDArray[np.float64]] = field(default_factory=list)
+    faces: list[NDArray[np.int64]] = field(default_factory=list)
+    solids: list[tuple[str, str]] = field(default_factory=list)
+    built: Counter[str] = field(default_factory=Counter)
+    mended: Counter[str] = field(default_factory=Counter)
+    left_out: Counter[str] = field(default_factory=Counter)
+    _count: int = 0
+
+    def add(self, vertices_m: NDArray[np.float64], faces: NDArray[np.int64], name: str, kind: str) -> None:
+        self.vertices.append(np.asarray(vertices_m, dtype=np.float64))
+        self.faces.append(np.asarray(faces, dtype=np.int64) + self._count)
+        self.solids.append((name, kind))
+        self._count += len(vertices_m)
+
+    def world(self) -> World:
+        owner = [np.full(len(f), i, dtype=np.int32) for i, f in enumerate(self.faces)]
+        return World(
+            np.concatenate([np.empty((0, 3)), *self.vertices]),
+            np.concatenate([np.empty((0, 3), dtype=np.int64), *self.faces]).astype(np.int32),
+            np.concatenate([np.empty(0, dtype=np.int32), *owner]),
+            tuple(self.solids),
+        )
+
+
+def _extrude(footprint: Footprint) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Vertices and faces (outwards) of a closed prism over the footprint."""
+    import trimesh
+
+    mesh = trimesh.creation.extrude_polygon(footprint.polygon, footprint.height_m - footprint.base_m, engine="earcut")
+    return np.asarray(mesh.vertices) + np.array([0.0, 0.0, footprint.base_m]), np.asarray(mesh.faces)
+
+
+def _add_mesh(builder: _Builder, path: Path, model: MeshModel) -> None:
+    """A mesh file: each closed piece becomes a solid of its own, so that sites inside can be told; the rest stays
+    surface."""
+    import trimesh
+
+    try:
+        mesh = trimesh.load(path, force="mesh", process=False)
+    except (ValueError, LookupError, OSError, NotImplementedError, AttributeError, TypeError, ImportError) as error:
+        raise InputError(path, f"cannot be loaded ({error})", "a mesh that trimesh reads: PLY, OBJ, STL, GLB") from None
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+        raise InputError(path, "holds no triangles", "a triangle mesh")
+    near = (np.abs(mesh.vertices) <= FARTHEST_M).all(axis=1)
+    if not near.all():
+        bad = int(np.flatnonzero(~near)[0])
+        raise InputError(
+            f"{path}: vertex {bad}", f"{mesh.vertices[bad].tolist()}", f"finite coordinates, at most {FARTHEST_M:g} m"
+        )
+    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
+        raise InputError(path, f"a triangle names vertex {mesh.faces.max()} of {len(mesh.vertices)}", "a whole mesh")
+    faces = len(mesh.faces)
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
+    if len(mesh.faces) == 0:
+        raise InputError(path, f"none of its {faces} triangles has an area", "a triangle mesh")
+    if dropped := faces - len(mesh.faces):
+        builder.mended["degenerate or doubled triangles dropped"] += dropped
+    pieces = trimesh.graph.connected_components(mesh.face_adjacency, nodes=np.arange(len(mesh.faces)), min_len=1)
+    offset, surface = np.asarray(model.offset_m), [np.empty(0, dtype=np.int64)]
+    for number, piece in enumerate(sorted((np.sort(p) for p in pieces), key=lambda p: int(p[0]))):
+        part = trimesh.Trimesh(mesh.vertices, mesh.faces[piece], process=False)
+        if part.is_watertight and part.is_winding_consistent:
+            part.remove_unreferenced_vertices()
+            builder.add(part.vertices + offset, part.faces, f"{path.stem}_{number}", model.kind)
+            builder.built[model.kind] += 1
+        else:
+            surface.append(piece)
+    if len(rest := np.concatenate(surface)):
+        builder.add(mesh.vertices + offset, mesh.faces[rest], f"{path.stem}_surface", model.kind)
+        builder.built[f"{model.kind} (open surface)"] += 1
+
+
+def _plane(builder: _Builder, scenario: Scenario) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Two triangles at z = 0, facing up, well beyond the region of interest and everything that stands."""
+    box = scenario.roi.box
+    corners = np.array([box.origin_m, np.add(box.origin_m, box.size_m)])
+    points = np.concatenate([corners, *builder.vertices])
+    (x0, y0), (x1, y1) = points.min(axis=0)[:2] - GROUND_MARGIN_M, points.max(axis=0)[:2] + GROUND_MARGIN_M
+    vertices = np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
+    return vertices, np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def _extent_m(scenario: Scenario, footprints: Sequence[Footprint]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """South-west and north-east corner (2,) of the ground: well beyond the region of interest and all footprints."""
+    box = scenario.roi.box
+    corners = np.array([box.origin_m, np.add(box.origin_m, box.size_m)])[:, :2]
+    points = np.concatenate([corners, *(np.reshape(f.polygon.bounds, (2, 2)) for f in footprints)])
+    return points.min(axis=0) - GROUND_MARGIN_M, points.max(axis=0) + GROUND_MARGIN_M
+
+
+def _on(surface: Surface, footprint: Footprint) -> Footprint:
+    """A footprint whose heights count from the ground."""
+    centre = np.array([[footprint.polygon.centroid.x, footprint.polygon.centroid.y]])
+    ground = float(surface.height_m(centre[:, 0], centre[:, 1])[0])
+    base = ground + footprint.base_m
+    if footprint.base_m <= 0:
+        base = min(base, surface.lowest_m(np.asarray(footprint.polygon.exterior.coords)))
+    return replace(footprint, base_m=base, height_m=ground + footprint.height_m)

@@ -1,0 +1,186 @@
+"""Reads footprints, and mends or refuses what is not sound.
+
+Steps: read GeoJSON polygons, lines and points, or a SUMO .poly.xml; widen lines and points; mend what has one meaning
+only, and count it; refuse the rest. World frame, metres.
+
+``height_m`` is the z of the top, ``base_m`` (default 0) the z of the underside. Points are discs of ``radius_m``, lines
+are strips of that half width.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.core.errors import InputError
+from pipeline.formats import safe_xml
+from pipeline.scenario.types import FARTHEST_M
+
+if TYPE_CHECKING:
+    from shapely import Polygon
+    from shapely.geometry.base import BaseGeometry
+
+_QUARTER_SIDES = 4  # a disc is a regular polygon of four times as many sides
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """A polygon (world frame, metres, may have holes) that is extruded from ``base_m`` to ``height_m``."""
+
+    name: str
+    kind: str
+    polygon: Polygon
+    base_m: float
+    height_m: float
+
+
+@dataclass(frozen=True)
+class FootprintFile:
+    """What a file holds; what was mended in it, and what was left out, each with how often."""
+
+    footprints: list[Footprint] = field(default_factory=list)
+    mended: Counter[str] = field(default_factory=Counter)
+    left_out: Counter[str] = field(default_factory=Counter)
+
+
+def read_geojson(path: Path) -> FootprintFile:
+    """Footprints of a GeoJSON FeatureCollection in world-frame metres.
+
+    Raises
+    ------
+    InputError
+        Naming the feature that cannot be understood, has no height, or is no sound polygon.
+    """
+    file = FootprintFile()
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(path, f"is not valid JSON: {error}", "a GeoJSON FeatureCollection") from None
+    if not isinstance(document, dict) or not isinstance(document.get("features"), list):
+        raise InputError(path, "has no list of features", "a GeoJSON FeatureCollection in world-frame metres")
+    for number, feature in enumerate(document["features"]):
+        place = f"{path}: feature {number}"
+        if not isinstance(feature, dict) or not isinstance(feature.get("properties") or {}, dict):
+            raise InputError(place, "is not a GeoJSON feature", "an object with geometry and properties")
+        properties = feature.get("properties") or {}
+        name = str(properties.get("name", f"{path.stem}_{number}"))
+        place = f"{place} ({name})"
+        height, base = _metres(properties, "height_m", place), _metres(properties, "base_m", place, 0.0)
+        if not height > base:
+            raise InputError(place, f"height_m = {height:g} with base_m = {base:g}", "a top above the underside")
+        kind = str(properties.get("kind", "footprint"))
+        for part in _polygons(feature.get("geometry"), properties, place, file.mended):
+            file.footprints.append(Footprint(name, kind, part, base, height))
+    return file
+
+
+def _metres(properties: dict[str, Any], key: str, place: str, default: float | None = None) -> float:
+    value = properties.get(key, default)
+    if value is None:
+        raise InputError(place, f"{key} is missing", "a number of metres")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= FARTHEST_M:
+        raise InputError(f"{place}: {key}", f"{value!r}", f"a finite number of metres, at most {FARTHEST_M:g}")
+    return float(value)
+
+
+def _polygons(geometry: Any, properties: dict[str, Any], place: str, mended: Counter[str]) -> list[Polygon]:
+    """The polygons of one feature: lines and points buffered, dirt mended, multi-part geometries taken apart."""
+    import shapely
+
+    try:
+        with np.errstate(invalid="ignore"):  # what is no number is refused below
+            shape: BaseGeometry = shapely.geometry.shape(geometry)
+        coordinates = shapely.get_coordinates(shape)
+    except (
+        shapely.errors.ShapelyError,
+        TypeError,
+        ValueError,
+        KeyError,
+        AttributeError,
+        IndexError,
+        RecursionError,
+    ) as error:
+        raise InputError(f"{place}: geometry", f"cannot be understood ({error})", "a GeoJSON geometry") from None
+    if shape.is_empty or not np.isfinite(coordinates).all():
+        raise InputError(f"{place}: geometry", "is empty or has a coordinate that is no number", "finite metres")
+    if np.abs(coordinates).max() > FARTHEST_M:
+        raise InputError(
+            f"{place}: geometry",
+            f"lies {np.abs(coordinates).max():g} m from the world's zero",
+            f"within {FARTHEST_M:g} m",
+        )
+    if shapely.has_z(shape) and np.any(shapely.get_coordinates(shape, include_z=True)[:, 2] != 0):
+        raise InputError(
+            f"{place}: geometry", "has z coordinates", "two coordinates a point; heights go into base_m, height_m"
+        )
+    if shape.geom_type.endswith(("Point", "LineString")):
+        radius = _metres(properties, "radius_m", place)
+        if radius <= 0:
+            raise InputError(f"{place}: radius_m", f"{radius:g}", "above 0")
+        shape = shape.buffer(
+            radius, quad_segs=_QUARTER_SIDES, cap_style="flat" if "Line" in shape.geom_type else "round"
+        )
+    elif "Polygon" not in shape.geom_type:
+        raise InputError(
+            f"{place}: geometry", f"is a {shape.geom_type}", "a Polygon, LineString or Point, or their Multi forms"
+        )
+    parts = [p for p in shapely.get_parts(_sound(shape, place, mended)) if "Polygon" in p.geom_type]
+    if not parts:
+        raise InputError(f"{place}: geometry", "encloses no area", "a polygon with three corners that are not in line")
+    return parts
+
+
+def _sound(shape: BaseGeometry, place: str, mended: Counter[str]) -> BaseGeometry:
+    """Mend what has one meaning only (doubled points, rings that touch themselves); refuse what has two."""
+    import shapely
+
+    if not shapely.is_valid(shape):
+        reason = shapely.is_valid_reason(shape)
+        if not reason.startswith("Ring Self-intersection"):
+            raise InputError(
+                f"{place}: geometry", f"is not a sound polygon ({reason})", "rings that do not cross, holes inside"
+            )
+        shape = shapely.make_valid(shape)
+        mended["rings that touched themselves"] += 1
+    clean = shapely.remove_repeated_points(shape)
+    if doubled := len(shapely.get_coordinates(shape)) - len(shapely.get_coordinates(clean)):
+        mended["doubled points"] += doubled
+    return shapely.orient_polygons(clean)
+
+
+def read_poly_xml(path: Path, height_m: float) -> FootprintFile:
+    """Footprints of a SUMO .poly.xml; a ``height`` parameter overrides the default height.
+
+    Raises
+    ------
+    InputError
+        Naming the polygon that is not in metres, or not sound.
+    """
+    file = FootprintFile()
+    for number, element in enumerate(safe_xml.children(path, "additional")):
+        if element.tag != "poly":
+            file.left_out[f"<{element.tag}> of .poly.xml"] += 1
+            continue
+        name = element.get("id", f"{path.stem}_{number}")
+        place = f"{path}: poly {name}"
+        if element.get("geo", "false").lower() in ("true", "1"):
+            raise InputError(place, "has longitude and latitude (geo)", "a shape in the network's metres")
+        try:
+            points = [tuple(float(v) for v in pair.split(",")[:2]) for pair in element.get("shape", "").split()]
+            top = next((float(p.get("value", "")) for p in element if p.get("key") == "height"), height_m)
+        except ValueError as error:
+            raise InputError(
+                place, f"has a value that is no number ({error})", "shape='x,y x,y ...' in metres"
+            ) from None
+        if element.get("fill", "false").lower() not in ("true", "1") or len(points) < 3:
+            file.left_out["lines of .poly.xml"] += 1
+            continue
+        ring = [*points, points[0]]
+        for part in _polygons({"type": "Polygon", "coordinates": [ring]}, {}, place, file.mended):
+            file.footprints.append(Footprint(name, element.get("type", "polygon"), part, 0.0, top))
+    return file
