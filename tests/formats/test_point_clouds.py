@@ -22,7 +22,10 @@ quick = settings(deadline=None, max_examples=60, suppress_health_check=[HealthCh
 
 POINTS = np.array([[1 / 3, -2.5, 1e6 / 7], [4.0, 5.0, 6.0]])
 ASCII_PCD = "FIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nWIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA ascii\n1 2 3\n4 5 6\n"
-ASCII_PLY = "ply\nformat ascii 1.0\nelement vertex 2\nproperty double x\nproperty double y\nproperty double z\nend_header\n1 2 3\n4 5 6\n"
+ASCII_PLY = (
+    "ply\nformat ascii 1.0\nelement vertex 2\nproperty double x\nproperty double y\nproperty double z\nend_header\n"
+    "1 2 3\n4 5 6\n"
+)
 
 
 def put(folder: Path, name: str, content: str | bytes) -> Path:
@@ -40,7 +43,8 @@ def read(folder: Path, name: str, content: str | bytes) -> list[list[float]]:
 
 
 def pcd(fields: str, sizes: str, types: str, n: int, data: str = "binary", more: str = "") -> bytes:
-    return f"# made by hand\nFIELDS {fields}\nSIZE {sizes}\nTYPE {types}\n{more}WIDTH {n}\nHEIGHT 1\nDATA {data}\n".encode()
+    head = f"# made by hand\nFIELDS {fields}\nSIZE {sizes}\nTYPE {types}\n"
+    return f"{head}{more}WIDTH {n}\nHEIGHT 1\nDATA {data}\n".encode()
 
 
 def lzf(plain: bytes) -> bytes:
@@ -209,9 +213,9 @@ def test_pcd_viewpoint_leaves_missing_returns_missing(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("kind", "letter"), [("double", "d"), ("float64", "d"), ("float", "f"), ("int16", "h")])
 def test_ply_binary(tmp_path: Path, order: str, mark: str, kind: str, letter: str) -> None:
     head = (
-        f"ply\r\nformat binary_{order}_endian 1.0\r\ncomment end_header to come\r\nelement camera 1\nproperty uchar id\n"
-        f"element vertex 2\nproperty {kind} z\nproperty uchar red\nproperty {kind} y\nproperty {kind} x\n"
-        "element face 1\nproperty list uchar int vertex_indices\nend_header\r\n"
+        f"ply\r\nformat binary_{order}_endian 1.0\r\ncomment end_header to come\r\nelement camera 1\n"
+        f"property uchar id\nelement vertex 2\nproperty {kind} z\nproperty uchar red\n"
+        f"property {kind} y\nproperty {kind} x\nelement face 1\nproperty list uchar int vertex_indices\nend_header\r\n"
     ).encode()
     body = b"\7" + b"".join(
         struct.pack(f"{mark}{letter}B2{letter}", z, 255, y, x) for x, y, z in [(1, 2, 3), (4, 5, -6)]
@@ -222,8 +226,8 @@ def test_ply_binary(tmp_path: Path, order: str, mark: str, kind: str, letter: st
 def test_ply_ascii_ignores_faces_and_what_comes_before(tmp_path: Path) -> None:
     text = (
         "ply\nformat ascii 1.0\nelement path 1\nproperty list uchar int way\nelement vertex 2\nproperty float x\n"
-        "property float y\nproperty uchar red\nproperty float z\nelement face 1\nproperty list uchar int vertex_indices\n"
-        "end_header\n2 0 1\n0.1 2 255 3\n4 5 0 6\n3 0 1 0\n"
+        "property float y\nproperty uchar red\nproperty float z\nelement face 1\n"
+        "property list uchar int vertex_indices\nend_header\n2 0 1\n0.1 2 255 3\n4 5 0 6\n3 0 1 0\n"
     )
     assert read(tmp_path, "a.ply", text) == [[0.1, 2, 3], [4, 5, 6]]
 
@@ -331,8 +335,8 @@ OTHER_COLUMNS = r"has no single column 'x_m' \(its columns: x, y_m, z_m\); a hea
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("a.xyz", "1 2 3", r"a\.xyz: is of the unknown kind '\.xyz'; one of \.pcd, \.ply, \.las, \.laz, \.csv"),
-        ("a", "1 2 3", r"/a: has no suffix that tells its kind; one of \.pcd"),
+        ("a.xyz", "1 2 3", r"a\.xyz: is of the unknown kind '\.xyz'; one of \.csv, \.las, \.laz, \.pcd, \.ply"),
+        ("a", "1 2 3", r"/a: has no suffix that tells its kind; one of \.csv"),
         # PCD, header
         ("a.pcd", "", r"a\.pcd: is not a whole PCD file \(no line DATA in its header\)"),
         ("a.pcd", ASCII_PCD[:40], "is not a whole PCD file"),
@@ -358,9 +362,11 @@ OTHER_COLUMNS = r"has no single column 'x_m' \(its columns: x, y_m, z_m\); a hea
         ("a.pcd", ASCII_PCD + "7 8 9\n", "holds 3 lines of points; 2, as its header says"),
         ("a.pcd", ASCII_PCD.replace("4 5 6", "4 5"), r"a\.pcd: line 9: holds 2 values; 3 in each line"),
         ("a.pcd", ASCII_PCD.replace("1 2 3\n4 5 6", "1 2 3 0\n4 5 6 0"), r"line 8: holds 4 values; 3 in each line"),
-        ("a.pcd", ASCII_PCD.replace("4 5 6", "\n4 5 six"), "line 10: 'six' is no number; a number, or nan where nothing"),
+        ("a.pcd", ASCII_PCD.replace("4 5 6", "\n4 5 six"),
+         "line 10: 'six' is no number; a number, or nan where nothing"),
         ("a.pcd", ASCII_PCD.replace("4 5 6", "4 5 6_0"), "cannot be read as text .*6_0"),
-        ("a.pcd", ASCII_PCD.replace("1 2 3\n4 5 6", "nan 2 3\n4 5 inf"), r"holds no finite point \(of 2\); at least one"),
+        ("a.pcd", ASCII_PCD.replace("1 2 3\n4 5 6", "nan 2 3\n4 5 inf"),
+         r"holds no finite point \(of 2\); at least one"),
         ("a.pcd", BINARY + bytes(23), r"holds 23 bytes of points; 24 \(2 points of 12\), as its header says"),
         ("a.pcd", BINARY + bytes(25), "holds 25 bytes of points; 24"),
         ("a.pcd", PACKED + bytes(7), r"ends before its points \(7 bytes of them\); 24, as its header says"),
@@ -372,15 +378,19 @@ OTHER_COLUMNS = r"has no single column 'x_m' \(its columns: x, y_m, z_m\); a hea
         # PLY
         ("a.ply", "plyx", r"a\.ply: is not a whole PLY file \(from 'ply' to 'end_header'\)"),
         ("a.ply", "solid\nend_header\n", "is not a whole PLY file"),
-        ("a.ply", ASCII_PLY.replace("vertex", "corner"), r"has no element 'vertex' \(its elements: corner\); vertices with"),
+        ("a.ply", ASCII_PLY.replace("vertex", "corner"),
+         r"has no element 'vertex' \(its elements: corner\); vertices with"),
         ("a.ply", ASCII_PLY.replace("double z", "double q"), r"has no single field 'z' \(its fields: x y q\)"),
         ("a.ply", ASCII_PLY.replace("format ascii 1.0\n", ""), "its PLY header has no line 'format'; one of ascii"),
-        ("a.ply", ASCII_PLY.replace("ascii", "utf8"), r"line 2: 'format utf8 1\.0' in its PLY header; a format, an element"),
+        ("a.ply", ASCII_PLY.replace("ascii", "utf8"),
+         r"line 2: 'format utf8 1\.0' in its PLY header; a format, an element"),
         ("a.ply", ASCII_PLY.replace("double z", "real z"), r"line 6: 'property real z' in its PLY header"),
         ("a.ply", ASCII_PLY.replace("double z", "double x"), r"line 6: 'property double x' in its PLY header"),
-        ("a.ply", ASCII_PLY.replace("vertex 2", "vertex two"), "the count of element 'vertex' is 'two'; a whole number"),
+        ("a.ply", ASCII_PLY.replace("vertex 2", "vertex two"),
+         "the count of element 'vertex' is 'two'; a whole number"),
         ("a.ply", ASCII_PLY.replace("vertex 2", "vertex 0"), "holds no points, says its header"),
-        ("a.ply", ASCII_PLY.replace("double z", "list uchar int z"), "the element 'vertex' holds a list; no list among"),
+        ("a.ply", ASCII_PLY.replace("double z", "list uchar int z"),
+         "the element 'vertex' holds a list; no list among"),
         ("a.ply", BINARY_PLY.replace("element", "element path 1\nproperty list uchar int way\nelement") + "\0" * 49,
          "the element 'path' holds a list"),
         ("a.ply", ASCII_PLY.replace("4 5 6\n", ""), "holds 1 lines of points; 2"),
@@ -393,7 +403,8 @@ OTHER_COLUMNS = r"has no single column 'x_m' \(its columns: x, y_m, z_m\); a hea
         ("a.csv", CSV.replace("x_m", "x"), OTHER_COLUMNS),
         ("a.csv", CSV.replace("z_m", "x_m"), "has no single column 'x_m'"),
         ("a.csv", "x_m,y_m,z_m\n", r"holds no finite point \(of 0\)"),
-        ("a.csv", CSV + "4,five,6\n", r"a\.csv: line 3: y_m: 'five' is no number; a number, or nan where nothing returned"),
+        ("a.csv", CSV + "4,five,6\n",
+         r"a\.csv: line 3: y_m: 'five' is no number; a number, or nan where nothing returned"),
         ("a.csv", CSV + "\n4,,6\n", "line 4: y_m: '' is no number"),
         ("a.csv", CSV + "4,5\n", "line 3: holds 2 values; 3, one a column"),
         ("a.csv", CSV + "1,5,2,5,3,5\n", "line 3: holds 6 values; 3, one a column"),
