@@ -273,7 +273,7 @@ def effects(
 @app.command()
 def new(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="The scenario's folder, to be made.")],
-    osm: Annotated[Path, typer.Option(metavar="FILE", help="An OpenStreetMap extract (.osm, .osm.xml).")],
+    osm: Annotated[Path, typer.Option(metavar="FILE", help="An OpenStreetMap extract (.osm, .osm.pbf).")],
     at: Annotated[
         str | None, typer.Option(metavar="LAT,LON", help="The junction nearest to this place; the largest by default.")
     ] = None,
@@ -283,7 +283,7 @@ def new(
     from pipeline.cli import screen as show
     from pipeline.importers import openstreetmap as from_osm
 
-    show.summary(folder, from_osm.new(folder, osm, _place(at) if at is not None else None, lefthand=lefthand))
+    show.summary(from_osm.new(folder, osm, _place(at) if at is not None else None, lefthand=lefthand))
 
 
 def _load(path: Path, set_: list[str] | None) -> Scenario:

@@ -20,6 +20,7 @@ from pipeline.artefacts.readers import SEPARABLE
 from pipeline.sensing.sensors import Sensor
 
 if TYPE_CHECKING:
+    from pipeline.importers.openstreetmap import NewScenario
     from pipeline.studies.accuracy import Row, Seeds, Study
     from pipeline.studies.effects import Call, Change, Price
 
@@ -236,12 +237,12 @@ def ablation(changes: Sequence[Change]) -> None:
     Console(width=None if sys.stdout.isatty() else 160, highlight=False).print(table)
 
 
-def summary(folder: Path, found: dict[str, Any]) -> None:
+def summary(made: NewScenario) -> None:
     """What ``egvs new`` made."""
     console = Console(highlight=False, soft_wrap=True)
-    for key, value in found.items():
+    for key, value in made.to_json().items():
         console.print(f"{key}: {_in_words(value) if isinstance(value, dict) else _plain(value)}", markup=False)
-    console.print(f"next: egvs run {folder}", markup=False)
+    console.print(f"next: egvs run {made.folder}", markup=False)
 
 
 def accuracy(study: Study, command: str) -> None:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 from xml.sax.saxutils import quoteattr
 
 from pipeline.core.errors import InputError
-from pipeline.formats import safe_xml as safexml
+from pipeline.formats import safe_xml
 
 if TYPE_CHECKING:
     import osmium
@@ -200,7 +200,7 @@ def _opened(path: Path) -> Iterator[osmium.FileProcessor]:
     """The file's objects; what osmium says against them becomes an InputError."""
     import osmium
 
-    kind = "pbf" if is_pbf(path) else "osm.gz" if safexml.is_gzip(path) else "osm"
+    kind = "pbf" if is_pbf(path) else "osm.gz" if safe_xml.is_gzip(path) else "osm"
     try:
         yield osmium.FileProcessor(osmium.io.File(path, kind))
     except (RuntimeError, ValueError, osmium.InvalidLocationError) as error:
@@ -221,7 +221,7 @@ def _check_xml(path: Path) -> frozenset[tuple[str, int]]:
     """Refuse what osmium would take for 0, or complain of without naming the object; find what an editor has marked as
     deleted, which osmium does not see: (first letter of its type, identifier)."""
     deleted = set()
-    for element in safexml.children(path, "osm"):
+    for element in safe_xml.children(path, "osm"):
         name = element.get("id", "")
         if element.tag in _KINDS.values():
             identifier = _integer(path, f"<{element.tag}> id", element.get("id"))

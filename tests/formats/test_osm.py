@@ -76,7 +76,8 @@ def test_ways_and_relations_are_sorted_and_whole(tmp_path: Path) -> None:
     inside = (
         f'{NODE}<way id="9"><nd ref="1"/><nd ref="5"/></way><way id="-3"><nd ref="1"/><tag k="a" v="&lt;ü&gt;"/></way>'
         '<relation id="8"/><relation id="7"><member type="way" ref="9" role="outer"/>'
-        '<member type="node" ref="1" role=""/><member type="relation" ref="8" role="x"/><tag k="type" v="multipolygon"/></relation>'
+        '<member type="node" ref="1" role=""/><member type="relation" ref="8" role="x"/>'
+        '<tag k="type" v="multipolygon"/></relation>'
     )
     extract = osm.read(put(tmp_path, osm_xml(inside)))
     assert list(extract.ways.values()) == [osm.Way(-3, (1,), {"a": "<ü>"}), osm.Way(9, (1, 5), {})]
