@@ -256,7 +256,7 @@ def effects(
         what = "they" if prices is None else ", ".join(unpriced)
         print(f"what {what} cost and change: {arguments.command('accuracy', scenario, set_, out)}, or --ablation")
     if ablation:
-        if not resolved.effects:
+        if not resolved.effects.named:
             raise InputError(
                 "--ablation", "the scenario names no effect", "name one, e.g. --set effects.rain.rate_mm_h=20"
             )
@@ -280,7 +280,9 @@ def sensors() -> None:
 @app.command()
 def new(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="The scenario's folder, to be made.")],
-    osm: Annotated[Path, typer.Option(metavar="FILE", help="An OpenStreetMap extract (.osm, .osm.xml).")],
+    osm: Annotated[
+        Path, typer.Option(metavar="FILE", help="An OpenStreetMap extract (.osm, .osm.xml, .osm.pbf; may be gzipped).")
+    ],
     at: Annotated[
         str | None, typer.Option(metavar="LAT,LON", help="The junction nearest to this place; the largest by default.")
     ] = None,
@@ -291,7 +293,7 @@ def new(
     from pipeline.importers import openstreetmap
 
     place = arguments.latitude_and_longitude(at) if at is not None else None
-    results.print_new_scenario(folder, openstreetmap.new(folder, osm, place, lefthand=lefthand))
+    results.print_new_scenario(openstreetmap.new(folder, osm, place, lefthand=lefthand))
 
 
 def _resolved(path: Path, set_: list[str] | None, out: Path | None) -> tuple[Scenario, Path]:

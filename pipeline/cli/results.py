@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.table import Table
@@ -13,6 +13,9 @@ from pipeline.artefacts.run_record import RunRecord
 from pipeline.cli.ranking_table import ranking_table
 from pipeline.cli.terminal import console, in_words, value_in_words
 from pipeline.report.ranking import ScoredSite
+
+if TYPE_CHECKING:
+    from pipeline.importers.openstreetmap import NewScenario
 
 _FILE_WIDTH = 150
 
@@ -47,12 +50,12 @@ def print_verification(folder: Path, differences: list[str]) -> None:
         console(_FILE_WIDTH).print(f"{folder}: {line}", markup=False)
 
 
-def print_new_scenario(folder: Path, summary: dict[str, Any]) -> None:
+def print_new_scenario(made: NewScenario) -> None:
     """What ``egvs new`` made."""
     out = Console(highlight=False, soft_wrap=True)
-    for key, value in summary.items():
+    for key, value in made.to_json().items():
         out.print(f"{key}: {in_words(value) if isinstance(value, dict) else value_in_words(value)}", markup=False)
-    out.print(f"next: egvs run {folder}", markup=False)
+    out.print(f"next: egvs run {made.folder}", markup=False)
 
 
 def _print_scores(out: Console, folder: Path, record: RunRecord) -> None:

@@ -1,25 +1,34 @@
-"""What does an OpenStreetMap file say?
+"""OpenStreetMap files are read here: XML (``.osm``, may be gzipped) and PBF (``.osm.pbf``), by what they hold, whatever
+they are called.
 
-Steps of :func:`read`: parse as XML without entities (may be gzipped), check every number once, keep what is needed:
+Steps of :func:`read`: check what osmium would let pass (XML only); let osmium read the objects; keep what is needed:
 positions of nodes, tagged nodes, ways, relations, the extract's bounds. :func:`streets_xml` writes the streets alone,
-for netconvert: so SUMO sees only what was checked here.
+for netconvert: so SUMO sees only what was checked here. :func:`write_xml` writes all of a PBF file as XML.
 
-Frame: latitude and longitude in degrees (WGS 84). Objects are sorted by their identifiers, so that the order in the
-file changes nothing. The meaning of tags: https://wiki.openstreetmap.org/wiki/Map_features."""
+Frame: latitude and longitude in degrees (WGS 84), whole numbers of 1e-7 degree (1 cm), as OpenStreetMap keeps them.
+Objects are sorted by their identifiers, so that the order in the file changes nothing. The meaning of tags:
+https://wiki.openstreetmap.org/wiki/Map_features."""
 
 from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from xml.etree.ElementTree import Element
+from typing import TYPE_CHECKING
 from xml.sax.saxutils import quoteattr
 
 from pipeline.core.errors import InputError
-from pipeline.formats import safe_xml as safexml
+from pipeline.formats import safe_xml
+
+if TYPE_CHECKING:
+    import osmium
 
 Tags = dict[str, str]
+
+_KINDS = {"n": "node", "w": "way", "r": "relation"}
 
 _FOOT_M = 0.3048
 _LENGTH = re.compile(r"(\d+(?:\.\d+)?|\d+,\d{1,2}|\.\d+)\s*(m|metres?|meters?|ft|feet|foot|')?", re.IGNORECASE)
@@ -82,23 +91,64 @@ class Extract:
 
 
 def read(path: Path) -> Extract:
-    """Read an ``.osm`` file (XML, may be gzipped).
+    """Read an OpenStreetMap file; objects that are marked as deleted do not count.
 
     Raises
     ------
     InputError
-        When the file is missing, is no whole OpenStreetMap XML file, declares a document type or entities, or holds a
-        position that is none.
+        When the file is missing, is no whole OpenStreetMap file, declares entities, or holds a position that is none.
     """
     if not path.is_file():
-        raise InputError(path, "no such file", "an OpenStreetMap file (.osm)")
+        raise InputError(path, "no such file", "an OpenStreetMap file (.osm, .osm.pbf)")
+    import osmium
+
+    deleted = frozenset() if is_pbf(path) else _check_xml(path)
+    nodes, node_tags = dict[int, tuple[float, float]](), dict[int, Tags]()
+    ways, relations = dict[int, Way](), dict[int, Relation]()
+    with _opened(path) as objects:
+        box = objects.header.box()
+        for o in objects:
+            if isinstance(o, osmium.osm.Changeset) or not o.visible or (o.type_str(), o.id) in deleted:
+                continue
+            match o:
+                case osmium.osm.Node():
+                    if not o.location.valid():
+                        problem = "has no position on the globe"
+                        raise InputError(f"{path}: node {o.id}", problem, "a latitude and a longitude")
+                    nodes[o.id] = (o.location.lat, o.location.lon)
+                    if tags := dict(o.tags):
+                        node_tags[o.id] = tags
+                case osmium.osm.Way():
+                    ways[o.id] = Way(o.id, tuple(node.ref for node in o.nodes), dict(o.tags))
+                case osmium.osm.Relation():
+                    members = tuple((_KINDS[m.type], m.ref, m.role) for m in o.members)
+                    relations[o.id] = Relation(o.id, members, dict(o.tags))
+    if not nodes:
+        raise InputError(path, "holds no node", "an OpenStreetMap extract with streets")
+    return Extract(
+        nodes, dict(sorted(node_tags.items())), dict(sorted(ways.items())),
+        tuple(relation for _, relation in sorted(relations.items())), _bounds(box, nodes), box.valid(),
+    )  # fmt: skip
+
+
+def is_pbf(path: Path) -> bool:
+    """Whether the file's first bytes are those of OpenStreetMap's PBF format, whatever its name says."""
     with path.open("rb") as file:
-        if b"OSMHeader" in file.read(64):
-            raise InputError(path, "is in the PBF format", "XML; convert it: osmium cat in.osm.pbf -o out.osm")
-    builder = _Builder(path)
-    for element in safexml.children(path, "osm"):
-        builder.take(element)
-    return builder.extract()
+        return b"OSMHeader" in file.read(64)
+
+
+def write_xml(path: Path, xml: Path) -> None:
+    """Write all objects of an OpenStreetMap file as XML, for programs that read nothing else (netconvert)."""
+    import osmium
+
+    with _opened(path) as objects:
+        header = osmium.io.Header()
+        if (box := objects.header.box()).valid():
+            header.add_box(box)
+        with osmium.SimpleWriter(osmium.io.File(xml, "osm"), header=header, overwrite=True) as writer:
+            for o in objects:
+                if isinstance(o, osmium.osm.Changeset) or o.visible:
+                    writer.add(o)
 
 
 def streets_xml(extract: Extract) -> str:
@@ -145,79 +195,64 @@ def number(text: str) -> float | None:
     return float(text) if _NUMBER.fullmatch(text.strip()) else None
 
 
-class _Builder:
-    """Collects the file's objects one by one."""
+@contextmanager
+def _opened(path: Path) -> Iterator[osmium.FileProcessor]:
+    """The file's objects; what osmium says against them becomes an InputError."""
+    import osmium
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._nodes: dict[int, tuple[float, float]] = {}
-        self._node_tags: dict[int, Tags] = {}
-        self._ways: dict[int, Way] = {}
-        self._relations: dict[int, Relation] = {}
-        self._bounds: Bounds | None = None
+    kind = "pbf" if is_pbf(path) else "osm.gz" if safe_xml.is_gzip(path) else "osm"
+    try:
+        yield osmium.FileProcessor(osmium.io.File(path, kind))
+    except (RuntimeError, ValueError, osmium.InvalidLocationError) as error:
+        raise InputError(
+            path, f"cannot be read as OpenStreetMap data ({error})", "a whole file; fetch it again"
+        ) from None
 
-    def take(self, element: Element) -> None:
-        """Take one child of <osm>; objects marked as deleted by an editor do not count."""
-        if element.get("action") == "delete" or element.get("visible") == "false":
-            return
-        if element.tag == "node":
-            self._take_node(element)
-        elif element.tag == "way":
-            way = Way(self._id(element), tuple(self._ref(element, nd) for nd in element.iter("nd")), _tags(element))
-            self._ways[way.id] = way
-        elif element.tag == "relation":
-            members = tuple(
-                (m.get("type", ""), self._ref(element, m), m.get("role", "")) for m in element.iter("member")
-            )
-            relation = Relation(self._id(element), members, _tags(element))
-            self._relations[relation.id] = relation
+
+def _bounds(box: osmium.osm.Box, nodes: dict[int, tuple[float, float]]) -> Bounds:
+    """The rectangle that the file declares, else that of its nodes."""
+    if box.valid():
+        return Bounds(box.bottom_left.lat, box.bottom_left.lon, box.top_right.lat, box.top_right.lon)
+    lats, lons = zip(*nodes.values(), strict=True)
+    return Bounds(min(lats), min(lons), max(lats), max(lons))
+
+
+def _check_xml(path: Path) -> frozenset[tuple[str, int]]:
+    """Refuse what osmium would take for 0, or complain of without naming the object; find what an editor has marked as
+    deleted, which osmium does not see: (first letter of its type, identifier)."""
+    deleted = set()
+    for element in safe_xml.children(path, "osm"):
+        name = element.get("id", "")
+        if element.tag in _KINDS.values():
+            identifier = _integer(path, f"<{element.tag}> id", element.get("id"))
+            if element.get("action") == "delete":
+                deleted.add((element.tag[0], identifier))
+            elif element.tag == "node" and element.get("visible") != "false":
+                _degrees(path, f"node {name}: lat", element.get("lat"), 90.0)
+                _degrees(path, f"node {name}: lon", element.get("lon"), 180.0)
+            for member in element:
+                if member.tag != "tag":
+                    _integer(path, f"{element.tag} {name}: ref", member.get("ref"))
         elif element.tag == "bounds":
-            keys = (("minlat", 90.0), ("minlon", 180.0), ("maxlat", 90.0), ("maxlon", 180.0))
-            self._bounds = Bounds(*(self._degrees(element, key, limit) for key, limit in keys))
-
-    def extract(self) -> Extract:
-        """What was collected, sorted."""
-        if not self._nodes:
-            raise InputError(self._path, "holds no node", "an OpenStreetMap extract with streets")
-        lats, lons = zip(*self._nodes.values(), strict=True)
-        bounds = self._bounds or Bounds(min(lats), min(lons), max(lats), max(lons))
-        return Extract(
-            self._nodes, dict(sorted(self._node_tags.items())), dict(sorted(self._ways.items())),
-            tuple(r for _, r in sorted(self._relations.items())), bounds, self._bounds is not None,
-        )  # fmt: skip
-
-    def _take_node(self, element: Element) -> None:
-        identifier = self._id(element)
-        self._nodes[identifier] = (self._degrees(element, "lat", 90.0), self._degrees(element, "lon", 180.0))
-        if tags := _tags(element):
-            self._node_tags[identifier] = tags
-
-    def _id(self, element: Element) -> int:
-        return self._integer(element.get("id"), f"<{element.tag}> id")
-
-    def _ref(self, element: Element, member: Element) -> int:
-        return self._integer(member.get("ref"), f"{element.tag} {element.get('id')}: ref")
-
-    def _integer(self, text: str | None, key: str) -> int:
-        try:
-            return int(text or "")
-        except ValueError:
-            raise InputError(f"{self._path}: {key}", repr(text), "a whole number") from None
-
-    def _degrees(self, element: Element, key: str, limit: float) -> float:
-        text = element.get(key)
-        try:
-            value = float(text or "")
-        except ValueError:
-            value = math.nan
-        if not abs(value) <= limit:
-            place = f"{self._path}: {element.tag} {element.get('id', '')}".rstrip()
-            raise InputError(f"{place}: {key}", repr(text), f"degrees from {-limit:g} to {limit:g}")
-        return value
+            for key, limit in (("minlat", 90.0), ("minlon", 180.0), ("maxlat", 90.0), ("maxlon", 180.0)):
+                _degrees(path, f"bounds: {key}", element.get(key), limit)
+    return frozenset(deleted)
 
 
-def _tags(element: Element) -> Tags:
-    return {tag.get("k", ""): tag.get("v", "") for tag in element.iter("tag")}
+def _integer(path: Path, key: str, text: str | None) -> int:
+    try:
+        return int(text or "")
+    except ValueError:
+        raise InputError(f"{path}: {key}", repr(text), "a whole number") from None
+
+
+def _degrees(path: Path, key: str, text: str | None, limit: float) -> None:
+    try:
+        value = float(text or "")
+    except ValueError:
+        value = math.nan
+    if not abs(value) <= limit:
+        raise InputError(f"{path}: {key}", repr(text), f"degrees from {-limit:g} to {limit:g}")
 
 
 def _tag_lines(tags: Tags) -> list[str]:

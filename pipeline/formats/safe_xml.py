@@ -1,4 +1,4 @@
-"""How is a user's XML file read without trusting it, and without holding it whole?
+"""A user's XML file is read without trusting it, and without holding it whole.
 
 Steps: undo gzip where the first two bytes say so; parse with defusedxml, which refuses entities; hand out one child of
 the root at a time and forget it. Whatever is wrong with the file becomes an :class:`InputError` that names it (for a

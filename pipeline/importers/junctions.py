@@ -1,7 +1,7 @@
-"""Where is the junction, how far does the region of interest reach round it, and where could a pole stand at its kerbs?
+"""A junction is chosen here, the region of interest laid round it, and places for poles are found along its kerbs.
 
-Steps: read lanes, junctions and the projection from a SUMO network -> :class:`Streets`; :func:`choose` a junction;
-:func:`region` round it; :func:`kerb_sites` along the carriageway's rim.
+Steps: read lanes, junctions and the projection from a SUMO network -> :class:`Streets`; :func:`choose_junction`;
+:func:`region_round` it; :func:`kerb_places` along the carriageway's rim.
 
 World frame: the network's own x, y in metres. Longitude and latitude become x, y by the network's ``<location>``, as
 netconvert did:
@@ -22,7 +22,7 @@ from shapely.geometry import LineString, Point, Polygon, box
 from shapely.geometry.base import BaseGeometry
 
 from pipeline.core.errors import InputError
-from pipeline.formats import safe_xml as safexml
+from pipeline.formats import safe_xml
 
 XY = tuple[float, float]
 
@@ -36,7 +36,7 @@ KERB_LEAST_M = 0.5
 CLEARANCE_M = 1.0
 BEYOND_ROI_M = 5.0
 HEIGHTS_M = (3.0, 4.5)
-MOST_SPOTS = 12
+MOST_PLACES = 12
 LANE_WIDTH_M = 3.2
 """SUMO's default."""
 
@@ -123,7 +123,7 @@ class Region:
 
 
 @dataclass(frozen=True)
-class Spot:
+class KerbPlace:
     """A place for a pole and where a sensor there would look: x, y in metres, yaw in degrees."""
 
     x_m: float
@@ -135,24 +135,49 @@ def read(path: Path) -> Streets:
     """Read a network that netconvert wrote from OpenStreetMap."""
     streets: list[Street] = []
     inside: list[BaseGeometry] = []
-    raw: list[Element] = []
+    nodes: list[Element] = []
     projection, offset_m = "", (0.0, 0.0)
-    for element in safexml.children(path, "net"):
+    for element in safe_xml.children(path, "net"):
         function = element.get("function", "")
         if element.tag == "location":
             projection, offset_m = element.attrib["projParameter"], _points(element.attrib["netOffset"])[0]
         elif element.tag == "edge" and function == "internal":
-            inside.append(_area(element))
+            inside.append(_area(_lanes(element)))
         elif element.tag == "edge" and not function:
-            streets.append(_street(element))
+            ends = element.attrib["from"], element.attrib["to"]
+            length_m = math.fsum(float(lane.attrib["length"]) for lane in element.iter("lane"))
+            streets.append(Street(ends, _area(_lanes(element)), element.get("name", ""), length_m))
         elif element.tag == "junction" and element.get("type") != "internal":
-            raw.append(element)
-    nodes_m = {e.attrib["id"]: (float(e.attrib["x"]), float(e.attrib["y"])) for e in raw}
-    junctions = [_junction(e, streets) for e in raw if e.get("type") != "dead_end" and e.get("incLanes")]
-    return Streets(tuple(streets), tuple(inside), nodes_m, tuple(junctions), projection, offset_m)
+            nodes.append(element)
+    nodes_m = {e.attrib["id"]: (float(e.attrib["x"]), float(e.attrib["y"])) for e in nodes}
+    junctions = tuple(
+        _junction(
+            e.attrib["id"], e.attrib["type"], nodes_m[e.attrib["id"]], _points(e.get("shape", "")),
+            len(e.get("incLanes", "").split()), streets,
+        )
+        for e in nodes
+        if e.get("type") != "dead_end" and e.get("incLanes")
+    )  # fmt: skip
+    return Streets(tuple(streets), tuple(inside), nodes_m, junctions, projection, offset_m)
 
 
-def choose(streets: Streets, at_m: XY | None) -> Junction | None:
+def _lanes(edge: Element) -> list[tuple[list[XY], float]]:
+    """Middle line and width of each lane; pavements are none."""
+    return [
+        (_points(lane.attrib["shape"]), float(lane.get("width", LANE_WIDTH_M)))
+        for lane in edge.iter("lane")
+        if lane.get("allow") != "pedestrian"
+    ]
+
+
+def _points(text: str) -> list[XY]:
+    try:
+        return [(float(x), float(y)) for x, y, *_ in (pair.split(",") for pair in text.split())]
+    except ValueError:
+        raise InputError("network", f"a shape holds no coordinates ({text[:40]!r})", "what netconvert writes") from None
+
+
+def choose_junction(streets: Streets, at_m: XY | None) -> Junction | None:
     """The signalised junction nearest to ``at_m``, or the largest; one without signals only where there is no other.
 
     A junction is where at least three streets meet, so that the signals of a mere crossing for pedestrians do not
@@ -172,7 +197,7 @@ def choose(streets: Streets, at_m: XY | None) -> Junction | None:
     return min(among, key=lambda j: (Point(at_m).distance(j.area), math.dist(at_m, j.at_m), j.id))
 
 
-def region(junction: Junction) -> Region:
+def region_round(junction: Junction) -> Region:
     """A box round the junction with a piece of each approach; all its corners are whole metres."""
     x0, y0, x1, y1 = junction.area.bounds
     steps = (math.ceil((side + 2 * APPROACH_M) / ROI_STEP_M) for side in (x1 - x0, y1 - y0))
@@ -180,12 +205,12 @@ def region(junction: Junction) -> Region:
     return Region((float(round((x0 + x1) / 2)), float(round((y0 + y1) / 2))), (width, depth))
 
 
-def kerb_sites(streets: Streets, junction: Junction, roi: Region, objects: Sequence[BaseGeometry]) -> list[Spot]:
+def kerb_places(streets: Streets, junction: Junction, roi: Region, objects: Sequence[BaseGeometry]) -> list[KerbPlace]:
     """Places for poles along the kerbs of the junction and its approaches, in and around the region of interest.
 
     They stand ``KERB_M`` outside the carriageway (rounded to 0.1 m, never nearer than ``KERB_LEAST_M``),
     ``CLEARANCE_M`` from every object, about ``SPACING_M`` apart along the kerb and never nearer to each other than half
-    of it. Islands smaller than 100 m2 count as carriageway. Of more than ``MOST_SPOTS`` places, the nearest to the
+    of it. Islands smaller than 100 m2 count as carriageway. Of more than ``MOST_PLACES`` places, the nearest to the
     junction are taken."""
     window = box(*roi.area.buffer(BEYOND_ROI_M, join_style="mitre").bounds)
     near = window.buffer(50.0)
@@ -200,7 +225,7 @@ def kerb_sites(streets: Streets, junction: Junction, roi: Region, objects: Seque
     center = junction.area.centroid
     taken = _nearest(places, (center.x, center.y))
     yaws = [(math.degrees(math.atan2(center.y - y, center.x - x)), x, y) for x, y in taken]
-    return [Spot(x, y, float(round(yaw_deg))) for yaw_deg, x, y in sorted(yaws)]
+    return [KerbPlace(x, y, float(round(yaw_deg))) for yaw_deg, x, y in sorted(yaws)]
 
 
 def _nearest(places: Sequence[XY], center: XY) -> list[XY]:
@@ -209,7 +234,7 @@ def _nearest(places: Sequence[XY], center: XY) -> list[XY]:
     for place in sorted(places, key=lambda p: (math.dist(p, center), p)):
         if all(math.dist(place, other) >= SPACING_M / 2 for other in taken):
             taken.append(place)
-    return taken[:MOST_SPOTS]
+    return taken[:MOST_PLACES]
 
 
 def _approaches(streets: Streets, junction: Junction, window: BaseGeometry) -> list[BaseGeometry]:
@@ -226,16 +251,16 @@ def _approaches(streets: Streets, junction: Junction, window: BaseGeometry) -> l
 def _along(line: LineString, forbidden: BaseGeometry, window: BaseGeometry) -> list[XY]:
     """Free places along a line, evenly spaced; one that is taken moves a little along the kerb."""
     count = round(line.length / SPACING_M)
-    spots = []
+    places = []
     for index in range(count):
         middle_m = (index + 0.5) * line.length / count
         for slide_m in _SLIDES_M:
             point = line.interpolate(min(max(middle_m + slide_m, 0.0), line.length))
             x, y = round(point.x, 1), round(point.y, 1)
             if window.covers(Point(x, y)) and not forbidden.intersects(Point(x, y)):
-                spots.append((x, y))
+                places.append((x, y))
                 break
-    return spots
+    return places
 
 
 def _without_islands(area: BaseGeometry) -> BaseGeometry:
@@ -249,35 +274,18 @@ def _lines(rim: BaseGeometry) -> list[LineString]:
     return [line for line in shapely.get_parts(shapely.normalize(merged)) if isinstance(line, LineString)]
 
 
-def _junction(element: Element, streets: Sequence[Street]) -> Junction:
-    name = element.attrib["id"]
-    at_m = float(element.attrib["x"]), float(element.attrib["y"])
-    corners = _points(element.get("shape", ""))
-    area = shapely.make_valid(Polygon(corners)) if len(corners) >= 3 else Point(at_m).buffer(1.0)
+def _junction(
+    name: str, kind: str, at_m: XY, corners_m: Sequence[XY], lanes_in: int, streets: Sequence[Street]
+) -> Junction:
+    area = shapely.make_valid(Polygon(corners_m)) if len(corners_m) >= 3 else Point(at_m).buffer(1.0)
     meeting = [s for s in streets if name in s.ends]
     arms = {end for s in meeting for end in s.ends} - {name}
     names = tuple(sorted({s.name for s in meeting if s.name}))
-    signalised = element.attrib["type"].startswith("traffic_light")
-    return Junction(name, at_m, area, len(element.get("incLanes", "").split()), len(arms), signalised, names)
+    return Junction(name, at_m, area, lanes_in, len(arms), kind.startswith("traffic_light"), names)
 
 
-def _street(element: Element) -> Street:
-    ends = element.attrib["from"], element.attrib["to"]
-    length_m = math.fsum(float(lane.attrib["length"]) for lane in element.iter("lane"))
-    return Street(ends, _area(element), element.get("name", ""), length_m)
-
-
-def _area(edge: Element) -> BaseGeometry:
-    """Its lanes at their full width; pavements are none."""
-    lanes = [(_points(lane.attrib["shape"]), lane) for lane in edge.iter("lane") if lane.get("allow") != "pedestrian"]
+def _area(lanes: Sequence[tuple[Sequence[XY], float]]) -> BaseGeometry:
+    """Lanes at their full width."""
     return shapely.union_all([
-        LineString(points).buffer(float(lane.get("width", LANE_WIDTH_M)) / 2, cap_style="flat")
-        for points, lane in lanes if len(set(points)) > 1
+        LineString(points).buffer(width_m / 2, cap_style="flat") for points, width_m in lanes if len(set(points)) > 1
     ])  # fmt: skip
-
-
-def _points(text: str) -> list[XY]:
-    try:
-        return [(float(x), float(y)) for x, y, *_ in (pair.split(",") for pair in text.split())]
-    except ValueError:
-        raise InputError("network", f"a shape holds no coordinates ({text[:40]!r})", "what netconvert writes") from None

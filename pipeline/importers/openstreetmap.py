@@ -1,7 +1,7 @@
-"""How does a town on OpenStreetMap become a scenario?
+"""A scenario is made from a town on OpenStreetMap.
 
 Steps of :func:`new`: read the extract; netconvert makes the streets a SUMO network; choose a junction and lay the
-region of interest round it; take buildings, trees, barriers and poles as footprints; find candidate sites along the
+region of interest round it; take buildings, trees, barriers and poles as solids; find candidate sites along the
 kerbs; write
 
     network.net.xml    the streets                                       (traffic)
@@ -21,19 +21,22 @@ import json
 import re
 import shutil
 import tempfile
+from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import tomlkit
 from pydantic import TypeAdapter, ValidationError
 
 from pipeline.core.errors import InputError, RunError
-from pipeline.formats import osm as osm_reader
-from pipeline.formats.osm import Extract
-from pipeline.importers import junctions as osm_junction
-from pipeline.importers import solids as osm_footprints
-from pipeline.importers.junctions import Junction, Region, Spot, Streets
-from pipeline.importers.solids import Footprint
+from pipeline.formats.osm import Extract, streets_xml
+from pipeline.formats.osm import read as read_extract
+from pipeline.importers import junctions, solids
+from pipeline.importers.buildings import BUILDING_M
+from pipeline.importers.junctions import HEIGHTS_M, ROI_HEIGHT_M, Junction, KerbPlace, Region, Streets
+from pipeline.importers.mapped_solids import ImportCounts, MappedSolid
 from pipeline.scenario.loading import load
 from pipeline.scenario.models import FILE, RoiModel, ScoreModel
 from pipeline.scenario.traffic import TrafficModel
@@ -58,7 +61,48 @@ LANE_PER_VEHICLE_M = 250.0
 VEHICLES_LEAST, VEHICLES_MOST = 5, 50
 
 
-def new(folder: Path, osm: Path, at: tuple[float, float] | None = None, lefthand: bool = False) -> dict[str, Any]:
+@dataclass(frozen=True)
+class NewScenario:
+    """What :func:`new` made, for the user. ``sites`` counts poles times heights, ``notes`` say what to know before
+    trusting the scenario."""
+
+    folder: Path
+    junction: Junction
+    roi: Region
+    streets: Streets
+    sites: int
+    statics: ImportCounts
+    notes: tuple[str, ...]
+
+    @property
+    def vehicles(self) -> int:
+        """How many the network takes without grid-lock."""
+        fitting = round(self.streets.lane_length_m / LANE_PER_VEHICLE_M)
+        return min(max(fitting, VEHICLES_LEAST), VEHICLES_MOST)
+
+    def to_json(self) -> dict[str, Any]:
+        """All of it as plain JSON, in the order of interest."""
+        junction, streets = self.junction, self.streets
+        return {
+            "folder": str(self.folder),
+            "attribution": ATTRIBUTION,
+            "junction": {
+                "title": junction.title, "id": junction.id, "signalised": junction.signalised,
+                "x_m": junction.at_m[0], "y_m": junction.at_m[1], "lanes_in": junction.lanes_in, "arms": junction.arms,
+            },
+            "roi": {"center_m": [*self.roi.center_m, ROI_HEIGHT_M / 2], "size_m": [*self.roi.size_m, ROI_HEIGHT_M]},
+            "network": {
+                "edges": len(streets.streets), "lane_length_m": round(streets.lane_length_m),
+                "signalised_junctions": sum(j.signalised for j in streets.junctions),
+            },
+            "vehicles": self.vehicles,
+            "sites": self.sites,
+            "statics": self.statics.to_json(),
+            "notes": list(self.notes),
+        }  # fmt: skip
+
+
+def new(folder: Path, osm: Path, at: tuple[float, float] | None = None, lefthand: bool = False) -> NewScenario:
     """Make a scenario folder from an OpenStreetMap extract.
 
     Parameters
@@ -66,16 +110,11 @@ def new(folder: Path, osm: Path, at: tuple[float, float] | None = None, lefthand
     folder
         Made by this function; may exist when it is empty.
     osm
-        An ``.osm`` file (XML, may be gzipped).
+        An OpenStreetMap file: XML (may be gzipped) or PBF.
     at
         Latitude, longitude in degrees: the signalised junction nearest to it is taken; without it, the largest.
     lefthand
         Whether one drives on the left there.
-
-    Returns
-    -------
-    dict
-        JSON: the junction, region, vehicles, sites; ``statics`` with what was counted; ``notes`` for the user.
 
     Raises
     ------
@@ -84,26 +123,24 @@ def new(folder: Path, osm: Path, at: tuple[float, float] | None = None, lefthand
         site is possible. Nothing is written then.
     """
     name = _check_folder(folder)
-    extract = osm_reader.read(osm)
+    extract = read_extract(osm)
     _check_at(extract, at)
     network, streets = _network(extract, osm, lefthand)
     junction, roi = _junction(streets, osm, at)
-    footprints, counted = osm_footprints.collect(extract, streets.to_xy, streets.lane_areas)
-    spots = osm_junction.kerb_sites(streets, junction, roi, [f.area for f in footprints])
-    if not spots:
-        raise InputError(
-            osm,
-            f"no place for a pole is free along the kerbs of the {junction.title}",
-            "another junction: --at LAT,LON",
-        )
-    summary = _summary(streets, junction, roi, spots, counted)
+    mapped, counts = solids.collect(extract, streets.to_xy, streets.lane_areas)
+    places = junctions.kerb_places(streets, junction, roi, [solid.area for solid in mapped])
+    if not places:
+        problem = f"no place for a pole is free along the kerbs of the {junction.title}"
+        raise InputError(osm, problem, "another junction: --at LAT,LON")
+    notes = _notes(junction, roi, counts)
+    made = NewScenario(folder, junction, roi, streets, len(places) * len(HEIGHTS_M), counts, notes)
     _publish(folder, {
         NETWORK: network,
-        STATICS: _geojson(footprints, counted),
-        SITES: _sites(spots),
-        FILE: _toml(name, summary),
+        STATICS: _geojson(mapped, counts),
+        SITES: _sites(places),
+        FILE: _toml(name, made),
     })  # fmt: skip
-    return {"folder": str(folder), **summary}
+    return made
 
 
 def _check_folder(folder: Path) -> str:
@@ -141,7 +178,7 @@ def _network(extract: Extract, osm: Path, lefthand: bool) -> tuple[str, Streets]
         raise missing
     with tempfile.TemporaryDirectory() as name:
         work = Path(name)
-        (work / "streets.osm.xml").write_text(osm_reader.streets_xml(extract), encoding="utf-8")
+        (work / "streets.osm.xml").write_text(streets_xml(extract), encoding="utf-8")
         flags = [*NETCONVERT, *_boundary(extract), *(["--lefthand"] if lefthand else [])]
         try:
             sumo.run("netconvert", ["--osm-files", "streets.osm.xml", *flags, "-o", NETWORK], work)
@@ -149,7 +186,7 @@ def _network(extract: Extract, osm: Path, lefthand: bool) -> tuple[str, Streets]
             if re.search(r"No (nodes|edges) loaded", str(error)):
                 raise missing from None
             raise
-        streets = osm_junction.read(work / NETWORK)
+        streets = junctions.read(work / NETWORK)
         if not streets.streets:
             raise missing
         return _without_header((work / NETWORK).read_text(encoding="utf-8")), streets
@@ -170,121 +207,88 @@ def _without_header(network: str) -> str:
 
 def _junction(streets: Streets, osm: Path, at: tuple[float, float] | None) -> tuple[Junction, Region]:
     near = streets.to_xy([at[1]], [at[0]])[0] if at else None
-    junction = osm_junction.choose(streets, near)
+    junction = junctions.choose_junction(streets, near)
     if junction is None:
         raise InputError(osm, "its streets meet nowhere", "an extract with a junction")
-    return junction, osm_junction.region(junction)
+    return junction, junctions.region_round(junction)
 
 
 # --- what is written ------------------------------------------------------------------------------------------------
 
 
-def _summary(
-    streets: Streets, junction: Junction, roi: Region, spots: Sequence[Spot], counted: dict[str, Any]
-) -> dict[str, Any]:
-    vehicles = round(streets.lane_length_m / LANE_PER_VEHICLE_M)
-    return {
-        "attribution": ATTRIBUTION,
-        "junction": {
-            "title": junction.title, "id": junction.id, "signalised": junction.signalised,
-            "x_m": junction.at_m[0], "y_m": junction.at_m[1], "lanes_in": junction.lanes_in, "arms": junction.arms,
-        },
-        "roi": {
-            "center_m": [*roi.center_m, osm_junction.ROI_HEIGHT_M / 2],
-            "size_m": [*roi.size_m, osm_junction.ROI_HEIGHT_M],
-        },
-        "network": {
-            "edges": len(streets.streets), "lane_length_m": round(streets.lane_length_m),
-            "signalised_junctions": sum(j.signalised for j in streets.junctions),
-        },
-        "vehicles": min(max(vehicles, VEHICLES_LEAST), VEHICLES_MOST),
-        "sites": len(spots) * len(osm_junction.HEIGHTS_M),
-        "statics": counted,
-        "notes": _notes(junction, roi, counted),
-    }  # fmt: skip
-
-
-def _notes(junction: Junction, roi: Region, counted: dict[str, Any]) -> list[str]:
-    """What a user should know before trusting the scenario."""
+def _notes(junction: Junction, roi: Region, counts: ImportCounts) -> tuple[str, ...]:
     notes = []
     if not junction.signalised:
         notes.append("no junction in the extract has signals; the one with the most incoming lanes was taken")
     if not roi.area.covers(junction.area):
-        notes.append(f"the junction is larger than the region of interest ({osm_junction.ROI_MOST_M:g} m at most)")
-    heights = counted["heights"].get("building", {})
-    if guessed := heights.get("default", 0):
-        share = f"{guessed} of {sum(heights.values())} buildings"
-        notes.append(f"{share} name neither height nor levels: {osm_footprints.BUILDING_M:g} m assumed")
-    return notes
+        notes.append(f"the junction is larger than the region of interest ({junctions.ROI_MOST_M:g} m at most)")
+    heights = counts.heights.get("building", Counter())
+    if guessed := heights["default"]:
+        share = f"{guessed} of {heights.total()} buildings"
+        notes.append(f"{share} name neither height nor levels: {BUILDING_M:g} m assumed")
+    return tuple(notes)
 
 
-def _geojson(footprints: Sequence[Footprint], counted: dict[str, Any]) -> str:
+def _geojson(mapped: Sequence[MappedSolid], counts: ImportCounts) -> str:
     """GeoJSON in world-frame metres, one feature a line."""
     head = {
         "type": "FeatureCollection",
         "attribution": ATTRIBUTION,
         "frame": f"metres, x and y of {NETWORK}; not longitude and latitude",
-        "summary": counted,
+        "summary": counts.to_json(),
     }
     opening = json.dumps(head, indent=1, ensure_ascii=False).removesuffix("\n}")
-    lines = ",\n".join(json.dumps(f.to_geojson(), ensure_ascii=False) for f in footprints)
+    lines = ",\n".join(json.dumps(solid.to_geojson(), ensure_ascii=False) for solid in mapped)
     return f'{opening},\n "features": [\n{lines}\n]}}\n'
 
 
-def _sites(spots: Sequence[Spot]) -> str:
+def _sites(places: Sequence[KerbPlace]) -> str:
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(("site", "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg", "sensor"))
-    rows = [(spot, z_m) for spot in spots for z_m in osm_junction.HEIGHTS_M]
-    for number, (spot, z_m) in enumerate(rows, 1):
-        table.writerow((f"k{number:02d}", spot.x_m, spot.y_m, z_m, spot.yaw_deg, 0.0, 0.0, SENSOR))
+    rows = [(place, z_m) for place in places for z_m in HEIGHTS_M]
+    for number, (place, z_m) in enumerate(rows, 1):
+        table.writerow((f"k{number:02d}", place.x_m, place.y_m, z_m, place.yaw_deg, 0.0, 0.0, SENSOR))
     return text.getvalue()
 
 
-def _toml(name: str, summary: dict[str, Any]) -> str:
-    defaults = {key: field.default for key, field in TrafficModel.model_fields.items()}
-    title = summary["junction"]["title"]
-    lines = [
-        f"# A scenario made from OpenStreetMap. Map data {ATTRIBUTION} (openstreetmap.org/copyright).",
-        f"# World frame: x east, y north in metres as in {NETWORK}, z up from the flat ground.",
-        "",
-        *([f"name = {_quoted(name)}"] if name else []),
-        f"description = {_quoted(title[0].upper() + title[1:])}",
-        "seed = 1",
-        "",
-        "[roi]  # the box whose visibility counts; its size is a whole number of voxels along each axis",
-        f"center_m = {_floats(summary['roi']['center_m'])}",
-        f"size_m = {_floats(summary['roi']['size_m'])}",
-        f"voxel_m = {RoiModel.model_fields['voxel_m'].default}",
-        "",
-        "[traffic]  # SUMO; trips are drawn between the ends of the network's streets",
-        f"network = {_quoted(NETWORK)}",
-        f"vehicles = {summary['vehicles']}  # in the whole network, in every frame"
-        f" ({summary['network']['lane_length_m'] / 1000:.1f} km of lanes)",
-        f"frames = {defaults['frames']}",
-        f"frame_period_s = {defaults['frame_period_s']}",
-        f"warmup_s = {defaults['warmup_s']}",
-        "",
-        "[statics]  # buildings, trees, barriers, poles; what was assumed about them is counted in the file's summary",
-        f"footprints = [{_quoted(STATICS)}]",
-        "",
-        f"[sites]  # poles {osm_junction.KERB_M:g} m behind the kerbs of the junction; add or remove rows at will",
-        f"file = {_quoted(SITES)}",
-        "",
-        "[score]",
-        f"gamma = {ScoreModel.model_fields['gamma'].default}",
-        "",
-    ]
-    return "\n".join(lines)
-
-
-def _quoted(text: str) -> str:
-    """A TOML basic string."""
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
-def _floats(values: Sequence[float]) -> str:
-    return f"[{', '.join(repr(float(v)) for v in values)}]"
+def _toml(name: str, made: NewScenario) -> str:
+    document = tomlkit.document()
+    source = f"A scenario made from OpenStreetMap. Map data {ATTRIBUTION} (openstreetmap.org/copyright)."
+    document.add(tomlkit.comment(source))
+    document.add(tomlkit.comment(f"World frame: x east, y north in metres as in {NETWORK}, z up from the flat ground."))
+    document.add(tomlkit.nl())
+    title = made.junction.title
+    document.update({"name": name} if name else {})
+    document.update({"description": title[0].upper() + title[1:], "seed": 1})
+    lanes_km = made.streets.lane_length_m / 1000
+    traffic = {key: TrafficModel.model_fields[key].default for key in ("frames", "frame_period_s", "warmup_s")}
+    tables: dict[str, tuple[str, dict[str, Any]]] = {
+        "roi": ("the box whose visibility counts; its size is a whole number of voxels along each axis", {
+            "center_m": [*made.roi.center_m, ROI_HEIGHT_M / 2], "size_m": [*made.roi.size_m, ROI_HEIGHT_M],
+            "voxel_m": RoiModel.model_fields["voxel_m"].default,
+        }),
+        "traffic": ("SUMO; trips are drawn between the ends of the network's streets", {
+            "network": NETWORK, "vehicles": made.vehicles, **traffic,
+        }),
+        "statics": (
+            "buildings, trees, barriers, poles; what was assumed about them is counted in the file's summary",
+            {"footprints": [STATICS]},
+        ),
+        "sites": (
+            f"poles {junctions.KERB_M:g} m behind the kerbs of the junction; add or remove rows at will",
+            {"file": SITES},
+        ),
+        "score": ("", {"gamma": ScoreModel.model_fields["gamma"].default}),
+    }  # fmt: skip
+    for key, (comment, values) in tables.items():
+        table = tomlkit.item(values)
+        if comment:
+            table.comment(comment)
+        document.add(tomlkit.nl()).add(key, table)
+    vehicles = document["traffic"]["vehicles"]
+    vehicles.comment(f"in the whole network, in every frame ({lanes_km:.1f} km of lanes)")
+    return tomlkit.dumps(document)
 
 
 def _publish(folder: Path, files: dict[str, str]) -> None:

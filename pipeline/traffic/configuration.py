@@ -21,7 +21,7 @@ import numpy as np
 
 from pipeline.core import files
 from pipeline.core.errors import InputError
-from pipeline.formats import safe_xml
+from pipeline.formats import osm, safe_xml
 from pipeline.scenario.models import Scenario
 from pipeline.scenario.traffic import TrafficModel
 from pipeline.traffic import demand, network, sumo
@@ -30,7 +30,7 @@ from pipeline.traffic.frames import Window
 
 CONFIG, NETWORK, TRIPS, VTYPES = "run.sumocfg", "network.net.xml", "trips.rou.xml", "vtypes.add.xml"
 FCD, COLLISIONS, STOPS, LOG = "fcd.csv", "collisions.xml", "stops.xml", "sumo.log"
-OTHERS, PERSONS = "others.rou.xml", "persons.csv"
+OTHERS, PERSONS, MAP = "others.rou.xml", "persons.csv", "map.osm.xml"
 """Route file of an extension (those of further ones count up), and what SUMO records of persons."""
 
 _SYNONYMS = {
@@ -341,7 +341,7 @@ def _draw(
 
 def _copies(given: Sources, folder: Path, others: Iterable[str]) -> dict[str, str]:
     """Copy every file into the folder, so that it can be moved and opened elsewhere; ``others`` are taken names."""
-    taken, values = {CONFIG, TRIPS, VTYPES, FCD, COLLISIONS, STOPS, LOG, OTHERS, PERSONS, *others}, {}
+    taken, values = {CONFIG, TRIPS, VTYPES, FCD, COLLISIONS, STOPS, LOG, OTHERS, PERSONS, MAP, *others}, {}
     for option, paths in given.files.items():
         names = []
         for path in paths:
@@ -362,15 +362,12 @@ def _copies(given: Sources, folder: Path, others: Iterable[str]) -> dict[str, st
 
 def convert_osm(path: Path, network_path: Path) -> None:
     """Turn a map of OpenStreetMap into a network; its world frame starts at the network's south-west corner."""
-    source = os.path.relpath(_osm_xml(path), network_path.parent)
-    sumo.run("netconvert", ["--osm-files", source, *_OSM_FLAGS, "-o", network_path.name], network_path.parent)
-
-
-def _osm_xml(path: Path) -> Path:
-    """The map as XML, which is all that netconvert reads."""
-    if path.name.endswith(".osm.pbf"):
-        raise InputError(path, "is in the PBF format", "XML; convert it: osmium cat in.osm.pbf -o out.osm")
-    return path
+    folder, readable = network_path.parent, path
+    if osm.is_pbf(path):  # netconvert reads XML only
+        readable = folder / MAP
+        osm.write_xml(path, readable)
+    source = os.path.relpath(readable, folder)
+    sumo.run("netconvert", ["--osm-files", source, *_OSM_FLAGS, "-o", network_path.name], folder)
 
 
 def _config_xml(options: Mapping[str, str]) -> str:

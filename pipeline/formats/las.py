@@ -1,0 +1,52 @@
+"""LAS and LAZ files are read through laspy (``pip install egvs[las]``): the scaled coordinates, as the file gives them.
+
+Frame: a file in a map projection is in the world frame only when the scenario is in the same projection."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.core.errors import InputError
+from pipeline.formats.point_records import columns_of
+
+_CHUNK = 1_000_000
+
+
+def read(path: Path, place: str) -> NDArray[np.float64]:
+    """All points, (n, 3) float64; a damaged file, or laspy missing, is an InputError at ``place``."""
+    try:
+        import laspy
+    except ImportError:
+        raise InputError(place, "needs laspy, which is not installed", "pip install egvs[las]") from None
+    # The serial backend: the parallel one ends the whole process on a damaged file.
+    backend = laspy.LazBackend.Lazrs
+    damaged = (laspy.LaspyException, RuntimeError, ValueError, struct.error)  # RuntimeError: lazrs
+    with path.open("rb") as file:
+        packed = _is_packed(place, file.read(375), path.stat().st_size)
+        if packed and backend not in laspy.LazBackend.detect_available():
+            raise InputError(place, "needs lazrs, which is not installed", "pip install egvs[las]")
+        file.seek(0)
+        try:
+            with laspy.open(file, closefd=False, read_evlrs=False, laz_backend=backend) as las:
+                declared = int(las.header.point_count)
+                chunks = [columns_of([chunk.x, chunk.y, chunk.z]) for chunk in las.chunk_iterator(_CHUNK)]
+        except damaged as error:
+            raise InputError(place, f"cannot be read as LAS ({error})", "a whole LAS or LAZ file") from None
+    points = np.concatenate([np.empty((0, 3)), *chunks])
+    if len(points) != declared:
+        raise InputError(place, f"holds {len(points)} points", f"{declared}, as its header says; a whole file")
+    return points
+
+
+def _is_packed(place: str, head: bytes, size: int) -> bool:
+    """Check the public header block (ASPRS LAS 1.4, table 3): laspy would follow a damaged count for hours."""
+    if head[:4] != b"LASF" or len(head) < 227:
+        raise InputError(place, "is not a LAS file (no LASF header)", "a whole LAS or LAZ file")
+    header_size, points_at, records = struct.unpack_from("<HII", head, 94)
+    if not 227 <= header_size <= points_at <= size or 54 * records > points_at - header_size:
+        raise InputError(place, "its LAS header points past the file or into itself", "a whole LAS or LAZ file")
+    return bool(head[104] & 0xC0)  # LAZ sets the upper bits of the point format

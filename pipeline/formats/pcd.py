@@ -1,0 +1,190 @@
+r"""PCD files (Point Cloud Library) are read with DATA ascii, binary or binary_compressed and fields in any order, of
+any TYPE, SIZE and COUNT, and written as DATA binary.
+
+Frame: a VIEWPOINT other than the identity is the sensor's pose in the world; the points then stand in the sensor's
+frame, in metres, and are brought into the world's:
+
+.. math:: p_\mathrm{world} = R(q)\, p_\mathrm{sensor} + t, \qquad
+          \mathrm{VIEWPOINT} = t_x\, t_y\, t_z\, q_w\, q_x\, q_y\, q_z.
+
+Format: the PCL documentation, "The PCD (Point Cloud Data) file format", version 0.7. Read by hand, because pypcd4 takes
+a file that was cut short, does not apply VIEWPOINT, and reads no text whose columns are apart by more than one space.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.core.errors import InputError
+from pipeline.formats.point_records import RecordLayout, number, whole_number
+
+_IDENTITY = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+_UNIT = 1e-3  # how far a quaternion's length may be from 1: headers are often written with few digits
+
+_HEADER = """\
+# .PCD v0.7 - Point Cloud Data file format
+VERSION 0.7
+FIELDS x y z
+SIZE 8 8 8
+TYPE F F F
+COUNT 1 1 1
+WIDTH {n}
+HEIGHT 1
+VIEWPOINT 0 0 0 1 0 0 0
+POINTS {n}
+DATA binary
+"""
+
+_SIZES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
+
+
+def read(path: Path, place: str) -> NDArray[np.float64]:
+    """All points in the world frame, (n, 3) float64; a damaged file is an InputError at ``place``."""
+    data = path.read_bytes()
+    header, start, lines = _header(place, data)
+    layout = _layout(place, header)
+    viewpoint = _viewpoint(place, header.get("VIEWPOINT"))
+    match header["DATA"]:
+        case ["ascii"]:
+            points = layout.from_text(data[start:], lines + 1)
+        case ["binary"]:
+            points = layout.from_records(memoryview(data)[start:])
+        case ["binary_compressed"]:
+            points = layout.from_blocks(_unpacked(place, data[start:], layout.n * layout.size))
+        case other:
+            raise InputError(place, f"DATA is {' '.join(other)!r}", "ascii, binary or binary_compressed")
+    return points if viewpoint == _IDENTITY else _to_world(points, viewpoint)
+
+
+def write(path: Path, points_m: NDArray[np.float64]) -> None:
+    """Write world-frame points, (n, 3) float64, as DATA binary with the identity as VIEWPOINT."""
+    with path.open("wb") as file:
+        file.write(_HEADER.format(n=len(points_m)).encode("ascii"))
+        file.write(np.ascontiguousarray(points_m, dtype="<f8").data)
+
+
+def _header(place: str, data: bytes) -> tuple[dict[str, list[str]], int, int]:
+    """The header's words by keyword, where the points start, and how many lines come before."""
+    header: dict[str, list[str]] = {}
+    start = lines = 0
+    while "DATA" not in header:
+        if start >= len(data):
+            raise InputError(place, "is not a whole PCD file (no line DATA in its header)", "a PCD file, version 0.7")
+        end = data.find(b"\n", start) % (len(data) + 1)  # -1, no further line end, becomes the file's end
+        words = data[start:end].decode("latin-1").split()
+        if words and not words[0].startswith("#"):
+            header[words[0]] = words[1:]
+        start, lines = end + 1, lines + 1
+    return header, start, lines
+
+
+def _layout(place: str, header: dict[str, list[str]]) -> RecordLayout:
+    for key in ("FIELDS", "SIZE", "TYPE"):
+        if key not in header:
+            raise InputError(place, f"its PCD header has no line {key}", "FIELDS, SIZE, TYPE, POINTS and DATA")
+    names = header["FIELDS"]
+    words = {"COUNT": ["1"] * len(names)} | header
+    for key in ("SIZE", "TYPE", "COUNT"):
+        if len(words[key]) != len(names):
+            raise InputError(place, f"{key} has {len(words[key])} values for {len(names)} FIELDS", "one value a field")
+    formats = []
+    for name, kind, size in zip(names, words["TYPE"], words["SIZE"], strict=True):
+        if whole_number(place, f"the SIZE of {name}", [size]) not in _SIZES.get(kind, ()):
+            raise InputError(
+                place, f"field {name!r} has TYPE {kind} and SIZE {size}", "F of 4 or 8, I or U of 1, 2, 4 or 8"
+            )
+        formats.append(f"<{kind.lower()}{size}")
+    counts = [
+        whole_number(place, f"the COUNT of {name}", [count]) for name, count in zip(names, words["COUNT"], strict=True)
+    ]
+    return RecordLayout.of(place, _count(place, header), names, formats, counts)
+
+
+def _count(place: str, header: dict[str, list[str]]) -> int:
+    counts = {key: whole_number(place, key, header[key]) for key in ("POINTS", "WIDTH", "HEIGHT") if key in header}
+    product = counts["WIDTH"] * counts["HEIGHT"] if {"WIDTH", "HEIGHT"} <= counts.keys() else counts.get("POINTS")
+    if product is None:
+        raise InputError(place, "its PCD header has no line POINTS", "FIELDS, SIZE, TYPE, POINTS and DATA")
+    if counts.get("POINTS", product) != product:
+        raise InputError(place, f"POINTS is {counts['POINTS']}, but WIDTH x HEIGHT is {product}", "the same number")
+    return product
+
+
+def _viewpoint(place: str, words: list[str] | None) -> tuple[float, ...]:
+    """t_x, t_y, t_z, q_w, q_x, q_y, q_z, with the quaternion brought to length 1."""
+    if words is None:
+        return _IDENTITY
+    values = [value for word in words if (value := number(word)) is not None and math.isfinite(value)]
+    length = math.hypot(*values[3:])
+    if len(values) != len(words) or len(values) != 7 or abs(length - 1) > _UNIT:
+        right = "a translation and a unit quaternion, tx ty tz qw qx qy qz"
+        raise InputError(place, f"VIEWPOINT is {' '.join(words)!r}", right)
+    return (*values[:3], *(value / length for value in values[3:]))
+
+
+def _to_world(points: NDArray[np.float64], viewpoint: tuple[float, ...]) -> NDArray[np.float64]:
+    """Rotate and shift, in plain sums: a matrix product's last bits would depend on the machine."""
+    tx, ty, tz, w, x, y, z = viewpoint
+    rotation = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    px, py, pz = points.T
+    with np.errstate(invalid="ignore", over="ignore"):  # what is not finite stays so, and is dropped
+        return np.stack(
+            [a * px + b * py + c * pz + t for (a, b, c), t in zip(rotation, (tx, ty, tz), strict=True)], axis=1
+        )
+
+
+def _unpacked(place: str, body: bytes, need: int) -> bytes:
+    right = f"{need}, as its header says; a whole file"
+    if len(body) < 8:
+        raise InputError(place, f"ends before its points ({len(body)} bytes of them)", right)
+    packed, size = struct.unpack_from("<II", body)
+    if size != need:
+        raise InputError(place, f"holds {size} bytes of points, unpacked", right)
+    if len(body) < 8 + packed:
+        raise InputError(place, f"holds {len(body) - 8} bytes of packed points", f"{packed}; a whole file")
+    unpacked = _lzf(body[8 : 8 + packed], size)
+    if unpacked is None:
+        raise InputError(place, "its packed points are damaged", f"LZF data of {right}")
+    return unpacked
+
+
+def _lzf(packed: bytes, size: int) -> bytes | None:
+    """Undo LZF, the format of Marc Lehmann's liblzf; None when the outcome would not have ``size`` bytes.
+
+    A control byte c below 32 is followed by c + 1 plain bytes. Any other copies from what is already there: its upper
+    three bits are the length less 2 (7: another byte adds to it), its lower five and one byte more the distance back,
+    less 1."""
+    out, at, end = bytearray(), 0, len(packed)
+    try:
+        while at < end:
+            control = packed[at]
+            at += 1
+            if control < 32:
+                out += packed[at : at + control + 1]
+                at += control + 1
+                continue
+            length = control >> 5
+            if length == 7:
+                length += packed[at]
+                at += 1
+            length += 2
+            back = ((control & 31) << 8 | packed[at]) + 1
+            at += 1
+            first = len(out) - back
+            if first < 0:
+                return None
+            piece = out[first : first + length]
+            # A copy may run into what it writes: then the last ``back`` bytes repeat.
+            out += piece if back >= length else (piece * (length // back + 1))[:length]
+    except IndexError:
+        return None
+    return bytes(out) if at == end and len(out) == size else None

@@ -1,0 +1,81 @@
+"""Plug-ins of other packages: found by their entry points, loaded once, and never in this program's own place."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from pipeline.core import plugins
+from pipeline.core.errors import InputError, MissingBackendError
+
+GROUP = "egvs.test_group"
+
+
+def install(folder: Path, package: str, entries: str, modules: dict[str, str], group: str = GROUP) -> None:
+    """Lay a package of somebody else's into a folder as pip would."""
+    info = folder / f"{package}-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n", encoding="utf-8")
+    (info / "entry_points.txt").write_text(f"[{group}]\n{entries}\n", encoding="utf-8")
+    for name, source in modules.items():
+        (folder / f"{name}.py").write_text(source, encoding="utf-8")
+
+
+@pytest.fixture
+def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder on the path, as site-packages is."""
+    before = set(sys.modules)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    forget()
+    yield tmp_path
+    forget()
+    for name in set(sys.modules) - before:
+        if name.startswith("plug_"):
+            del sys.modules[name]
+
+
+def forget() -> None:
+    plugins.load.cache_clear()
+    plugins._declared.cache_clear()
+
+
+def test_names_are_sorted_and_nothing_is_imported(site: Path) -> None:
+    install(site, "two", "b = plug_b:PART\na = plug_a", {"plug_a": "raise RuntimeError", "plug_b": "PART = [7]"})
+    assert plugins.names(GROUP) == ["a", "b"]
+    assert "plug_a" not in sys.modules and "plug_b" not in sys.modules
+    assert plugins.load(GROUP, "b") == [7]
+    assert plugins.load(GROUP, "b") is plugins.load(GROUP, "b")
+
+
+def test_of_two_packages_this_programs_own_comes_first_then_the_first_by_name(site: Path) -> None:
+    install(site, "zebra", "a = plug_z:PART\nb = plug_z:PART", {"plug_z": "PART = 'zebra'"})
+    install(site, "antelope", "a = plug_c:PART\nb = plug_c:PART", {"plug_c": "PART = 'antelope'"})
+    install(site, "egvs", "a = plug_e:PART", {"plug_e": "PART = 'own'"})
+    assert (plugins.load(GROUP, "a"), plugins.load(GROUP, "b")) == ("own", "antelope")
+
+
+def test_an_unknown_name_is_said_with_those_that_are_known(site: Path) -> None:
+    install(site, "one", "a = plug_a", {})
+    with pytest.raises(InputError, match=r"^egvs\.test_group: knows no 'c'; one of a$"):
+        plugins.load(GROUP, "c")
+    with pytest.raises(InputError, match="one of none"):
+        plugins.load("egvs.nobody", "c")
+
+
+@pytest.mark.parametrize(
+    ("entry", "source", "problem"),
+    [
+        ("plug_missing:PART", "", "No module named 'plug_missing'"),
+        ("plug_a:PART", "", "module 'plug_a' has no attribute 'PART'"),
+        ("plug_a", "import nowhere_to_be_found", "No module named 'nowhere_to_be_found'"),
+        ("plug_a", "def", "invalid syntax"),
+    ],
+)
+def test_one_that_cannot_be_loaded_names_its_package(site: Path, entry: str, source: str, problem: str) -> None:
+    install(site, "somebody-elses", f"a = {entry}", {"plug_a": source})
+    place = rf"\(entry point '{entry}' of the package somebody-elses\)"
+    with pytest.raises(MissingBackendError, match=rf"^'a' of egvs\.test_group cannot be loaded: {problem}.*{place}"):
+        plugins.load(GROUP, "a")

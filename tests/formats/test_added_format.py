@@ -1,0 +1,78 @@
+"""A package of somebody else's adds a file format: found, read, written and offered without a change here."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.core import plugins
+from pipeline.formats.point_clouds import GROUP, read_points
+from tests.core.test_plugins import install
+
+FOO = """
+import numpy as np
+
+class Foo:
+    "Points as text, one number a line."
+
+    def read(self, path, place):
+        return np.array([float(word) for word in path.read_text().split()]).reshape(-1, 3)
+
+    def write(self, path, points_m):
+        path.write_text("\\n".join(map(repr, points_m.ravel().tolist())))
+
+class Bar:
+    def read(self, path, place):
+        return np.zeros((1, 3))
+
+FOO, BAR = Foo(), Bar()
+"""
+
+USER = """
+import sys
+from pathlib import Path
+import numpy as np
+from pipeline.core.errors import InputError
+from pipeline.formats.point_clouds import read_points, write_points
+path = Path(sys.argv[1])
+write_points(path, np.array([[0.1, 2.0, 3.0], [4.0, np.nan, 6.0]]))
+points, dropped = read_points(path, "")
+assert points.tolist() == [[0.1, 2.0, 3.0]] and dropped == 1
+try:
+    write_points(path.with_suffix(".bar"), points)
+except InputError as error:
+    print(error)
+"""
+
+
+def test_a_package_adds_a_format(tmp_path: Path) -> None:
+    install(tmp_path / "site", "foo", "foo = foo_points:FOO\nbar = foo_points:BAR", {"foo_points": FOO}, GROUP)
+    code = f"import sys; sys.path.insert(0, {str(tmp_path / 'site')!r})\n{USER}"
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "a.FOO")], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "a.bar: is of the unknown kind '.bar'; one of .foo, .pcd, .ply" in done.stdout
+
+
+def test_our_own_formats_are_found_and_complete() -> None:
+    assert {"csv", "las", "laz", "pcd", "ply"} <= set(plugins.names(GROUP))
+    for name in plugins.names(GROUP):
+        assert callable(plugins.load(GROUP, name).read)
+
+
+def test_reading_imports_no_other_format(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    path.write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+                    "end_header\n1 2 3\n", encoding="ascii")  # fmt: skip
+    assert np.array_equal(read_points(path, "")[0], [[1, 2, 3]])
+    code = (
+        "import sys\nfrom pathlib import Path\nfrom pipeline.formats.point_clouds import read_points\n"
+        f"read_points(Path({str(path)!r}), '')\n"
+        "print([m for m in sys.modules if m in ('pipeline.formats.pcd', 'pipeline.formats.las', 'pyarrow', 'laspy')])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -1,0 +1,178 @@
+"""OpenStreetMap files: XML and PBF give the same, whatever they are called, and what is no map is refused.
+
+The PBF files are written here by osmium's own writer; those of XML by hand."""
+
+from __future__ import annotations
+
+import gzip
+from pathlib import Path
+
+import osmium
+import pytest
+
+from pipeline.core.errors import InputError
+from pipeline.formats import osm
+
+SMALL = Path(__file__).parents[1] / "importers" / "data" / "small.osm"
+NODE = '<node id="1" lat="1" lon="2"/>'
+
+
+def put(folder: Path, content: str, name: str = "a.osm") -> Path:
+    path = folder / name
+    path.write_text(content, encoding="utf-8")
+    return path
+
+
+def osm_xml(inside: str) -> str:
+    return f'<?xml version="1.0" encoding="UTF-8"?><osm version="0.6">{inside}</osm>'
+
+
+def pbf_of(source: Path, path: Path, with_bounds: bool = True) -> Path:
+    """The same map as PBF, by osmium alone."""
+    objects = osmium.FileProcessor(source)
+    header = osmium.io.Header()
+    if with_bounds:
+        header.add_box(objects.header.box())
+    with osmium.SimpleWriter(osmium.io.File(path, "pbf"), header=header) as writer:
+        for o in objects:
+            writer.add(o)
+    return path
+
+
+# --- the same map -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["a.osm.pbf", "a.osm"])
+def test_pbf_gives_the_same_as_xml_whatever_its_name(tmp_path: Path, name: str) -> None:
+    path = pbf_of(SMALL, tmp_path / name)
+    assert osm.is_pbf(path) and not osm.is_pbf(SMALL)
+    assert osm.read(path) == osm.read(SMALL)
+
+
+@pytest.mark.parametrize("name", ["a.osm.gz", "a.osm.xml.gz", "a.osm"])
+def test_gzip_gives_the_same_whatever_its_name(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    path.write_bytes(gzip.compress(SMALL.read_bytes()))
+    assert osm.read(path) == osm.read(SMALL)
+
+
+def test_xml_written_from_pbf_gives_the_same(tmp_path: Path) -> None:
+    pbf, xml = pbf_of(SMALL, tmp_path / "a.osm.pbf"), put(tmp_path, "what is there is written over", "b.osm.xml")
+    osm.write_xml(pbf, xml)
+    assert xml.read_bytes().startswith(b"<?xml")
+    assert osm.read(xml) == osm.read(SMALL)
+
+
+def test_without_declared_bounds_those_of_the_nodes_hold(tmp_path: Path) -> None:
+    inside = '<node id="2" lat="51.1234567" lon="-9.7654321"/><node id="1" lat="52.5" lon="9"><tag k="a" v="b"/></node>'
+    for path in (xml := put(tmp_path, osm_xml(inside)), pbf_of(xml, tmp_path / "a.osm.pbf", with_bounds=False)):
+        extract = osm.read(path)
+        assert extract.nodes == {1: (52.5, 9.0), 2: (51.1234567, -9.7654321)}
+        assert extract.node_tags == {1: {"a": "b"}}
+        assert (extract.bounds, extract.declared) == (osm.Bounds(51.1234567, -9.7654321, 52.5, 9.0), False)
+
+
+def test_ways_and_relations_are_sorted_and_whole(tmp_path: Path) -> None:
+    inside = (
+        f'{NODE}<way id="9"><nd ref="1"/><nd ref="5"/></way><way id="-3"><nd ref="1"/><tag k="a" v="&lt;ü&gt;"/></way>'
+        '<relation id="8"/><relation id="7"><member type="way" ref="9" role="outer"/>'
+        '<member type="node" ref="1" role=""/><member type="relation" ref="8" role="x"/>'
+        '<tag k="type" v="multipolygon"/></relation>'
+    )
+    extract = osm.read(put(tmp_path, osm_xml(inside)))
+    assert list(extract.ways.values()) == [osm.Way(-3, (1,), {"a": "<ü>"}), osm.Way(9, (1, 5), {})]
+    members = (("way", 9, "outer"), ("node", 1, ""), ("relation", 8, "x"))
+    assert extract.relations == (osm.Relation(7, members, {"type": "multipolygon"}), osm.Relation(8, (), {}))
+
+
+@pytest.mark.parametrize("mark", ['action="delete"', 'visible="false"'])
+def test_what_is_deleted_does_not_count(tmp_path: Path, mark: str) -> None:
+    gone = (
+        f'<node id="2" {mark} lat="5" lon="6"><tag k="a" v="b"/></node><node id="3" {mark}/>'
+        f'<way id="1" {mark}><nd ref="1"/></way><way id="2"><nd ref="1"/></way>'
+        f'<relation id="2" {mark}/><relation id="1"/>'
+    )
+    extract = osm.read(put(tmp_path, osm_xml(NODE + gone)))
+    assert (list(extract.nodes), extract.node_tags, list(extract.ways)) == ([1], {}, [2])
+    assert [relation.id for relation in extract.relations] == [1]
+
+
+# --- no map -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (osm_xml(NODE).replace("<osm", '<!DOCTYPE osm [<!ENTITY a "b">]><osm'), "declares XML entities"),
+        (osm_xml(NODE).replace("<osm", '<!DOCTYPE osm [<!ENTITY a SYSTEM "file:///etc/passwd">]><osm'), "XML entities"),
+        (osm_xml(NODE).replace("</osm>", ""), "is not well-formed XML: no element found"),
+        ("<gpx/>", "its root is <gpx>; a file whose root is <osm>"),
+        (osm_xml(""), "holds no node"),
+        (osm_xml('<node id="1" lat="1" lon="2" action="delete"/>'), "holds no node"),
+        (osm_xml(NODE).replace(' version="0.6"', ""), "cannot be read as OpenStreetMap data .*version"),
+        (osm_xml('<node lat="1" lon="2"/>'), "<node> id: None; a whole number"),
+        (osm_xml('<node id="1.5" lat="1" lon="2"/>'), "<node> id: '1.5'; a whole number"),
+        (osm_xml('<node id="1" lat="90.1" lon="2"/>'), "node 1: lat: '90.1'; degrees from -90 to 90"),
+        (osm_xml('<node id="1" lat="1" lon="-180.1"/>'), "node 1: lon: '-180.1'; degrees from -180 to 180"),
+        (osm_xml('<node id="1" lat="1"/>'), "node 1: lon: None"),
+        (osm_xml('<node id="1" lat="1" lon="2 E"/>'), "node 1: lon: '2 E'"),
+        (osm_xml('<bounds minlat="0" minlon="0" maxlat="91" maxlon="9"/>' + NODE), "bounds: maxlat: '91'"),
+        (osm_xml(NODE + '<way id="4"><nd/></way>'), "way 4: ref: None; a whole number"),
+        (osm_xml(NODE + '<relation id="4"><member type="way" ref="x"/></relation>'), "relation 4: ref: 'x'"),
+        (
+            osm_xml(NODE + '<relation id="4"><member type="cat" ref="1" role=""/></relation>'),
+            "cannot be read as OpenStr",
+        ),
+    ],
+)
+def test_bad_xml_is_refused(tmp_path: Path, content: str, message: str) -> None:
+    path = put(tmp_path, content)
+    with pytest.raises(InputError, match=message) as caught:
+        osm.read(path)
+    assert str(caught.value).startswith(str(path)) and "\n" not in str(caught.value)
+
+
+def test_a_pbf_file_cut_anywhere_or_damaged_is_refused(tmp_path: Path) -> None:
+    path = pbf_of(SMALL, tmp_path / "a.osm.pbf")
+    whole = path.read_bytes()
+    damaged = bytearray(whole)
+    damaged[len(whole) // 2] ^= 255
+    for content in [*(whole[:end] for end in (20, 100, len(whole) // 2, len(whole) - 1)), bytes(damaged)]:
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=r"a\.osm\.pbf: cannot be read as OpenStreetMap data \(.*\); a whole file"):
+            osm.read(path)
+
+
+def test_a_pbf_file_with_a_node_beyond_the_pole_is_refused(tmp_path: Path) -> None:
+    path = pbf_of(put(tmp_path, osm_xml('<node id="6" lat="91" lon="2"/>')), tmp_path / "a.osm.pbf", with_bounds=False)
+    with pytest.raises(InputError, match=r"a\.osm\.pbf: node 6: has no position on the globe"):
+        osm.read(path)
+
+
+# --- values -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "metres"),
+    [
+        ("12", 12.0),
+        (" 12.5 m ", 12.5),
+        ("12m", 12.0),
+        ("12,5", 12.5),
+        ("40 ft", 12.192),
+        ("40'", 12.192),
+        ("40'6\"", 12.3444),
+        ("0", 0.0),
+        ("tall", None),
+        ("~12", None),
+        ("-3", None),
+        ("12;15", None),
+        ("1e3", None),
+        ("inf", None),
+        ("nan", None),
+        ("1000", None),
+        ("", None),
+    ],
+)
+def test_lengths(text: str, metres: float | None) -> None:
+    assert osm.length_m(text) == (None if metres is None else pytest.approx(metres))
