@@ -1,10 +1,14 @@
-"""A small scenario that needs no simulation, for tests that want every stage in a second."""
+"""What all tests share: a small scenario that needs no simulation, the command line, and which tests are `unit` tests.
+
+A test is `system` when it says so or stands in one of SYSTEM; all others may start no process, and are `unit` unless
+they are `slow`."""
 
 from __future__ import annotations
 
 import json
 import math
 import sys
+from collections.abc import Generator
 from pathlib import Path
 
 import pytest
@@ -51,6 +55,9 @@ gamma = 4
 
 SITES = "site,x_m,y_m,z_m\npole_a,10,12,3\npole_b,30.5,-12,3\n"
 
+SYSTEM = ("tests/effects/test_effects_traffic", "tests/importers/", "tests/runs/", "tests/studies/", "tests/traffic/")
+"""Where every test counts as `system`: SUMO runs there, or whole runs are made, interrupted and compared."""
+
 BUILDING = [[[14, 5], [18, 5], [18, 8], [14, 8], [14, 5]]]
 
 
@@ -72,6 +79,38 @@ def fcd() -> str:
         lines.append(f"{t:.2f};east;{t * 2 + 1:.6f};-2.0;90.0;car;2.0")
         lines.append(f"{t:.2f};west;{39 - t * 1.7:.6f};{2 + 0.5 * math.sin(t):.6f};{270 - 5 * math.cos(t):.6f};car;1.7")
     return "\n".join(lines) + "\n"
+
+
+@pytest.hookimpl(tryfirst=True)  # before -m chooses
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark tests `system` or `unit`."""
+    for item in items:
+        if item.nodeid.startswith(SYSTEM):
+            item.add_marker("system")
+        if not any(item.iter_markers("system")) and not any(item.iter_markers("slow")):
+            item.add_marker("unit")
+
+
+_test_without_processes = ""  # that runs now
+
+
+def _no_process(event: str, _: object) -> None:
+    if _test_without_processes and event in ("subprocess.Popen", "os.system", "os.posix_spawn", "os.fork"):
+        raise RuntimeError(f"{_test_without_processes} starts a process: mark it system")
+
+
+sys.addaudithook(_no_process)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """Remember a test that is not `system` while it is at work, so that it cannot start a process."""
+    global _test_without_processes
+    _test_without_processes = "" if item.get_closest_marker("system") else item.nodeid
+    try:
+        return (yield)
+    finally:
+        _test_without_processes = ""
 
 
 @pytest.fixture

@@ -526,6 +526,7 @@ print(sorted(name for name in sys.modules if name.startswith("pipeline.effects."
 """
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(
     ("settings", "expected"),
     [([], []), (ON["rain"], ["pipeline.effects.registry", "pipeline.effects.score", "pipeline.effects.score.rain"])],
@@ -541,6 +542,7 @@ def test_what_is_not_named_is_not_imported(
     assert run.stdout.strip() == repr(expected)
 
 
+@pytest.mark.system
 def test_a_whole_plain_run_imports_no_effect(mini: Path, tmp_path: Path) -> None:
     program = f"""
 import sys

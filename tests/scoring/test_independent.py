@@ -25,6 +25,8 @@ from pipeline.stages import scan, score, statics, tpog, traffic
 from pipeline.world.mesh import World, read_ply, write_ply
 from tests.oracles import cast
 
+pytestmark = pytest.mark.system  # SUMO makes the traffic
+
 SHORT = ("traffic.frames=60", "tpog.blocks=3", "traffic.frame_period_s=1")
 SITES = {"nishishinjuku": "c05", "ingolstadt": "k02"}
 ALSO = {"nishishinjuku": "c13", "ingolstadt": "k08"}
