@@ -11,7 +11,11 @@ import sys
 from collections.abc import Generator
 from pathlib import Path
 
+import hypothesis
 import pytest
+
+hypothesis.settings.register_profile("ci", derandomize=True, deadline=None)  # the same examples in every run
+hypothesis.settings.load_profile("ci")  # --hypothesis-profile=default draws others
 
 SCENARIO = """\
 seed = 7
