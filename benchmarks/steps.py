@@ -58,7 +58,8 @@ def main() -> None:
         worst = int(np.abs(part).argmax())
         ratio = seconds[step] / seconds[AGAINST_S]
         print(
-            f"{step} | {ratio:.2f} | {100 * part[worst]:+.1f} | {sites[worst]} | {t[worst]:+.1f} | {100 * part.mean():+.1f}"
+            f"{step} | {ratio:.2f} | {100 * part[worst]:+.1f} | {sites[worst]} | {t[worst]:+.1f}"
+            f" | {100 * part.mean():+.1f}"
         )
 
 

@@ -1,14 +1,21 @@
-"""A small scenario that needs no simulation, for tests that want every stage in a second."""
+"""What all tests share: a small scenario that needs no simulation, the command line, and which tests are `unit` tests.
+
+A test is `system` when it says so or stands in one of SYSTEM; all others may start no process, and are `unit` unless
+they are `slow`."""
 
 from __future__ import annotations
 
 import json
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
+import hypothesis
 import pytest
+
+hypothesis.settings.register_profile("ci", derandomize=True, deadline=None)  # the same examples in every run
+hypothesis.settings.load_profile("ci")  # --hypothesis-profile=default draws others
 
 SCENARIO = """\
 seed = 7
@@ -52,6 +59,9 @@ gamma = 4
 
 SITES = "site,x_m,y_m,z_m\npole_a,10,12,3\npole_b,30.5,-12,3\n"
 
+SYSTEM = ("tests/effects/test_effects_traffic", "tests/importers/", "tests/runs/", "tests/studies/", "tests/traffic/")
+"""Where every test counts as `system`: SUMO runs there, or whole runs are made, interrupted and compared."""
+
 BUILDING = [[[14, 5], [18, 5], [18, 8], [14, 8], [14, 5]]]
 
 
@@ -89,6 +99,38 @@ def store(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPa
     folder = tmp_path_factory.mktemp("store")
     monkeypatch.setenv("EGVS_STORE", str(folder))
     return folder
+
+
+@pytest.hookimpl(tryfirst=True)  # before -m chooses
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark tests `system` or `unit`."""
+    for item in items:
+        if item.nodeid.startswith(SYSTEM):
+            item.add_marker("system")
+        if not any(item.iter_markers("system")) and not any(item.iter_markers("slow")):
+            item.add_marker("unit")
+
+
+_test_without_processes = ""  # that runs now
+
+
+def _no_process(event: str, _: object) -> None:
+    if _test_without_processes and event in ("subprocess.Popen", "os.system", "os.posix_spawn", "os.fork"):
+        raise RuntimeError(f"{_test_without_processes} starts a process: mark it system")
+
+
+sys.addaudithook(_no_process)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """Remember a test that is not `system` while it is at work, so that it cannot start a process."""
+    global _test_without_processes
+    _test_without_processes = "" if item.get_closest_marker("system") else item.nodeid
+    try:
+        return (yield)
+    finally:
+        _test_without_processes = ""
 
 
 @pytest.fixture

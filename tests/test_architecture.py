@@ -1,113 +1,83 @@
-"""Do imports point one way, and does the package stay what it promises to be?
+"""Holds the package to what it promises of itself: imports, sizes, docstrings, and the names it offers.
 
-errors, grid, schemas, scenario -> kernels -> tables, statics, sensors -> stages -> workflow -> command line: no edge
-runs back, none runs from stage to stage, and heavy libraries are imported only where they are needed."""
+Which package may import which stands in ``pyproject.toml`` (import-linter); here stands what cannot be said there."""
 
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
+from importlinter.cli import lint_imports
+
+import pipeline
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "pipeline"
-STAGES = ("traffic", "statics", "tpog", "scan", "score", "report")
+MODULES = sorted(str(path.relative_to(PACKAGE)) for path in PACKAGE.rglob("*.py"))
+FOLDERS = sorted({str(Path(name).parent) for name in MODULES} - {"."})
 
-# Lower layers may not import higher ones; modules of one layer may import each other unless they are stages.
-LAYERS = (
-    ("errors",),
-    ("grid", "schemas", "checked"),
-    ("scenario", "tables", "cost"),
-    ("kernels", "safexml", "stage", "ordered"),
-    (
-        "sumo",
-        "network",
-        "world",
-        "sensors",
-        "sites",
-        "clouds",
-        "results",
-        "entropy",
-        "fcd",
-        "motion",
-        "demand",
-        "raycast",
-        "crossings",
-        "uncertainty",
-    ),
-    ("effects",),
-    ("osm_reader", "osm_footprints", "osm_junction", "simulation", "survey", "visibility", "figures"),
-    ("osm", *STAGES),
-    ("workflow",),
-    ("callings", "accuracy", "knobs", "pareto", "trials"),
-    ("show",),
-    ("cli",),
-    ("__init__",),
-)
-LAYER_OF = {name: level for level, names in enumerate(LAYERS) for name in names}
+MOST_LINES = 400
+MOST_MODULES = 12
 
 
-def modules() -> dict[str, Path]:
-    """Name -> file of every module; everything under kernels/ counts as "kernels", everything under effects/ as
-    "effects"."""
-    return {str(p.relative_to(PACKAGE).with_suffix("")): p for p in sorted(PACKAGE.rglob("*.py"))}
+def tree(name: str) -> ast.Module:
+    """The syntax of a module of the package."""
+    return ast.parse((PACKAGE / name).read_text(encoding="utf-8"))
 
 
-def imported(path: Path) -> set[str]:
-    """The pipeline modules that a file imports at any depth of its code, type checking included."""
+def imported(name: str) -> set[str]:
+    """All that a module imports, at any depth of its code: ``a.b`` for ``import a.b`` and for ``from a import b``."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(tree(name)):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
-            found.add(node.module)
-            found |= {f"{node.module}.{alias.name}" for alias in node.names}
-    names = {name.split(".")[1] for name in found if name.startswith("pipeline.")}
-    return {name for name in names if name in LAYER_OF}
-
-
-def top(name: str) -> str:
-    return name.split("/")[0] if "/" in name else name
-
-
-def test_every_module_has_a_layer() -> None:
-    assert {top(name) for name in modules()} == set(LAYER_OF)
-
-
-@pytest.mark.parametrize("name", [name for name in modules() if name != "__init__"])
-def test_imports_point_one_way(name: str) -> None:
-    mine = top(name)
-    for other in imported(modules()[name]) - {mine}:
-        assert LAYER_OF[other] <= LAYER_OF[mine], f"{name} imports {other}, which stands above it"
-        assert not (mine in STAGES and other in STAGES), f"stage {name} imports stage {other}"
-
-
-def importers_of(library: str) -> set[str]:
-    found = set()
-    for name, path in modules().items():
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
-            if isinstance(node, ast.ImportFrom) and node.module:
-                names = [node.module]
-            if any(n == library or n.startswith(library + ".") for n in names):
-                found.add(name)
+            found |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
     return found
-
-
-def test_one_module_imports_sumo_and_one_reads_schemas_and_one_parquet() -> None:
-    assert importers_of("traci") | importers_of("sumolib") | importers_of("libsumo") == {"sumo"}
-    assert importers_of("pyarrow.parquet") <= {"tables", "fcd"}  # fcd reads what SUMO wrote
-    texts = {name for name, path in modules().items() if "data_schemas" in path.read_text(encoding="utf-8")}
-    assert texts - {"scenario"} == {"schemas"}  # scenario only mentions the folder
 
 
 def run_python(code: str) -> str:
     return subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True).stdout
 
 
+# ---- what imports what
+
+
+def test_the_contracts_on_imports_hold(capsys: pytest.CaptureFixture[str]) -> None:
+    broken = lint_imports(config_filename=str(ROOT / "pyproject.toml"), no_cache=True)
+    assert not broken, capsys.readouterr().out
+
+
+def test_no_import_hides_in_a_string() -> None:
+    """What is imported by name is seen by no contract; only plug-ins and the package's own names are."""
+    hidden = {
+        name
+        for name in MODULES
+        for node in ast.walk(tree(name))
+        if (isinstance(node, ast.Attribute) and node.attr == "import_module")
+        or (isinstance(node, ast.Name) and node.id in ("__import__", "import_module"))
+    }
+    assert hidden <= {"__init__.py", "core/plugins.py"}
+
+
+def test_one_package_reads_parquet_and_one_module_the_schemas() -> None:
+    readers = {name for name in MODULES if "pyarrow.parquet" in imported(name)}
+    assert readers <= {"artefacts/tables.py", "traffic/fcd.py"}  # the latter reads what SUMO wrote
+    named = {
+        name
+        for name in MODULES
+        for node in ast.walk(tree(name))
+        if isinstance(node, ast.Constant) and node.value == "data_schemas"
+    }
+    assert named == {"artefacts/schemas.py"}
+
+
+@pytest.mark.system
 @pytest.mark.parametrize("module", ["pipeline", "pipeline.cli.app"])
 def test_nothing_heavy_is_imported_for_help(module: str) -> None:
     heavy = "numpy numba pyarrow pydantic shapely trimesh matplotlib embreex scipy rich.table traci sumolib"
@@ -115,9 +85,42 @@ def test_nothing_heavy_is_imported_for_help(module: str) -> None:
     assert run_python(code).strip() == "[]"
 
 
-def test_every_module_opens_with_the_question_that_it_answers() -> None:
-    for name, path in modules().items():
-        doc = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
-        assert doc, f"{name} has no docstring"
-        if name not in ("__init__", "kernels/__init__", "errors", "cli"):
-            assert "?" in doc.split("\n\n")[0], f"{name} opens with no question"
+# ---- how large it is, and how it explains itself
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_a_module_is_short(name: str) -> None:
+    assert len((PACKAGE / name).read_text(encoding="utf-8").splitlines()) <= MOST_LINES
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_a_module_opens_with_a_plain_sentence(name: str) -> None:
+    opening = re.match(r".+?[.:?!](?=\s|$)", ast.get_docstring(tree(name)) or "", re.DOTALL)
+    assert opening, "no docstring, or none that opens with a sentence"
+    assert opening[0][-1] in ".:", f"no plain sentence: {opening[0]}"
+    assert "\n\n" not in opening[0], f"no end before the first paragraph's: {opening[0]}"
+
+
+def test_packages_are_small_and_whole() -> None:
+    count = Counter(str(Path(name).parent) for name in MODULES if not name.endswith("__init__.py"))
+    assert {folder: n for folder, n in count.items() if n > MOST_MODULES} == {}
+    assert [folder for folder in FOLDERS if f"{folder}/__init__.py" not in MODULES] == []
+
+
+# ---- what it offers
+
+
+def test_dir_shows_what_the_package_offers() -> None:
+    assert dir(pipeline) == sorted(pipeline.__all__)
+    assert len(set(pipeline.__all__)) == len(pipeline.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = pipeline.nothing
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("name", sorted(set(pipeline.__all__) - {"__version__"}))
+def test_each_name_can_be_imported_first_and_says_what_it_is(name: str) -> None:
+    code = f"import inspect, pipeline; from pipeline import {name}; assert pipeline.{name} is {name}"
+    kind, said = run_python(f"{code}; print(inspect.isclass({name})); print(inspect.getdoc({name}))").split("\n", 1)
+    assert said.strip() not in ("", "None")
+    assert kind == str(name[0].isupper())

@@ -300,11 +300,12 @@ def shipped(name, scale):
             broken + found[2] + found[3],
         )
     return [
-        Row(f"beams of {name}", RULE, f"sorted cuts with a margin; {asked} by fractions", total, excluded, mismatches, "-"),
+        Row(f"beams of {name}", RULE, f"sorted cuts with a margin; {asked} by fractions", total, excluded, mismatches,
+            "-"),
         Row(f"beams of {name}, chords add up", "to 1e-12 of the segment, no voxel twice", "march.audit", total, 0,
             broken + (worst_sum > 1e-12), f"{worst_sum:.1e} of the segment; longest gap {longest_gap:.1e} m"),
-        Row(f"beams of {name}, ends moved by 1e-9 m", "no voxel may turn", "chords in voxels 1e-9 m larger and smaller", total,
-            in_plane + others, 0, f"{in_plane} beams exactly in a plane, {others} others"),
+        Row(f"beams of {name}, ends moved by 1e-9 m", "no voxel may turn", "chords in voxels 1e-9 m larger and smaller",
+            total, in_plane + others, 0, f"{in_plane} beams exactly in a plane, {others} others"),
     ]  # fmt: skip
 
 

@@ -55,6 +55,7 @@ def test_fine_samples_miss_no_voxel_that_a_beam_crosses_at_length() -> None:
     assert shares[1] < 0.01 < shares[0]
 
 
+@pytest.mark.slow
 def test_a_box_off_the_faces_occupies_the_same_by_all_ways() -> None:
     grid = Grid((0.0, 0.0, 0.0), 0.5, (12, 6, 4))
     box = np.array(

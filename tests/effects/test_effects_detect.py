@@ -258,7 +258,8 @@ def test_incidence_by_hand(one_beam: tuple[Path, Path]) -> None:
     """cos 60 deg = 1/2, and another factor of 1/2 in reflectivity: again 20 m."""
     found = along(
         one_beam,
-        "effects.range_limit={rated_range_m = 40, rated_reflectivity = 0.8, reflectivity = 0.4, incidence_deg = 60, softness = 0}",
+        "effects.range_limit={rated_range_m = 40, rated_reflectivity = 0.8, reflectivity = 0.4, incidence_deg = 60,"
+        " softness = 0}",
     )
     np.testing.assert_array_equal(found, [1.0] * 20 + [0.0] * 60)
 
@@ -425,8 +426,11 @@ def test_idle_says_why(done: tuple[Path, Path]) -> None:
     assert made("dropout", share=0).idle(here) == "share is 0"
     assert made("range_limit", softness=0, rated_range_m=300).idle(here) == "every beam ends before the limit"
     for name, parameters in {
-        "rain": {"rate_mm_h": 1}, "dropout": {"share": 0.1}, "fog": {"visibility_m": 1e4}, "range_limit": {"rated_range_m": 300},
-    }.items():  # fmt: skip
+        "rain": {"rate_mm_h": 1},
+        "dropout": {"share": 0.1},
+        "fog": {"visibility_m": 1e4},
+        "range_limit": {"rated_range_m": 300},
+    }.items():
         assert made(name, **parameters).idle(here) is None
     assert made("range_limit", softness=0, rated_range_m=30).idle(here) is None
     with pytest.raises(InputError, match="sensor small: no rated_range_m"):
@@ -526,6 +530,7 @@ print(sorted(name for name in sys.modules if name.startswith("pipeline.effects."
 """
 
 
+@pytest.mark.system
 @pytest.mark.parametrize(
     ("settings", "expected"),
     [([], []), (ON["rain"], ["pipeline.effects.registry", "pipeline.effects.score", "pipeline.effects.score.rain"])],
@@ -541,6 +546,7 @@ def test_what_is_not_named_is_not_imported(
     assert run.stdout.strip() == repr(expected)
 
 
+@pytest.mark.system
 def test_a_whole_plain_run_imports_no_effect(mini: Path, tmp_path: Path) -> None:
     program = f"""
 import sys

@@ -155,6 +155,7 @@ where_m = st.one_of(
 any_box = st.tuples(where_m, where_m, where_m, angle, slope, size_m, size_m, size_m)
 
 
+@pytest.mark.slow
 @often
 @given(any_box)
 def test_any_box_like_50_digits(box):
@@ -436,6 +437,7 @@ def real(tmp_path_factory):
 NUDGES = [sign * 1e-9 * np.eye(8)[axis] for axis in range(3) for sign in (-1, 1)]
 
 
+@pytest.mark.system
 def test_moving_real_boxes_by_a_nanometre_changes_no_count(real):
     frame, values, grid = real
     before = count(frame, values, grid, 200)
@@ -463,6 +465,7 @@ def counted_by(kernels, frame, values, shape, voxel_m):
     return np.cumsum(steps, axis=0)[:-1].transpose(1, 2, 0)
 
 
+@pytest.mark.system
 def test_the_touching_rule_fails_where_the_0_1_mm_rule_holds(real):
     frame, values, grid = real
     few = (frame < 3) & tpog._in_reach(values, grid)

@@ -339,6 +339,7 @@ def test_a_scene_400_km_away_is_the_same(start, beam):
     assert np.array_equal(here[1], there[1])
 
 
+@pytest.mark.slow
 def test_from_1e7_m_near_corners_of_a_long_grid():
     """Corner cuts of about 1 micrometre, 1e7 m from the start and behind hundreds of planes: an accumulated t is lost
     here."""
@@ -401,6 +402,7 @@ def test_the_audit_is_quiet_on_good_beams():
     assert (misplaced, doubled) == (0, 0)
 
 
+@pytest.mark.slow
 @seldom
 @given(st.lists(segments().filter(lambda s: s[2] == 0.25 and max(map(abs, s[0])) < 1e6), min_size=1, max_size=5))
 def test_the_audit_is_quiet_on_hostile_beams(found):
@@ -490,6 +492,7 @@ def test_a_fault_in_the_march_shows_in_the_corpus(fault):
 # --- the long hunt, in short ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_hunt_finds_nothing():
     rows = hunt.rows(1e-4)
     assert [row.case for row in rows if row.mismatches] == []

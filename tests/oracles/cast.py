@@ -1,10 +1,13 @@
-"""What does a ray meet first, and which voxels does a segment cross - slowly, obviously, in float64?
+"""Finds what a ray meets first, and which voxels a segment crosses: slowly, obviously, in float64.
 
 Shares no code with the pipeline. Rays: each is held against every triangle (Moeller and Trumbore 1997, "Fast, Minimum
 Storage Ray/Triangle Intersection"), then against the rules that the pipeline documents: a plane seen at a sine below
 1e-9 or within 1 micrometre of the start is not met, and a point up to 1 micrometre outside a triangle is on it.
+:func:`allowed` judges one ray in rational arithmetic.
 Segments: all crossings with the planes of the grid are collected and sorted; the middle of each piece tells the voxel.
 """
+
+from fractions import Fraction
 
 import numba
 import numpy as np
@@ -12,6 +15,9 @@ import numpy as np
 EDGE_M = 1e-6
 GRAZE = 1e-9
 CHORD_M = 1e-6
+ROUNDING = 4 * 2.0**-53
+"""Of a cross product in float64, relative to the product of the lengths: two roundings of each product, one of each
+side, one of the difference."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -87,6 +93,65 @@ def differ(found, true, tolerance_m=1e-9):
     with np.errstate(invalid="ignore"):
         close = np.abs(found - true) <= tolerance_m * (1.0 + np.abs(true))
     return ~((found == true) | close)
+
+
+def _minus(a, b):
+    return [x - y for x, y in zip(a, b, strict=True)]
+
+
+def _dot(a, b):
+    return sum(x * y for x, y in zip(a, b, strict=True))
+
+
+def _cross(a, b):
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+
+def _outside_m(p, triangle, normal):
+    """How far a point of a triangle's plane lies from the triangle; all in rational numbers but the root."""
+    pairs = [(triangle[i], triangle[(i + 1) % 3]) for i in range(3)]
+    if all(_dot(_cross(normal, _minus(b, a)), _minus(p, a)) >= 0 for a, b in pairs):
+        return 0.0
+    squares = []
+    for a, b in pairs:
+        side = _minus(b, a)
+        s = min(max(_dot(_minus(p, a), side) / _dot(side, side), Fraction(0)), Fraction(1))
+        off = [x - y - s * z for x, y, z in zip(p, a, side, strict=True)]
+        squares.append(_dot(off, off))
+    return float(min(squares)) ** 0.5
+
+
+def allowed(found, o, d, corners):
+    """Whether a ray's range (infinity: nothing met) is one that the rules allow, in rational arithmetic.
+
+    Float64 knows the normal of a triangle of size L and height h to ROUNDING * L / h radians: seen at sine s, the hit
+    on it moves along the ray by ROUNDING * L**2 / (h s). A triangle that is met wherever its plane lies within that
+    must be met; a range must be that of a triangle that is met for one such plane.
+
+    ``o``, ``d`` (3,), ``corners`` (m, 3, 3).
+    """
+    low, high = corners.min(axis=1) - 1e-3, corners.max(axis=1) + 1e-3
+    with np.errstate(divide="ignore", invalid="ignore"):
+        a, b = (low - o) / d, (high - o) / d
+    near = np.fmin(a, b).max(axis=1) <= np.fmax(a, b).min(axis=1)
+    start, way = [Fraction(float(x)) for x in o], [Fraction(float(x)) for x in d]
+    latest, of_some = np.inf, bool(np.isinf(found))
+    for corner in corners[near]:
+        triangle = [[Fraction(float(x)) for x in point] for point in corner]
+        normal = _cross(_minus(triangle[1], triangle[0]), _minus(triangle[2], triangle[0]))
+        facing = _dot(normal, way)
+        if facing == 0:
+            continue
+        exact = _dot(normal, _minus(triangle[0], start)) / facing
+        outside = _outside_m([x + exact * y for x, y in zip(start, way, strict=True)], triangle, normal)
+        t, area2 = float(exact), float(_dot(normal, normal)) ** 0.5
+        size = max(np.linalg.norm(corner - np.roll(corner, 1, axis=0), axis=1))
+        sine = abs(float(facing)) / area2
+        moved = (ROUNDING * size**3 / area2 + ROUNDING * (np.abs(corner).max() + np.abs(o).max())) / sine
+        of_some |= t > 0.0 and outside <= EDGE_M + moved and abs(found - t) <= moved
+        if sine > 2 * GRAZE and t * sine > 2 * EDGE_M and outside <= EDGE_M - moved:
+            latest = min(latest, t + moved)
+    return of_some and found <= latest
 
 
 def crossed(start, way, origin, voxel, shape):

@@ -83,6 +83,7 @@ def true_score(counts, frames, hits, gamma):
 GAMMAS = st.one_of(st.sampled_from([0.0, 0.1, 1.0, 2.5, 10.0, 1e-300, 1e9, inf]), st.floats(0, 1e12))
 
 
+@pytest.mark.slow
 @settings(derandomize=True, max_examples=200, deadline=None)
 @given(st.data(), st.sampled_from([1, 2, 7, 5000, LARGEST]), GAMMAS)
 def test_score_is_the_exact_sum_rounded_once(data, frames, gamma):

@@ -25,6 +25,8 @@ from pipeline.stages import scan, score, statics, tpog, traffic
 from pipeline.world.mesh import World, read_ply, write_ply
 from tests.oracles import cast
 
+pytestmark = pytest.mark.system  # SUMO makes the traffic
+
 SHORT = ("traffic.frames=60", "tpog.blocks=3", "traffic.frame_period_s=1")
 SITES = {"nishishinjuku": "c05", "ingolstadt": "k02"}
 ALSO = {"nishishinjuku": "c13", "ingolstadt": "k08"}
@@ -32,9 +34,10 @@ ALSO = {"nishishinjuku": "c13", "ingolstadt": "k08"}
 
 # Velodyne VLP-32C User Manual, 63-9325: elevation and azimuth offset of each laser, in firing order.
 LASERS = """
--25 1.4, -1 -4.2, -1.667 1.4, -15.639 -1.4, -11.31 1.4, 0 -1.4, -0.667 4.2, -8.843 -1.4, -7.254 1.4, 0.333 -4.2, -0.333 1.4,
--6.148 -1.4, -5.333 4.2, 1.333 -1.4, 0.667 4.2, -4 -1.4, -4.667 1.4, 1.667 -4.2, 1 1.4, -3.667 -4.2, -3.333 4.2, 3.333 -1.4,
-2.333 1.4, -2.667 -1.4, -3 1.4, 7 -1.4, 4.667 1.4, -2.333 -4.2, -2 4.2, 15 -1.4, 10.333 1.4, -1.333 -1.4"""
+-25 1.4, -1 -4.2, -1.667 1.4, -15.639 -1.4, -11.31 1.4, 0 -1.4, -0.667 4.2, -8.843 -1.4, -7.254 1.4, 0.333 -4.2,
+-0.333 1.4, -6.148 -1.4, -5.333 4.2, 1.333 -1.4, 0.667 4.2, -4 -1.4, -4.667 1.4, 1.667 -4.2, 1 1.4, -3.667 -4.2,
+-3.333 4.2, 3.333 -1.4, 2.333 1.4, -2.667 -1.4, -3 1.4, 7 -1.4, 4.667 1.4, -2.333 -4.2, -2 4.2, 15 -1.4, 10.333 1.4,
+-1.333 -1.4"""
 RANGE_M = 200.0
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from pipeline.core.errors import InputError
@@ -276,6 +276,7 @@ def test_lattice_scenes_agree_with_brute_force(corners, start):
 
 
 @settings(derandomize=True, max_examples=40, deadline=None)
+@example(seed=0, thin=-7.0, size=14.0)  # beam 136 aims at a needle 0.17 micrometres high; float64 places it 4 um off
 @given(seed=st.integers(0, 2**32 - 1), thin=st.floats(-8, 0), size=st.floats(0.01, 40))
 def test_random_scenes_agree_with_brute_force(seed, thin, size):
     """Triangles of any size and thinness; rays aimed at corners, sides, faces, and anywhere."""
@@ -292,10 +293,21 @@ def test_random_scenes_agree_with_brute_force(seed, thin, size):
         (scene * weights).sum(axis=1),
         rng.random((100, 3)) * 100,
     ]
-    found, true = cast_both(scene, o, towards(o, np.concatenate(targets)))
-    # A needle's plane is known no better than its height allows: two ways to compute where a ray meets it differ by
-    # micrometres.
-    assert not cast.differ(found, true, 1e-5).any()
+    d = towards(o, np.concatenate(targets))
+    found, true = cast_both(scene, o, d)
+    # A needle's plane is known no better than its height allows: where two ways to compute differ, exact arithmetic
+    # tells what may come out.
+    assert all(cast.allowed(found[ray], o, d[ray], scene) for ray in np.flatnonzero(cast.differ(found, true)))
+
+
+@pytest.mark.xfail(strict=True, reason="seen along its length, a lone spike's fins end before float32's rounding does")
+def test_the_far_tip_of_a_spike_seen_along_its_length():
+    """A lone triangle 40 m long and 6 cm high, 87 m away, at 2.5 degrees; the beam is aimed at its very tip."""
+    spike = np.array([[[50.0, 50.0, 5.0], [16.58, 45.34, -16.48], [18.29, 45.63, -15.48]]])
+    o = np.array([-21.11, 41.95, -44.47])
+    found, true = cast_both(spike, o, towards(o, spike[0, :1]))
+    assert np.isfinite(true).all()
+    assert not cast.differ(found, true).any()
 
 
 @pytest.mark.parametrize("degrees", range(1, 90, 8))

@@ -1,0 +1,165 @@
+"""Candidate sites from GeoJSON and along lines: where they stand, what they are called, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import pipeline
+from pipeline.core.errors import InputError
+from pipeline.sensing import sites
+from tests.conftest import collection, feature
+
+
+def point(*coordinates: float, **properties: object) -> dict[str, Any]:
+    return feature({"type": "Point", "coordinates": coordinates}, **properties)
+
+
+def of_geojson(mini: Path, text: str, name: str = "sites.geojson") -> tuple[sites.Site, ...]:
+    (mini / name).write_text(text, encoding="utf-8")
+    return sites.of(pipeline.load(mini, [f'sites.file="{name}"']))
+
+
+def of_lines(mini: Path, *rules: dict[str, Any]) -> tuple[sites.Site, ...]:
+    tables = "".join(
+        f"[[sites.along]]\nline_m = {rule['line']}\nspacing_m = {rule['spacing']}\nheights_m = {rule['heights']}\n"
+        for rule in rules
+    )
+    path = mini / "scenario.toml"
+    path.write_text(path.read_text().replace('file = "sites.csv"\n', "yaw_deg = 15\n") + tables)
+    return sites.of(pipeline.load(mini))
+
+
+def places(found: tuple[sites.Site, ...]) -> list[tuple[str, float, float, float]]:
+    return [(site.site, *site.position_m) for site in found]
+
+
+# --- GeoJSON ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["sites.geojson", "sites.json", "SITES.GeoJSON"])
+def test_geojson_says_the_same_as_csv(mini: Path, name: str) -> None:
+    by_csv = sites.of(pipeline.load(mini))
+    text = collection(point(10, 12, 3, name="pole_a"), point(30.5, -12, 3, name="pole_b"))
+    assert of_geojson(mini, text, name) == by_csv
+    assert places(by_csv) == [("pole_a", 10, 12, 3), ("pole_b", 30.5, -12, 3)]
+
+
+def test_properties_of_a_feature_are_its_pose_sensor_and_scan(mini: Path) -> None:
+    own = {"yaw_deg": 90, "pitch_deg": -7.5, "roll_deg": 1, "sensor": "VLP-16", "points": "measured.ply"}
+    first, second = of_geojson(
+        mini, collection(point(0, 1, 2, name="a", **own), point(3, 4, 5, name="b", yaw_deg=None))
+    )
+    assert first == sites.Site("a", 0, 1, 2, 90, -7.5, 1, "VLP-16", "measured.ply")
+    assert second == sites.Site("b", 3, 4, 5, 0, 0, 0, "small", None)
+
+
+def test_a_run_from_geojson_scores_what_a_run_from_csv_does(mini: Path, tmp_path: Path) -> None:
+    settings = ["score.standard_error=false"]
+    pipeline.run(pipeline.load(mini, settings), tmp_path / "csv")
+    text = collection(point(10, 12, 3, name="pole_a"), point(30.5, -12, 3, name="pole_b"))
+    (mini / "sites.geojson").write_text(text)
+    pipeline.run(pipeline.load(mini, [*settings, 'sites.file="sites.geojson"']), tmp_path / "geojson")
+    by_csv, by_geojson = (pipeline.read_scores(tmp_path / way / "scores.parquet") for way in ("csv", "geojson"))
+    assert by_csv.num_rows == 2
+    assert by_geojson.equals(by_csv)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "cannot be read as GeoJSON"),
+        ("[1, 2]", "cannot be read as GeoJSON"),
+        ('{"type": "Point"}', "cannot be read as GeoJSON .*features"),
+        pytest.param("[" * 100_000, "cannot be read as GeoJSON", id="deep"),
+        (collection(), "holds no site"),
+        (collection({"type": "Feature", "geometry": None}), "cannot be read as GeoJSON"),
+        (
+            collection(feature({"type": "LineString", "coordinates": [[0, 0, 3], [1, 1, 3]]}, name="a")),
+            "feature 0.*is a LineString.*a Point",
+        ),
+        (collection(point(0, 0, 3, name="a"), point(0, 0, name="b")), "feature 1.*z_m is missing"),
+        (collection(point(0, 0, 3)), "feature 0.*site is missing"),
+        (collection(point(0, 0, 3, name="")), "feature 0.*site is missing"),
+        (collection(point(0, 0, 3, name="a/b")), "feature 0: site.*'a/b'"),
+        (collection(point(0, 0, 3, name="a"), point(1, 0, 3, name="a")), "feature 1.*'a' stands there twice"),
+        (collection(point(0, 0, 3, name="a", colour="red")), "unknown column 'colour'"),
+        (collection(point(0, 0, 3, name="a", pitch_deg=91)), "feature 0: pitch_deg.*91"),
+        (collection(point(0, 0, 3, name="a", yaw_deg="north")), "feature 0: yaw_deg.*'north'"),
+        (collection(point(0, 0, math.nan, name="a")), "feature 0: z_m.*nan"),
+        (
+            json.dumps({"features": [feature({"type": "Point", "coordinates": ["x", 0, 3]}, name="a")]}),
+            "feature 0: x_m.*'x'",
+        ),
+    ],
+)
+def test_what_is_wrong_with_geojson_is_said(mini: Path, text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        of_geojson(mini, text)
+
+
+def test_geojson_that_is_no_utf8_is_refused(mini: Path) -> None:
+    (mini / "sites.geojson").write_bytes(b'{"features": "\xff"}')
+    with pytest.raises(InputError, match="cannot be read as GeoJSON"):
+        sites.of(pipeline.load(mini, ['sites.file="sites.geojson"']))
+
+
+# --- along lines ------------------------------------------------------------------------------------------------------
+
+
+def test_sites_stand_along_a_line_and_round_its_corner(mini: Path) -> None:
+    """25 m east, then north: the distance of 10 m is counted round the corner."""
+    found = of_lines(mini, {"line": [[0, 5], [25, 5], [25, 20]], "spacing": 10, "heights": [4]})
+    assert places(found) == [
+        ("a01", 0, 5, 4),
+        ("a02", 10, 5, 4),
+        ("a03", 20, 5, 4),
+        ("a04", 25, 10, 4),
+        ("a05", 25, 20, 4),
+    ]
+    assert {(site.yaw_deg, site.pitch_deg, site.sensor, site.points) for site in found} == {(15, 0, "small", None)}
+
+
+def test_each_place_has_all_heights_and_names_go_on_from_line_to_line(mini: Path) -> None:
+    found = of_lines(
+        mini,
+        {"line": [[0, 0], [0, -3.5]], "spacing": 2, "heights": [3, 5]},
+        {"line": [[7, 7], [8, 7]], "spacing": 2, "heights": [6]},
+    )
+    assert places(found) == [("a01", 0, 0, 3), ("a02", 0, 0, 5), ("a03", 0, -2, 3), ("a04", 0, -2, 5), ("a05", 7, 7, 6)]
+
+
+def test_the_end_of_a_line_has_a_site_though_tenths_do_not_add_up(mini: Path) -> None:
+    found = of_lines(mini, {"line": [[0, 0], [0.3, 0], [0.7, 0]], "spacing": 0.1, "heights": [3]})
+    assert len(found) == 8
+    assert found[-1].x_m == pytest.approx(0.7, abs=1e-12)
+
+
+def test_many_sites_have_names_of_one_length(mini: Path) -> None:
+    found = of_lines(mini, {"line": [[0, 0], [120, 0]], "spacing": 1, "heights": [3]})
+    assert [found[i].site for i in (0, 9, 120)] == ["a001", "a010", "a121"]
+
+
+@pytest.mark.parametrize(
+    ("rule", "message"),
+    [
+        ({"line": [[0, 0]], "spacing": 1, "heights": [3]}, r"line_m"),
+        ({"line": [[0, 0], [1, 0]], "spacing": 0, "heights": [3]}, "spacing_m"),
+        ({"line": [[0, 0], [1, 0]], "spacing": 1, "heights": []}, "heights_m"),
+        ({"line": [[0, 0], [1, 0, 2]], "spacing": 1, "heights": [3]}, "line_m"),
+    ],
+)
+def test_senseless_lines_are_refused(mini: Path, rule: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        of_lines(mini, rule)
+
+
+def test_a_line_beside_a_file_is_refused(mini: Path) -> None:
+    path = mini / "scenario.toml"
+    path.write_text(path.read_text() + "[[sites.along]]\nline_m = [[0, 0], [1, 0]]\nspacing_m = 1\nheights_m = [3]\n")
+    with pytest.raises(InputError, match="exactly one of file, grid and along is needed, found file and along"):
+        pipeline.load(mini)
