@@ -297,11 +297,9 @@ class _Reading:
                 self.location = Location(element.get("projParameter", ""), offset_m)
 
     def _take_edge(self, element: Element) -> None:
-        function, of = element.get("function", ""), element.get
-        edge = Edge(
-            element.attrib["id"], function, of("from", ""), of("to", ""), of("name", ""),
-            tuple(self._lane(lane.attrib) for lane in element.iter("lane")),
-        )  # fmt: skip
+        function, start, end, name = (element.get(key, "") for key in ("function", "from", "to", "name"))
+        lanes = tuple(self._lane(lane.attrib) for lane in element.iter("lane"))
+        edge = Edge(element.attrib["id"], function, start, end, name, lanes)
         self.edges.append(edge)
         if not function:
             if not edge.from_node or not edge.to_node:
@@ -353,15 +351,11 @@ class _Reading:
                 source, target = (self.index.get(connection[key]) for key in ("from", "to"))
                 lanes = int(connection["fromLane"]), int(connection["toLane"])
             except (KeyError, ValueError) as error:
-                raise InputError(
-                    self.path, f"a <connection> from {start!r} is damaged ({error!r})", _RIGHT
-                ) from None
+                raise InputError(self.path, f"a <connection> from {start!r} is damaged ({error!r})", _RIGHT) from None
             if source is None or target is None:
                 continue  # to or from a walking area or a crossing
             if lanes[0] >= len(self.roads[source].lanes) or lanes[1] >= len(self.roads[target].lanes):
-                raise InputError(
-                    self.path, f"a <connection> from {start!r} names a lane that is not there", _RIGHT
-                )
+                raise InputError(self.path, f"a <connection> from {start!r} names a lane that is not there", _RIGHT)
             turnaround = connection.get("dir") in _TURNAROUNDS
             yield Connection(source, lanes[0], target, lanes[1], turnaround, Permission.of(connection))
 

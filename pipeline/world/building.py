@@ -67,9 +67,7 @@ def build(
     """
     model, builder = scenario.statics, _Builder()
     read = [read_geojson(scenario.find(name, "statics.footprints")) for name in model.footprints]
-    read += [
-        read_poly_xml(scenario.find(name, "statics.polygons"), model.polygon_height_m) for name in model.polygons
-    ]
+    read += [read_poly_xml(scenario.find(name, "statics.polygons"), model.polygon_height_m) for name in model.polygons]
     for file in read:
         builder.mended.update(file.mended)
         builder.left_out.update(file.left_out)
@@ -176,9 +174,7 @@ def _plane(builder: _Builder, scenario: Scenario) -> tuple[NDArray[np.float64], 
     return vertices, np.array([[0, 1, 2], [0, 2, 3]])
 
 
-def _extent_m(
-    scenario: Scenario, footprints: Sequence[Footprint]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _extent_m(scenario: Scenario, footprints: Sequence[Footprint]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """South-west and north-east corner (2,) of the ground: well beyond the region of interest and all footprints."""
     box = scenario.roi.box
     corners = np.array([box.origin_m, np.add(box.origin_m, box.size_m)])[:, :2]
