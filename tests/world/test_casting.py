@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from pipeline.core.errors import InputError
@@ -277,6 +277,7 @@ def test_lattice_scenes_agree_with_brute_force(corners, start):
 
 @settings(derandomize=True, max_examples=40, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), thin=st.floats(-8, 0), size=st.floats(0.01, 40))
+@example(seed=0, thin=-7.0, size=14.0)
 def test_random_scenes_agree_with_brute_force(seed, thin, size):
     """Triangles of any size and thinness; rays aimed at corners, sides, faces, and anywhere."""
     rng = np.random.default_rng(seed)
@@ -292,10 +293,15 @@ def test_random_scenes_agree_with_brute_force(seed, thin, size):
         (scene * weights).sum(axis=1),
         rng.random((100, 3)) * 100,
     ]
-    found, true = cast_both(scene, o, towards(o, np.concatenate(targets)))
+    points = np.concatenate(targets)
+    found, true = cast_both(scene, o, towards(o, points))
     # A needle's plane is known no better than its height allows: two ways to compute where a ray meets it differ by
-    # micrometres.
-    assert not cast.differ(found, true, 1e-5).any()
+    # micrometres. Whether a ray aimed at a corner or a side meets it is up to the last bit of its direction; if it is
+    # met, then where it is.
+    at_rim = np.arange(len(points)) < len(scene) * 4
+    aimed_m = np.linalg.norm(points - o, axis=1)
+    met_there = at_rim & (found < true) & ~cast.differ(found, aimed_m, 1e-5)
+    assert not (cast.differ(found, true, 1e-5) & ~met_there).any()
 
 
 @pytest.mark.parametrize("degrees", range(1, 90, 8))
