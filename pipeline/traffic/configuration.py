@@ -112,37 +112,37 @@ class Sources:
         return list(dict.fromkeys(path for paths in self.files.values() for path in paths))
 
 
-def place(scenario: Scenario) -> str:
+def place_of(scenario: Scenario) -> str:
     """Where messages about the traffic point to."""
     return f"{scenario.file}: traffic"
 
 
-def milliseconds(value_s: float, where: str) -> int:
+def milliseconds(value_s: float, place: str) -> int:
     """Seconds as whole milliseconds."""
     exact = value_s * 1000.0
     if abs(exact - round(exact)) > 1e-6 * max(1.0, exact):
-        raise InputError(f"{where} = {value_s:g}", "is no whole number of milliseconds", "SUMO counts in milliseconds")
+        raise InputError(f"{place} = {value_s:g}", "is no whole number of milliseconds", "SUMO counts in milliseconds")
     return round(exact)
 
 
-def timing(traffic: TrafficModel, begin_s: float, where: str) -> Timing:
+def timing(traffic: TrafficModel, begin_s: float, place: str) -> Timing:
     """Check that period and warm-up are whole numbers of steps (SUMO itself only warns, and records the wrong
     times)."""
-    step = milliseconds(traffic.step_s, f"{where}.step_s")
+    step = milliseconds(traffic.step_s, f"{place}.step_s")
     if step < 1:
-        raise InputError(f"{where}.step_s = {traffic.step_s:g}", "is below a millisecond", "at least 0.001")
+        raise InputError(f"{place}.step_s = {traffic.step_s:g}", "is below a millisecond", "at least 0.001")
     values = []
     for key in ("frame_period_s", "warmup_s"):
-        value = milliseconds(getattr(traffic, key), f"{where}.{key}")
+        value = milliseconds(getattr(traffic, key), f"{place}.{key}")
         if value % step:
             near = " or ".join(f"{n * step / 1000:g}" for n in (value // step, value // step + 1) if n)
             raise InputError(
-                f"{where}.{key} = {value / 1000:g}",
+                f"{place}.{key} = {value / 1000:g}",
                 f"is no whole number of steps of {step / 1000:g} s",
                 f"for example {near}, or another step_s",
             )
         values.append(value)
-    begin = milliseconds(begin_s, f"{where}: begin")
+    begin = milliseconds(begin_s, f"{place}: begin")
     return Timing(begin, begin + values[1], values[0], step, traffic.frames)
 
 
@@ -272,9 +272,9 @@ class Prepared:
 
 def prepare(scenario: Scenario, folder: Path, extensions: Iterable[TrafficExtension] = ()) -> Prepared:
     """Lay out the folder, with the traffic that ``extensions`` add."""
-    traffic, where = scenario.traffic, place(scenario)
+    traffic, place = scenario.traffic, place_of(scenario)
     given = sources(scenario)
-    when = timing(traffic, given.begin_s, where)
+    when = timing(traffic, given.begin_s, place)
     adding = [extension for extension in extensions if extension.adds_traffic]
     others = [OTHERS.replace("others", f"others{number or ''}") for number in range(len(adding))]
     folder.mkdir(parents=True, exist_ok=True)
@@ -323,9 +323,9 @@ def _text(time_ms: int) -> str:
 def _draw(
     scenario: Scenario, roads: network.Network, when: Timing, rng: np.random.Generator, folder: Path
 ) -> list[str]:
-    traffic, where = scenario.traffic, place(scenario)
-    demand.check_kinds(traffic.kinds, sumo.vehicle_classes(), where)
-    pairs = [demand.pairs(roads, kind, traffic, rng, where) for kind in traffic.kinds]
+    traffic, place = scenario.traffic, place_of(scenario)
+    demand.check_kinds(traffic.kinds, sumo.vehicle_classes(), place)
+    pairs = [demand.pairs(roads, kind, traffic, rng, place) for kind in traffic.kinds]
     departs_s = (
         np.arange(int(np.ceil((when.end_ms - when.begin_ms) / 1000.0 * traffic.trips_per_s))) / traffic.trips_per_s
     )

@@ -20,7 +20,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from pipeline.core.errors import InputError
-from pipeline.formats import safe_xml as safexml
+from pipeline.formats import safe_xml
 from pipeline.scenario.types import FARTHEST_M
 
 SCHEMA = pa.schema(
@@ -67,7 +67,7 @@ def read(path: Path, who: str = "vehicle") -> Iterator[pa.Table]:
     """
     if not path.is_file():
         raise InputError(path, "no such file", "a file that SUMO wrote with --fcd-output")
-    with safexml.opened(path) as file:
+    with safe_xml.opened(path) as file:
         head = file.read(256).lstrip(b"\xef\xbb\xbf \t\r\n")
     if not head:
         raise InputError(path, "is empty", RIGHT)
@@ -82,7 +82,7 @@ def read(path: Path, who: str = "vehicle") -> Iterator[pa.Table]:
 def _csv(path: Path, who: str) -> Iterator[pa.RecordBatch]:
     from pyarrow import csv
 
-    with safexml.opened(path) as file:
+    with safe_xml.opened(path) as file:
         header = file.readline().decode("utf-8", "replace").lstrip("\ufeff").strip()
     delimiter = ";" if ";" in header else ","
     columns = _columns([name.strip('"') for name in header.split(delimiter)], path, who)
@@ -95,7 +95,7 @@ def _csv(path: Path, who: str) -> Iterator[pa.RecordBatch]:
     reading = csv.ReadOptions(block_size=_BLOCK_BYTES, use_threads=False)
     try:
         with (
-            pa.input_stream(path, compression="gzip" if safexml.is_gzip(path) else None) as stream,
+            pa.input_stream(path, compression="gzip" if safe_xml.is_gzip(path) else None) as stream,
             csv.open_csv(stream, reading, csv.ParseOptions(delimiter=delimiter), convert) as batches,
         ):
             for batch in batches:
@@ -120,8 +120,8 @@ def _parquet(path: Path, who: str) -> Iterator[pa.RecordBatch]:
 @contextmanager
 def _seekable(path: Path) -> Iterator[Any]:
     """Parquet is read from its end, so a gzipped one is unzipped into memory first."""
-    if safexml.is_gzip(path):
-        with safexml.opened(path) as file:
+    if safe_xml.is_gzip(path):
+        with safe_xml.opened(path) as file:
             yield pa.BufferReader(file.read())
     else:
         yield path
@@ -129,7 +129,7 @@ def _seekable(path: Path) -> Iterator[Any]:
 
 def _xml(path: Path, who: str) -> Iterator[pa.RecordBatch]:
     rows: list[dict[str, str]] = []
-    for step in safexml.children(path, "fcd-export"):
+    for step in safe_xml.children(path, "fcd-export"):
         rows += [{"time": step.get("time", ""), **one.attrib} for one in step.iter(who)]
         if who == "person":
             rows = [{key: value for key, value in row.items() if key != "slope"} for row in rows]
@@ -143,7 +143,7 @@ def _xml(path: Path, who: str) -> Iterator[pa.RecordBatch]:
 def _xml_batch(rows: list[dict[str, str]], path: Path) -> pa.RecordBatch:
     names = [*_NEEDED, *(name for name in _OPTIONAL if name in rows[0])]
     columns = {name: pa.array([row.get(name) for row in rows], type=pa.string()) for name in names}
-    for row in (i for name in _NEEDED if columns[name].null_count for i in _where(pc.is_null(columns[name]))):
+    for row in (i for name in _NEEDED if columns[name].null_count for i in _rows_of(pc.is_null(columns[name]))):
         missing = next(name for name in _NEEDED if name not in rows[row])
         raise InputError(path, f"vehicle {rows[row].get('id')!r} at time {rows[row]['time']!r} has no {missing}", RIGHT)
     for name in set(names) - set(_STRINGS):
@@ -189,16 +189,16 @@ def _checked(batches: Iterable[pa.RecordBatch], path: Path, unit: str) -> Iterat
 def _finite(values: dict[str, Any], name: str, row: NDArray[np.int64], path: Path, unit: str) -> None:
     bad = np.flatnonzero(~(np.abs(_floats(values[name])) <= FARTHEST_M))
     if bad.size:
-        found = values[name][int(bad[0])].as_py()
+        value = values[name][int(bad[0])].as_py()
         raise InputError(
             f"{path}: {unit} {row[bad[0]]}",
-            f"{name} of vehicle {values['id'][int(bad[0])].as_py()!r} is {'empty' if found is None else found}",
+            f"{name} of vehicle {values['id'][int(bad[0])].as_py()!r} is {'empty' if value is None else value}",
             f"a finite number, at most {FARTHEST_M:g}",
         )
 
 
 def _typed(values: dict[str, Any], row: NDArray[np.int64], path: Path, unit: str) -> None:
-    bad = _where(pc.fill_null(pc.equal(values["type"], ""), True))
+    bad = _rows_of(pc.fill_null(pc.equal(values["type"], ""), True))
     if bad.size:
         raise InputError(
             f"{path}: {unit} {row[bad[0]]}",
@@ -252,7 +252,7 @@ def _floats(column: Any) -> NDArray[np.float64]:
     return array
 
 
-def _where(mask: Any) -> NDArray[np.int64]:
+def _rows_of(mask: Any) -> NDArray[np.int64]:
     return np.flatnonzero(mask.to_numpy(zero_copy_only=False))
 
 

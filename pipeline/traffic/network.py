@@ -297,11 +297,9 @@ class _Reading:
                 self.location = Location(element.get("projParameter", ""), offset_m)
 
     def _take_edge(self, element: Element) -> None:
-        function, of = element.get("function", ""), element.get
-        edge = Edge(
-            element.attrib["id"], function, of("from", ""), of("to", ""), of("name", ""),
-            tuple(self._lane(lane.attrib) for lane in element.iter("lane")),
-        )  # fmt: skip
+        function, start, end, name = (element.get(key, "") for key in ("function", "from", "to", "name"))
+        lanes = tuple(self._lane(lane.attrib) for lane in element.iter("lane"))
+        edge = Edge(element.attrib["id"], function, start, end, name, lanes)
         self.edges.append(edge)
         if not function:
             if not edge.from_node or not edge.to_node:

@@ -107,7 +107,7 @@ def record(
 @contextmanager
 def _finished(scenario: Scenario) -> Iterator[Recording]:
     """From a file; nothing is simulated, so nothing is promised about it."""
-    traffic, place = scenario.traffic, configuration.place(scenario)
+    traffic, place = scenario.traffic, configuration.place_of(scenario)
     assert traffic.fcd is not None
     path = scenario.find(traffic.fcd, "traffic.fcd")
     window = Window(
@@ -137,7 +137,7 @@ def _simulated(
             fcd.read(path) if _has_rows(path) else (),
             prepared.timing.window(),
             sizes,
-            configuration.place(scenario),
+            configuration.place_of(scenario),
             patience_s(prepared.roads.cycle_s),
             _stopped_on_purpose(prepared),
             None if not prepared.adds_traffic else (fcd.read(persons, "person") if _has_rows(persons) else ()),
@@ -152,7 +152,7 @@ def _simulated(
 def _running(scenario: Scenario, host: str, port: int, acting: Sequence[TrafficExtension]) -> Iterator[Recording]:
     """From a SUMO that somebody else started."""
     given = configuration.sources(scenario)
-    when = configuration.timing(scenario.traffic, given.begin_s, configuration.place(scenario))
+    when = configuration.timing(scenario.traffic, given.begin_s, configuration.place_of(scenario))
     net_file = given.files["net-file"][0]
     cycle_s = 0.0 if network.is_osm(net_file) else network.read(net_file).cycle_s
     observations = live.LiveObservations()
@@ -163,7 +163,7 @@ def _running(scenario: Scenario, host: str, port: int, acting: Sequence[TrafficE
             live.poll(connection, when, observations, f"{host}:{port}", persons=persons),
             when.window(),
             observations.sizes,
-            configuration.place(scenario),
+            configuration.place_of(scenario),
             patience_s(cycle_s),
             observations.stopped_on_purpose,
             summary=lambda: RecordingSummary(version, None, None, len(observations.collided)),

@@ -1,0 +1,39 @@
+"""A town with traffic, made once for all tests of the traffic."""
+
+import pytest
+
+from pipeline.artefacts import tables
+from pipeline.stages import traffic
+from pipeline.traffic import sumo
+from tests.traffic.helpers import SMALL, netgenerate, scenario
+
+
+@pytest.fixture(scope="session")
+def town(tmp_path_factory):
+    """A folder with a signalised 2 x 2 grid of streets that lead out of town."""
+    folder = tmp_path_factory.mktemp("town")
+    netgenerate(
+        folder, "--grid", "--grid.number", "2", "--grid.length", "90", "--grid.attach-length", "120", "-L", "2",
+        "--default-junction-type", "traffic_light", "--no-turnarounds", "--offset.disable-normalization",
+    )  # fmt: skip
+    return folder
+
+
+@pytest.fixture(scope="session")
+def recorded(town, tmp_path_factory):
+    """The stage's result, table and folder for the town's drawn traffic."""
+    out = tmp_path_factory.mktemp("recorded")
+    result = traffic.run(scenario(town, network="net.xml", **SMALL), out)
+    table, metadata = tables.read(out / "trajectories.parquet", "trajectories")
+    return result, table, metadata, out
+
+
+@pytest.fixture
+def patient(monkeypatch):
+    """SUMO listens a moment after it was started."""
+    connect = sumo._connect
+
+    def again(host, port):
+        return next(filter(None, (connect(host, port) for _ in range(1_000_000))))
+
+    monkeypatch.setattr(sumo, "_connect", again)

@@ -1,0 +1,101 @@
+"""Does whatever keeps to the protocol of extensions take part in the traffic, known to nobody by name?"""
+
+from dataclasses import replace
+
+import pytest
+
+from pipeline.artefacts import tables
+from pipeline.core.errors import InputError
+from pipeline.core.progress import silent
+from pipeline.effects.registry import Parameters, Traffic
+from pipeline.stages import traffic
+from pipeline.traffic import recording, trajectories
+from pipeline.traffic.boxes import Size
+from pipeline.traffic.extensions import TrafficPlan
+from tests.traffic.helpers import SMALL, scenario
+
+TRAM = Size(30.0, 2.4, 3.5, "tram")
+
+
+class Raised:
+    """Lifts every box, and says how many there were."""
+
+    def __init__(self, sizes):
+        self.sizes, self.boxes = sizes, 0
+
+    def change(self, boxes):
+        self.boxes += boxes.frame.size
+        return replace(boxes, z_m=boxes.z_m + 100.0)
+
+    def summary(self):
+        return {"raised": self.boxes, "kinds": sorted(self.sizes)}
+
+
+class Guests(Traffic):
+    """One more vehicle, which does not count, and boxes that are lifted."""
+
+    NAME = "guests"
+    ADDS_TRAFFIC = True
+
+    def sizes(self):
+        return {"guest": TRAM}
+
+    def uncounted_types(self, sizes):
+        return frozenset({"guest"})
+
+    def plan(self, scenario, roads, begin_s, end_s, rng):
+        lane = next(edge for edge in roads.edges if edge.lanes_for("passenger"))
+        vtype = '<vType id="guest" vClass="passenger" length="30" width="2.4" height="3.5"/>'
+        stop = f'<stop edge="{lane.id}" duration="9999" parking="true"/>'
+        guest = f'<trip id="guest" type="guest" depart="0" from="{lane.id}" to="{lane.id}">{stop}</trip>'
+        return TrafficPlan(f"<routes>{vtype}{guest}</routes>", 1, (f"a guest from {begin_s:g} to {end_s:g} s",))
+
+    def box_change(self, scenario, sizes):
+        return Raised(sizes)
+
+
+def recorded(scene, out, *acting):
+    with (
+        recording.record(scene, out / "sumo", acting, silent, None) as rows,
+        tables.writer(out / "trajectories.parquet", "trajectories") as file,
+    ):
+        written = trajectories.write(scene, rows, acting, file, silent)
+        file.describe({"schema": 1, "frames": 1})
+        return written, rows.summary()
+
+
+def test_an_extension_adds_traffic_that_does_not_count_and_changes_boxes(town, tmp_path):
+    scene = scenario(town, network="net.xml", **SMALL)
+    written, summary = recorded(scene, tmp_path, Guests(Parameters()))
+    plain = traffic.run(scene, tmp_path / "plain")
+    assert (written.counts.fewest, written.counts.most) == (12, 12)
+    assert set(written.counts.uncounted) == {"tram"} and written.counts.uncounted["tram"].most == 1
+    assert written.of_extensions["kinds"] == sorted({"car", "van", "truck", "bus"})
+    assert written.of_extensions["raised"] == plain["rows"] + written.counts.uncounted["tram"].mean * 240
+    assert summary.notes == ("a guest from 0 to 120 s",)
+    flags = " ".join(summary.flags)
+    assert "trips.rou.xml,others.rou.xml" in flags and "--max-num-vehicles 13" in flags
+
+
+def test_two_extensions_have_a_route_file_each_and_change_boxes_one_after_another(town, tmp_path):
+    class Others(Guests):
+        def plan(self, *arguments):
+            return TrafficPlan("<routes/>", 0)
+
+    scene = scenario(town, network="net.xml", **SMALL)
+    written, summary = recorded(scene, tmp_path, Guests(Parameters()), Others(Parameters()))
+    flags = " ".join(summary.flags)
+    assert "trips.rou.xml,others.rou.xml,others1.rou.xml" in flags and "--max-num-vehicles 13" in flags
+    assert written.counts.most == 12
+    lifted = tables.read(tmp_path / "trajectories.parquet", "trajectories")[0]["z_m"].to_numpy()
+    assert 200 < lifted.min() and lifted.max() < 202
+
+
+def test_what_an_extension_refuses_is_raised_before_anything_is_laid_out(town, tmp_path):
+    class Choosy(Guests):
+        def refusal(self, scenario):
+            return InputError("guests", "this is no place for guests", "another place")
+
+    with pytest.raises(InputError, match="no place for guests"):
+        recorded(scenario(town, network="net.xml", **SMALL), tmp_path, Choosy(Parameters()))
+    assert not (tmp_path / "sumo").exists()

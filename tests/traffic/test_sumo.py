@@ -1,0 +1,42 @@
+"""Is what goes wrong with SUMO's programs told with its own words?"""
+
+import pytest
+
+from pipeline.core.errors import MissingBackendError, RunError
+from pipeline.traffic import sumo
+
+
+def fake_sumo(folder, monkeypatch, script):
+    path = folder / "sumo"
+    path.write_text(f"#!/bin/sh\n{script}\n")
+    path.chmod(0o755)
+    monkeypatch.setenv("SUMO_BINARY", str(path))
+
+
+def test_a_missing_system_library_is_named_with_its_packages(tmp_path, monkeypatch):
+    says = "sumo: error while loading shared libraries: libX11.so.6: cannot open shared object file: No such file"
+    fake_sumo(tmp_path, monkeypatch, f"echo '{says}' >&2; exit 127")
+    with pytest.raises(MissingBackendError, match=r"libX11\.so\.6 is missing; on Debian: apt-get install .*libx11-6"):
+        sumo.run("sumo", ["--version"], tmp_path)
+
+
+def test_sumo_killed_from_outside_is_told(tmp_path, monkeypatch):
+    fake_sumo(tmp_path, monkeypatch, "kill -9 $$")
+    with pytest.raises(RunError, match="sumo was killed by signal 9"):
+        sumo.run("sumo", [], tmp_path)
+
+
+def test_a_binary_that_is_none_is_told(tmp_path, monkeypatch):
+    fake_sumo(tmp_path, monkeypatch, "")
+    (tmp_path / "sumo").write_bytes(b"\x00not a program")
+    with pytest.raises(MissingBackendError, match="sumo cannot be started"):
+        sumo.run("sumo", [], tmp_path)
+
+
+def test_another_sumos_version_is_asked(tmp_path, monkeypatch):
+    fake_sumo(tmp_path, monkeypatch, "echo 'Eclipse SUMO sumo v1_27_0+0045-abc'")
+    sumo.version.cache_clear()
+    try:
+        assert sumo.version() == "1.27.0+0045-abc"
+    finally:
+        sumo.version.cache_clear()
