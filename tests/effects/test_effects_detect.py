@@ -112,7 +112,7 @@ def one_beam(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def scored(done: tuple[Path, Path], settings: list[str], jobs: int | None = None) -> tuple[dict[str, list], bytes]:
     """Columns of scores.parquet under these settings, and its bytes; the module's artefacts stay as they are."""
     folder, out = done
-    score.run(pipeline.load(folder, settings), out, jobs=jobs)
+    run_stage(score, pipeline.load(folder, settings), out, jobs=jobs)
     table, _ = tables.read(out / "scores.parquet", "scores")
     return table.to_pydict(), (out / "scores.parquet").read_bytes()
 
@@ -524,8 +524,9 @@ IMPORTED = """
 import sys
 import pipeline
 from pipeline.stages import score
+from tests.stages import run_stage
 pipeline.load({folder!r}, {settings!r})
-score.run(pipeline.load({folder!r}, {settings!r}), __import__("pathlib").Path({out!r}), jobs=1)
+run_stage(score, pipeline.load({folder!r}, {settings!r}), __import__("pathlib").Path({out!r}), jobs=1)
 print(sorted(name for name in sys.modules if name.startswith("pipeline.effects.")))
 """
 

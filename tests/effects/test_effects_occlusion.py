@@ -26,6 +26,7 @@ from pipeline.effects.score.rain import Rain
 from pipeline.scoring.visibility import UNIT, Beams, Visibility
 from pipeline.sensing import crossings
 from pipeline.stages import score
+from tests.stages import inputs_of, run_stage
 
 ON = "effects.moving_occlusion.method=frames"
 ALL = "effects.moving_occlusion.frames=all"
@@ -161,7 +162,7 @@ def ran(mini: Path, tmp_path: Path) -> tuple[Path, Path]:
 
 
 def scores(folder: Path, out: Path, *overrides: str, jobs: int | None = None) -> list[float]:
-    score.run(pipeline.load(folder, overrides), out, jobs=jobs)
+    run_stage(score, pipeline.load(folder, overrides), out, jobs=jobs)
     return tables.read(out / "scores.parquet", "scores")[0].column("egvs").to_pylist()
 
 
@@ -473,10 +474,10 @@ def test_without_kept_scans_the_scores_are_the_same(ran: tuple[Path, Path]) -> N
 def test_scores_depend_on_the_trajectories_only_when_they_are_replayed(ran: tuple[Path, Path]) -> None:
     folder, out = ran
     named = {"trajectories.parquet": files.sha256_of(out / "trajectories.parquet")}
-    plain = score.inputs(pipeline.load(folder), out)["files"]
-    assert score.inputs(pipeline.load(folder, [ON]), out)["files"] == plain | named
-    assert score.inputs(pipeline.load(folder, [INDEPENDENT]), out)["files"] == plain
-    assert score.inputs(pipeline.load(folder, ["effects.rain.rate_mm_h=3"]), out)["files"] == plain
+    plain = inputs_of(score, pipeline.load(folder), out).files
+    assert inputs_of(score, pipeline.load(folder, [ON]), out).files == plain | named
+    assert inputs_of(score, pipeline.load(folder, [INDEPENDENT]), out).files == plain
+    assert inputs_of(score, pipeline.load(folder, ["effects.rain.rate_mm_h=3"]), out).files == plain
 
 
 def test_all_and_zero_are_one_setting(mini: Path, tmp_path: Path) -> None:

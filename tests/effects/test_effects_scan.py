@@ -34,6 +34,7 @@ from pipeline.world import casting as raycast
 from pipeline.world.casting import Caster, EmptyScan
 from pipeline.world.mesh import World, read_ply
 from tests.conftest import collection, feature
+from tests.stages import run_stage
 
 FOLIAGE, DIVERGENCE, SWAY = (
     "effects.foliage.leaf_area_density=",
@@ -81,8 +82,8 @@ TREES = (
 
 def scanned(folder: Path, out: Path, *sets: str, jobs: int = 1) -> tuple[pipeline.Scenario, Path]:
     scenario = pipeline.load(folder, sets)
-    statics.run(scenario, out)
-    scan.run(scenario, out, jobs=jobs)
+    run_stage(statics, scenario, out)
+    run_stage(scan, scenario, out, jobs=jobs)
     return scenario, out
 
 

@@ -31,6 +31,7 @@ from pipeline.traffic.boxes import Size
 from pipeline.traffic.frames import FrameGroup
 from pipeline.world import terrain
 from pipeline.world.mesh import read_ply
+from tests.stages import inputs_of, run_stage
 
 HILL = Path(__file__).resolve().parents[2] / "scenarios" / "hill"
 GRADE = 0.04
@@ -93,14 +94,14 @@ def rows(out):
 
 
 def bytes_of(scene, out):
-    return traffic.run(scene, out), (out / "trajectories.parquet").read_bytes()
+    return run_stage(traffic, scene, out), (out / "trajectories.parquet").read_bytes()
 
 
 @pytest.fixture(scope="session")
 def climbed(hill, tmp_path_factory):
     """Result, rows and folder of the traffic on the hill road, with everything that acts there."""
     out = tmp_path_factory.mktemp("climbed")
-    result = traffic.run(scenario(hill, {"articulated": {}, **CROWD}, **SMALL), out)
+    result = run_stage(traffic, scenario(hill, {"articulated": {}, **CROWD}, **SMALL), out)
     return result, rows(out), out
 
 
@@ -131,14 +132,14 @@ def test_an_effect_that_cannot_act_gives_the_bytes_of_the_plain_scene_and_says_s
     assert re.fullmatch(rf"{name}: named, but .*: skipped, the result is the same", result["notes"][-1])
     reason = make(name, effects[name], "place").idle(Scene(scene, None, ()))
     assert reason and reason in result["notes"][-1]
-    assert traffic.inputs(scene, tmp_path) == traffic.inputs(scenario(flat, **SMALL), tmp_path)
+    assert inputs_of(traffic, scene, tmp_path) == inputs_of(traffic, scenario(flat, **SMALL), tmp_path)
 
 
 def test_a_flat_network_imports_no_effect(flat, tmp_path):
     code = f"""
 import sys; from pathlib import Path; from pipeline.stages import statics, traffic; from pipeline.scenario.loading import from_values
 scene = from_values({scenario(flat, **(SMALL | {"frames": 8})).model_dump(mode="json")!r}, Path({str(flat)!r}), "place")
-traffic.run(scene, Path({str(tmp_path)!r})); statics.run(scene, Path({str(tmp_path)!r}))
+run_stage(traffic, scene, Path({str(tmp_path)!r})); run_stage(statics, scene, Path({str(tmp_path)!r}))
 print([m for m in sys.modules if m.startswith("pipeline.effects")])"""
     root = HILL.parent.parent
     done = subprocess.run([sys.executable, "-c", code], cwd=root, check=True, capture_output=True, text=True)
@@ -147,8 +148,8 @@ print([m for m in sys.modules if m.startswith("pipeline.effects")])"""
 
 def test_a_flat_network_keeps_its_flat_ground(flat, tmp_path):
     one, other = tmp_path / "one", tmp_path / "other"
-    statics.run(scenario(flat, **SMALL), one)
-    result = statics.run(scenario(flat, {"slope": {}}, **SMALL), other)
+    run_stage(statics, scenario(flat, **SMALL), one)
+    result = run_stage(statics, scenario(flat, {"slope": {}}, **SMALL), other)
     assert (one / "statics.ply").read_bytes() == (other / "statics.ply").read_bytes() and "notes" not in result
     assert len(read_ply(one / "statics.ply")[0].faces) == 2
 
@@ -252,9 +253,9 @@ def test_footprints_stand_on_the_hill_and_sites_below_it_are_refused(hill, tmp_p
     (tmp_path / "s.geojson").write_text(f'{{"features": {features}}}'.replace("'", '"'))
     values = scenario(tmp_path, **SMALL).model_dump(mode="json") | {"statics": {"footprints": ["s.geojson"]}}
     scene = from_values(values, tmp_path, "place")
-    result = statics.run(scene, tmp_path / "out")
+    result = run_stage(statics, scene, tmp_path / "out")
     assert result["notes"] == ["slope: on, the ground follows the network's roads"]
-    assert "surface" in statics.inputs(scene, tmp_path)["files"]
+    assert "surface" in inputs_of(statics, scene, tmp_path).files
     world = read_ply(tmp_path / "out" / "statics.ply")[0]
     spans = {
         name: np.ptp(world.triangles_m[world.solid_of_face == i][:, :, 2]) for i, (name, _) in enumerate(world.solids)
@@ -316,7 +317,7 @@ PARTS = {"articulated": {"kinds": {"bendy": {"parts_m": [10.6, 7.5], "axles_m": 
 def test_on_a_straight_road_parts_are_in_line_and_as_long_as_sumos_vehicle(tmp_path, angle):
     way = np.array([math.sin(math.radians(angle)), math.cos(math.radians(angle))])
     poses = [(*(way * 1.3 * i), angle) for i in range(60)]
-    traffic.run(finished(tmp_path, poses, PARTS), tmp_path / "out")
+    run_stage(traffic, finished(tmp_path, poses, PARTS), tmp_path / "out")
     front, rear = bus_rows(tmp_path / "out", 0), bus_rows(tmp_path / "out", 1)
     assert np.abs(rear["yaw_rad"] - front["yaw_rad"]).max() < 2e-9
     assert set(front["length_m"]) == {10.6} and set(rear["length_m"]) == {7.5}
@@ -339,7 +340,7 @@ def test_on_a_circle_the_rear_settles_at_the_arcsine_of_axle_over_radius(tmp_pat
                 math.degrees(-phi) if turn > 0 else 180 - math.degrees(phi),
             )
         )
-    traffic.run(finished(tmp_path, poses, PARTS), tmp_path / "out")
+    run_stage(traffic, finished(tmp_path, poses, PARTS), tmp_path / "out")
     front, rear = bus_rows(tmp_path / "out", 0), bus_rows(tmp_path / "out", 1)
     hinge = 10.6 + 0.65 / 2
     # the joint lies on the tangent behind the bumper; its own direction is turned against the front's heading by
@@ -393,7 +394,7 @@ def test_longer_axles_cut_less_and_three_parts_follow_one_another(tmp_path):
     angles = []
     for axle in (3.0, 6.0):
         kinds = {"bendy": {"parts_m": [8, 5, 5], "axles_m": [axle, axle]}}
-        traffic.run(finished(tmp_path, poses, {"articulated": {"kinds": kinds}}), tmp_path / "out")
+        run_stage(traffic, finished(tmp_path, poses, {"articulated": {"kinds": kinds}}), tmp_path / "out")
         yaw = [bus_rows(tmp_path / "out", part)["yaw_rad"][-1] for part in range(3)]
         angles.append([math.remainder(yaw[i] - yaw[i + 1], math.tau) for i in range(2)])
     assert all(
@@ -423,7 +424,7 @@ def test_parts_lie_on_the_slope_of_a_finished_file(tmp_path):
     """Without a network there is no surface: the parts lie along the slope that the file gives."""
     degrees, p = math.degrees(math.atan(GRADE)), math.atan(GRADE)
     poses = [(1.0 * i, 0, 90, degrees, 100 + GRADE * i) for i in range(20)]
-    traffic.run(finished(tmp_path, poses, PARTS), tmp_path / "out")
+    run_stage(traffic, finished(tmp_path, poses, PARTS), tmp_path / "out")
     rear = bus_rows(tmp_path / "out", 1)
     middle, front_x = 18.75 - 3.75, np.arange(20.0)
     assert rear["pitch_rad"] == pytest.approx(p, abs=1e-9)
@@ -477,7 +478,7 @@ def test_every_drawn_bicycle_trip_is_ridden_when_it_should_be(flat, tmp_path):
         {"pedestrians_bicycles": {"bicycles_per_h": 720}},
         **SMALL | {"warmup_s": 0.0, "frames": 600, "hold": "at_most"},
     )
-    traffic.run(scene, tmp_path)
+    run_stage(traffic, scene, tmp_path)
     r = kind_rows(rows(tmp_path), "bicycle")
     drawn = [
         float(t)
@@ -560,7 +561,7 @@ def test_more_departures_bring_more_people(flat, tmp_path):
     means = []
     for rate in (0, 200, 1000):
         scene = scenario(flat, {"pedestrians_bicycles": {"pedestrians_per_h": rate, "bicycles_per_h": 100}}, **SMALL)
-        traffic.run(scene, tmp_path)
+        run_stage(traffic, scene, tmp_path)
         means.append(np.count_nonzero(rows(tmp_path)["kind"] == "pedestrian"))
     assert means[0] == 0 < means[1] < means[2]
 
@@ -576,7 +577,7 @@ def test_same_seed_same_bytes_and_the_same_over_traci(hill, climbed, tmp_path, p
         command, cwd=tmp_path / "again" / "sumo", env=sumo.environment(), stdout=quiet, stderr=quiet
     ) as process:
         try:
-            traffic.run(scene, tmp_path / "polled", traci=("localhost", port))
+            run_stage(traffic, scene, tmp_path / "polled", traci=("localhost", port))
         finally:
             process.kill()
     one, other = rows(tmp_path / "again"), rows(tmp_path / "polled")
@@ -595,7 +596,7 @@ def own_demand(flat, folder):
 
 def test_a_users_own_routes_get_people_beside_them(flat, tmp_path):
     keys = own_demand(flat, tmp_path)
-    result = traffic.run(scenario(tmp_path, CROWD, **keys), tmp_path / "out")
+    result = run_stage(traffic, scenario(tmp_path, CROWD, **keys), tmp_path / "out")
     assert result["vehicles"]["most"] == 4 and result["vehicles"]["fewest"] >= 3
     assert set(result["beside_vehicles"]) == {"bicycle", "pedestrian", "overlapping_pairs"}
     assert "own" in rows(tmp_path / "out")["vehicle"]
@@ -603,7 +604,7 @@ def test_a_users_own_routes_get_people_beside_them(flat, tmp_path):
 
 def test_in_the_plain_scene_a_users_own_persons_are_no_vehicles(flat, tmp_path):
     """Without a file of their own, SUMO writes persons among the vehicles."""
-    result = traffic.run(scenario(tmp_path, **own_demand(flat, tmp_path)), tmp_path / "out")
+    result = run_stage(traffic, scenario(tmp_path, **own_demand(flat, tmp_path)), tmp_path / "out")
     assert result["vehicles"]["most"] == 4
     assert set(rows(tmp_path / "out")["kind"]) == {"passenger"}
 
@@ -637,7 +638,7 @@ BAD = {
 def test_what_does_not_fit_the_network_or_the_fleet_is_told(tmp_path, lanes, effects, message):
     build_road(tmp_path, 0, lanes)
     with pytest.raises(InputError, match=message):
-        traffic.run(scenario(tmp_path, effects, **SMALL), tmp_path / "out")
+        run_stage(traffic, scenario(tmp_path, effects, **SMALL), tmp_path / "out")
     assert not (tmp_path / "out" / "trajectories.parquet").exists()
 
 
@@ -663,7 +664,7 @@ def test_bad_parameters_are_refused(mini, egvs, tmp_path, override, message):
 
 def test_the_hill_scenario_holds_its_vehicles_and_has_everybody_on_the_road(tmp_path):
     scene = load(HILL, ["traffic.frames=120", "traffic.warmup_s=150", "tpog.blocks=1"])
-    result = traffic.run(scene, tmp_path)
+    result = run_stage(traffic, scene, tmp_path)
     assert result["vehicles"]["fewest"] == result["vehicles"]["most"] == 24 and result["collisions"] == 0
     assert "slope: on, the network has 16.0 m of relief" in result["notes"]
     r = rows(tmp_path)

@@ -24,6 +24,7 @@ from pipeline.formats import osm as osm_reader
 from pipeline.importers import openstreetmap as osm
 from pipeline.scenario import loading
 from tests.formats.test_osm import pbf_of
+from tests.stages import run_stage
 
 SMALL = Path(__file__).parent / "data" / "small.osm"
 REAL = Path(__file__).parents[3] / "shared" / "real" / "bad_hersfeld.osm"
@@ -340,5 +341,5 @@ def test_a_real_town_holds_its_vehicles_in_every_frame(town: Made, tmp_path: Pat
     from pipeline.stages import traffic
 
     # Raises when a single frame has fewer than 50, or when they jam. Four times as many do so within 600 frames.
-    traffic.run(loading.load(town[0], ["traffic.frames=600"]), tmp_path)
+    run_stage(traffic, loading.load(town[0], ["traffic.frames=600"]), tmp_path)
     assert (tmp_path / "trajectories.parquet").is_file()

@@ -23,6 +23,7 @@ from pipeline.core.grid import Grid
 from pipeline.kernels import boxes
 from pipeline.stages import tpog, traffic
 from tests.oracles import boxes as oracle
+from tests.stages import run_stage
 
 SHAPE, VOXEL_M = (8, 7, 5), 0.25
 SCENARIO = Path(__file__).resolve().parents[2] / "scenarios" / "nishishinjuku"
@@ -429,7 +430,7 @@ def real(tmp_path_factory):
     """Boxes of a short run of the shipped scenario, in the grid's frame, and its grid."""
     out = tmp_path_factory.mktemp("real")
     scenario = pipeline.load(SCENARIO, ["traffic.frames=200"])
-    traffic.run(scenario, out)
+    run_stage(traffic, scenario, out)
     batches = list(tpog._read(out / "trajectories.parquet", scenario.roi.grid))
     return np.concatenate([b.frame for b in batches]), np.concatenate([b.values for b in batches]), scenario.roi.grid
 

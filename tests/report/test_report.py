@@ -35,6 +35,7 @@ from pipeline.stages.base import metadata
 from pipeline.studies import accuracy
 from pipeline.studies import settings as study_settings
 from pipeline.world.mesh import World, write_ply
+from tests.stages import inputs_of, run_stage
 
 NASTY = '<b>&"x'
 SITES = [("north", 6, 9, 2), ("south", 6, -1, 2), (NASTY, 6, -1, 3), ("west", -2, 4, 1.5)]
@@ -97,8 +98,8 @@ def finished(folder, sites=SITES, counts=lane, record=True, **keys):
     more = {"grid": grid.to_json(), "frames": FRAMES, "block_frames": FRAMES}
     tables.write(out / "tpog.parquet", "tpog", columns, metadata(about, {}, **more))
     write_ply(out / "statics.ply", world(), {})
-    scan.run(about, out, jobs=1)
-    score.run(about, out, jobs=1)
+    run_stage(scan, about, out, jobs=1)
+    run_stage(score, about, out, jobs=1)
     if record:
         (out / "run.json").write_text(json.dumps(a_record()), encoding="utf-8")
     return about, out
@@ -127,7 +128,7 @@ def a_record(seconds=1.25):
 
 
 def page(about, out):
-    report.run(about, out)
+    run_stage(report, about, out)
     return (out / "report.html").read_text(encoding="utf-8")
 
 
@@ -232,20 +233,20 @@ def test_costs_are_shown_and_are_inputs(made, tmp_path):
     (tmp_path / "out" / "run.json").write_text(json.dumps(a_record(seconds=98.76)))
     assert "98.76" in page(about, tmp_path / "out") and "98.76" not in text
     assert "77.77" not in text, "SUMO's own seconds differ from run to run"
-    assert report.inputs(about, tmp_path / "out") != report.inputs(about, out)
+    assert inputs_of(report, about, tmp_path / "out") != inputs_of(report, about, out)
 
 
 def test_whatever_is_shown_is_an_input(made, tmp_path):
     about, out, _ = made
-    before = report.inputs(about, out)
+    before = inputs_of(report, about, out)
     changed = a_record()
     changed["stages"]["traffic"]["summary"]["collisions"] = 8
     (tmp_path / "out").mkdir()
     for name in ("tpog.parquet", "scores.parquet", "scans.parquet", "statics.ply"):
         shutil.copy(out / name, tmp_path / "out")
     (tmp_path / "out" / "run.json").write_text(json.dumps(changed))
-    assert report.inputs(about, tmp_path / "out") != before
-    assert report.inputs(scenario(tmp_path, SITES, seed=3), out) != before
+    assert inputs_of(report, about, tmp_path / "out") != before
+    assert inputs_of(report, scenario(tmp_path, SITES, seed=3), out) != before
     json.dumps(before, allow_nan=False)
 
 
@@ -347,7 +348,7 @@ def test_no_cap(tmp_path):
     about, out = finished(tmp_path, score={"gamma": float("inf")})
     text = Reader(page(about, out)).text
     assert "∞" in text and "inf" not in text.split() and "any site could reach" not in text
-    json.dumps(report.inputs(about, out), allow_nan=False)
+    json.dumps(inputs_of(report, about, out), allow_nan=False)
 
 
 def test_no_record_no_costs(tmp_path):

@@ -20,13 +20,13 @@ from pathlib import Path
 import pytest
 
 import pipeline
-from pipeline.core import files
 from pipeline.artefacts import tables
+from pipeline.core import files
+from pipeline.core.errors import InputError, RunError
 from pipeline.runs import workflow
 from pipeline.runs.locking import alone
 from pipeline.runs.stages import STAGES
 from pipeline.sensing import scanner as survey
-from pipeline.core.errors import InputError, RunError
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ("statics.ply", "scans.parquet", "trajectories.parquet", "tpog.parquet", "scores.parquet")
@@ -103,7 +103,9 @@ CHANGES = {
 
 
 @pytest.mark.parametrize(("change", "again"), CHANGES.items(), ids=CHANGES.keys())
-def test_a_changed_setting_runs_what_depends_on_it(done: tuple[Path, Path], tmp_path: Path, change: str, again: set[str]) -> None:
+def test_a_changed_setting_runs_what_depends_on_it(
+    done: tuple[Path, Path], tmp_path: Path, change: str, again: set[str]
+) -> None:
     mini, out = done
     scenario = pipeline.load(mini, [change])
     assert {stage for stage, state in states(scenario, out).items() if state == "done"} == again
@@ -223,7 +225,9 @@ def real(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("real") / "junction"
     shutil.copytree(ROOT / "scenarios" / "nishishinjuku", folder)
     text = (folder / "scenario.toml").read_text()
-    (folder / "scenario.toml").write_text(text.replace("frames = 5000", "frames = 500").replace("warmup_s = 300", "warmup_s = 100"))
+    (folder / "scenario.toml").write_text(
+        text.replace("frames = 5000", "frames = 500").replace("warmup_s = 300", "warmup_s = 100")
+    )
     return folder
 
 
@@ -267,10 +271,14 @@ def test_notebook_lines_of_the_readme_run(mini: Path, tmp_path: Path, monkeypatc
 def test_editor_schema_is_not_stale() -> None:
     from pipeline.scenario.loading import json_schema
 
-    assert (ROOT / "data_schemas" / "scenario.schema.json").read_text(encoding="utf-8") == json_schema(), "run: make schema"
+    assert (ROOT / "data_schemas" / "scenario.schema.json").read_text(encoding="utf-8") == json_schema(), (
+        "run: make schema"
+    )
 
 
-def test_another_seed_in_the_same_folder_changes_no_byte_of_what_is_not_random(mini: Path, tmp_path: Path, egvs) -> None:
+def test_another_seed_in_the_same_folder_changes_no_byte_of_what_is_not_random(
+    mini: Path, tmp_path: Path, egvs
+) -> None:
     out = tmp_path / "out"
     assert egvs("run", mini, "--out", out, "--set", "seed=5")[0] == 0
     before = {name: (out / name).read_bytes() for name in ("statics.ply", "scans.parquet")}

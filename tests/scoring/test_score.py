@@ -16,6 +16,7 @@ from pipeline.core.errors import InputError
 from pipeline.scenario import loading
 from pipeline.scoring.egvs import binary_entropy
 from pipeline.stages import scan, score, statics, tpog, traffic
+from tests.stages import run_stage
 
 STAGES = (traffic, statics, tpog, scan, score)
 
@@ -195,7 +196,7 @@ def test_altered_artefacts_are_refused(mini, tmp_path, artefact, change, message
                 file.write_table(table.filter(pa.compute.equal(table["site"], site)))
             file.add_key_value_metadata({b"egvs": meta[b"egvs"]})
     with pytest.raises(InputError, match=message):
-        score.run(load(mini), tmp_path)
+        run_stage(score, load(mini), tmp_path)
 
 
 def test_counts_may_reach_the_number_of_frames(mini, tmp_path):
@@ -210,7 +211,7 @@ def test_counts_may_reach_the_number_of_frames(mini, tmp_path):
     field = read_tpog(tmp_path / "tpog.parquet")
     assert field.counts.max() >= 2**32 - 1
     assert (field.counts % (2**32 - 1) == 0).all()
-    score.run(load(mini), tmp_path)
+    run_stage(score, load(mini), tmp_path)
     assert all(
         row["egvs"] == true_score(tmp_path, row["site"], 4.0)
         for row in read_scores(tmp_path / "scores.parquet").to_pylist()

@@ -5,6 +5,7 @@ import pytest
 from pipeline.artefacts import tables
 from pipeline.stages import traffic
 from pipeline.traffic import sumo
+from tests.stages import run_stage
 from tests.traffic.helpers import SMALL, netgenerate, scenario
 
 
@@ -23,7 +24,7 @@ def town(tmp_path_factory):
 def recorded(town, tmp_path_factory):
     """The stage's result, table and folder for the town's drawn traffic."""
     out = tmp_path_factory.mktemp("recorded")
-    result = traffic.run(scenario(town, network="net.xml", **SMALL), out)
+    result = run_stage(traffic, scenario(town, network="net.xml", **SMALL), out)
     table, metadata = tables.read(out / "trajectories.parquet", "trajectories")
     return result, table, metadata, out
 

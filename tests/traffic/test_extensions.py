@@ -12,6 +12,7 @@ from pipeline.stages import traffic
 from pipeline.traffic import recording, trajectories
 from pipeline.traffic.boxes import Size
 from pipeline.traffic.extensions import TrafficPlan
+from tests.stages import run_stage
 from tests.traffic.helpers import SMALL, scenario
 
 TRAM = Size(30.0, 2.4, 3.5, "tram")
@@ -67,7 +68,7 @@ def recorded(scene, out, *acting):
 def test_an_extension_adds_traffic_that_does_not_count_and_changes_boxes(town, tmp_path):
     scene = scenario(town, network="net.xml", **SMALL)
     written, summary = recorded(scene, tmp_path, Guests(Parameters()))
-    plain = traffic.run(scene, tmp_path / "plain")
+    plain = run_stage(traffic, scene, tmp_path / "plain")
     assert (written.counts.fewest, written.counts.most) == (12, 12)
     assert set(written.counts.uncounted) == {"tram"} and written.counts.uncounted["tram"].most == 1
     assert written.of_extensions["kinds"] == sorted({"car", "van", "truck", "bus"})

@@ -19,6 +19,7 @@ from pipeline.artefacts import tables
 from pipeline.core.errors import InputError, RunError
 from pipeline.stages import traffic
 from pipeline.traffic import demand, network, recording, sumo
+from tests.stages import inputs_of, run_stage
 from tests.traffic.helpers import SMALL, car, drawn, netgenerate, scenario
 
 
@@ -69,8 +70,8 @@ def test_flags_name_no_place_of_this_machine_and_the_fcd_file_is_gone(recorded):
 
 
 def test_same_seed_same_bytes_and_another_seed_other_traffic(town, recorded, tmp_path):
-    traffic.run(scenario(town, network="net.xml", **SMALL), tmp_path / "again", jobs=1)
-    traffic.run(scenario(town, seed=2, network="net.xml", **SMALL), tmp_path / "other")
+    run_stage(traffic, scenario(town, network="net.xml", **SMALL), tmp_path / "again", jobs=1)
+    run_stage(traffic, scenario(town, seed=2, network="net.xml", **SMALL), tmp_path / "other")
     first = (recorded[3] / "trajectories.parquet").read_bytes()
     assert (tmp_path / "again" / "trajectories.parquet").read_bytes() == first
     assert (tmp_path / "other" / "trajectories.parquet").read_bytes() != first
@@ -84,7 +85,7 @@ def test_the_folder_can_be_moved_and_gives_the_same_traffic_as_a_finished_file(r
     sumo.run("sumo", ["-c", "run.sumocfg", "--fcd-output", "all.xml.gz", "--precision", "8"], moved)
     values = {k: v for k, v in SMALL.items() if k in ("frames", "warmup_s")}
     finished = scenario(moved, fcd="all.xml.gz", **values)
-    result = traffic.run(finished, tmp_path / "out")
+    result = run_stage(traffic, finished, tmp_path / "out")
     again, metadata = tables.read(tmp_path / "out" / "trajectories.parquet", "trajectories")
     assert again.equals(table.cast(again.schema))
     assert metadata["sumo"] is None
@@ -109,7 +110,7 @@ def over_traci(scene, out, folder, *flags):
     process, port = serve(folder, *flags)
     with process:
         try:
-            return traffic.run(scene, out, traci=("localhost", port))
+            return run_stage(traffic, scene, out, traci=("localhost", port))
         finally:
             process.kill()
 
@@ -138,7 +139,9 @@ def test_traci_to_nobody_is_refused(town, tmp_path):
     from sumolib.miscutils import getFreeSocketPort
 
     with pytest.raises(InputError, match="no SUMO answers there"):
-        traffic.run(scenario(town, network="net.xml", **SMALL), tmp_path, traci=("localhost", getFreeSocketPort()))
+        run_stage(
+            traffic, scenario(town, network="net.xml", **SMALL), tmp_path, traci=("localhost", getFreeSocketPort())
+        )
 
 
 ROUTES = """<routes>
@@ -174,12 +177,12 @@ def test_own_routes_get_their_sizes_from_sumo(town, tmp_path):
         "step_s": 1,
         "frame_period_s": 1,
     }
-    result = traffic.run(scenario(tmp_path, **keys, frames=300, warmup_s=10), tmp_path / "out")
+    result = run_stage(traffic, scenario(tmp_path, **keys, frames=300, warmup_s=10), tmp_path / "out")
     table, _ = tables.read(tmp_path / "out" / "trajectories.parquet", "trajectories")
     sizes = {(r["kind"], r["length_m"], r["width_m"], r["height_m"]) for r in table.to_pylist()}
     assert sizes == {("trailer", 16.5, 2.55, 4.0), ("passenger", 3.0, 1.5, 1.4)}
     assert result["longest_standing_s"] > 200  # parked on purpose, which is no jam
-    assert set(traffic.inputs(scenario(tmp_path, **keys), tmp_path)["files"]) == {"net.xml", "own.rou.xml"}
+    assert set(inputs_of(traffic, scenario(tmp_path, **keys), tmp_path).files) == {"net.xml", "own.rou.xml"}
 
 
 CONFIG = """<configuration>
@@ -205,13 +208,13 @@ def configured(town, folder, additional="<additional/>", routes=None):
 
 def test_own_configuration_runs_with_the_scenarios_times_and_outputs(town, tmp_path):
     scene = configured(town, tmp_path / "in")
-    result = traffic.run(scene, tmp_path / "out")
+    result = run_stage(traffic, scene, tmp_path / "out")
     text = " ".join(result["flags"])
     assert "--begin 25200.000" in text and "--end 25510.000" in text and "--step-length 1.000" in text
     assert "--time-to-teleport -1" in text
     for dropped in ("tripinfo", "geo", "rerouting.threads", "nowhere"):
         assert dropped not in text
-    assert set(traffic.inputs(scene, tmp_path)["files"]) == {
+    assert set(inputs_of(traffic, scene, tmp_path).files) == {
         "town.sumocfg",
         "net.xml",
         "own.rou.xml",
@@ -232,7 +235,7 @@ def test_a_jam_without_end_fails_with_its_numbers(town, tmp_path):
     with pytest.raises(
         RunError, match=r"vehicles stand for more than 180 s and through to the last frame, .* for 2\d\d s"
     ):
-        traffic.run(scene, tmp_path / "out")
+        run_stage(traffic, scene, tmp_path / "out")
     assert not (tmp_path / "out" / "trajectories.parquet").exists()
     assert not (tmp_path / "out" / "sumo" / "fcd.csv").exists()
 
@@ -247,8 +250,8 @@ def test_more_vehicles_than_the_town_holds_fail_with_the_numbers(town, tmp_path)
     with pytest.raises(
         RunError, match=r"traffic: 200 vehicles are in 0 of 40 frames only; the fewest are \d+, the most \d+"
     ):
-        traffic.run(scenario(town, network="net.xml", **keys), tmp_path)
-    result = traffic.run(scenario(town, network="net.xml", **keys, hold="at_most"), tmp_path)
+        run_stage(traffic, scenario(town, network="net.xml", **keys), tmp_path)
+    result = run_stage(traffic, scenario(town, network="net.xml", **keys, hold="at_most"), tmp_path)
     assert 0 < result["vehicles"]["most"] < 200
 
 
@@ -258,7 +261,7 @@ def test_no_vehicle_at_all_fails(town, tmp_path):
     keys.pop("trips_per_s")
     shutil.copy(town / "net.xml", tmp_path)
     with pytest.raises(RunError, match="no vehicle is in any of 240 frames"):
-        traffic.run(scenario(tmp_path, network="net.xml", **keys), tmp_path / "out")
+        run_stage(traffic, scenario(tmp_path, network="net.xml", **keys), tmp_path / "out")
 
 
 NODES = """<nodes><node id="a" x="0" y="0" z="0"/><node id="b" x="400" y="0" z="40"/><node id="c" x="800" y="0" z="40"/></nodes>"""
@@ -270,7 +273,7 @@ def test_uphill_boxes_are_pitched_and_stand_on_the_road(tmp_path):
     (tmp_path / "e.edg.xml").write_text(EDGES)
     sumo.run("netconvert", ["-n", "n.nod.xml", "-e", "e.edg.xml", "-o", "hill.net.xml"], tmp_path)
     keys = SMALL | {"network": "hill.net.xml", "vehicles": 8, "frames": 120, "hold": "at_most"}
-    traffic.run(scenario(tmp_path, **keys), tmp_path / "out")
+    run_stage(traffic, scenario(tmp_path, **keys), tmp_path / "out")
     table, _ = tables.read(tmp_path / "out" / "trajectories.parquet", "trajectories")
     uphill = [r for r in table.to_pylist() if 20 < r["x_m"] < 380]
     assert len(uphill) > 50
@@ -291,7 +294,9 @@ def test_a_ring_gets_trips_between_any_edges_and_says_so(tmp_path):
         "--spider.omit-center",
         name="ring.net.xml",
     )
-    result = traffic.run(scenario(tmp_path, **(SMALL | {"network": "ring.net.xml", "vehicles": 5})), tmp_path / "out")
+    result = run_stage(
+        traffic, scenario(tmp_path, **(SMALL | {"network": "ring.net.xml", "vehicles": 5})), tmp_path / "out"
+    )
     assert result["notes"] and "no trip between fringe edges" in result["notes"][0]
 
 
@@ -306,14 +311,16 @@ def test_a_map_of_openstreetmap_becomes_a_network(tmp_path):
     where = [(52.002, 10.0), (52.002, 10.002), (52.002, 10.004), (52.0, 10.002), (52.004, 10.002)]
     nodes = "".join(f'<node id="{i}" lat="{lat}" lon="{lon}"/>' for i, (lat, lon) in enumerate(where, 1))
     (tmp_path / "cross.osm").write_text(OSM.replace("{nodes}", nodes))
-    result = traffic.run(scenario(tmp_path, **(SMALL | {"network": "cross.osm", "vehicles": 6})), tmp_path / "out")
+    result = run_stage(
+        traffic, scenario(tmp_path, **(SMALL | {"network": "cross.osm", "vehicles": 6})), tmp_path / "out"
+    )
     assert result["vehicles"]["fewest"] == 6
     assert (tmp_path / "out" / "sumo" / "network.net.xml").is_file()
 
 
 def test_progress_goes_on_to_the_end(town, tmp_path):
     heard = []
-    traffic.run(scenario(town, network="net.xml", **SMALL), tmp_path, progress=lambda *what: heard.append(what))
+    run_stage(traffic, scenario(town, network="net.xml", **SMALL), tmp_path, progress=lambda *what: heard.append(what))
     assert heard[-1] == ("frames written", 240, 240)
 
 
@@ -328,7 +335,7 @@ def test_the_time_of_a_growing_file_is_that_of_its_last_whole_row(tmp_path):
 
 def test_inputs_depend_on_what_the_stage_reads_and_on_nothing_else(town, tmp_path):
     def about(folder, **keys):
-        return traffic.inputs(scenario(folder, network="net.xml", **keys), tmp_path)
+        return inputs_of(traffic, scenario(folder, network="net.xml", **keys), tmp_path)
 
     shutil.copytree(town, tmp_path / "elsewhere")
     assert about(town, frames=10) == about(tmp_path / "elsewhere", frames=10)

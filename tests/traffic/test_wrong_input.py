@@ -6,6 +6,7 @@ import pytest
 
 from pipeline.core.errors import InputError, RunError
 from pipeline.stages import traffic
+from tests.stages import run_stage
 from tests.traffic.helpers import car, scenario
 
 
@@ -78,11 +79,11 @@ def test_wrong_input_is_answered_with_what_would_be_right(town, tmp_path, prepar
     shutil.copy(town / "net.xml", tmp_path)
     prepare(tmp_path)
     with pytest.raises(error, match=message):
-        traffic.run(scenario(tmp_path, **keys), tmp_path / "out")
+        run_stage(traffic, scenario(tmp_path, **keys), tmp_path / "out")
     assert not (tmp_path / "out" / "trajectories.parquet").exists()
 
 
 def test_traci_beside_a_finished_file_is_refused(tmp_path):
     (tmp_path / "f.csv").write_text("x")
     with pytest.raises(InputError, match="--traci: the scenario names a finished FCD file"):
-        traffic.run(scenario(tmp_path, fcd="f.csv"), tmp_path, traci=("localhost", 1))
+        run_stage(traffic, scenario(tmp_path, fcd="f.csv"), tmp_path, traci=("localhost", 1))
