@@ -42,7 +42,7 @@ _LEFT_OUT = (
 
 
 def inputs(scenario: Scenario, out: Path) -> dict[str, Any]:
-    """The artefacts by hash, the summaries and costs of the earlier stages, and the settings that are shown."""
+    """The artefacts by hash; of the settings and of the earlier stages' costs and summaries, what is shown."""
     read = ["trajectories.parquet", "tpog.parquet", "statics.ply", "scores.parquet"]
     if scenario.scan.keep:
         read.append("scans.parquet")
@@ -56,7 +56,7 @@ def inputs(scenario: Scenario, out: Path) -> dict[str, Any]:
         "settings": {"shown": _shown(scenario), "keep": scenario.scan.keep, **more},
         "costs": {name: [stage.seconds, stage.peak_mb] for name, stage in stages.items()},
         "files": {name: files.sha256_of(out / name) for name in (*read, *ACCURACY) if (out / name).is_file()},
-        "summaries": {name: dict(stage.summary) for name, stage in stages.items()},
+        "summaries": {name: dict(stages[name].summary) for name in ("traffic", "statics")},
     }
 
 
