@@ -49,9 +49,9 @@ def _style_sheet() -> str:
     light = "".join(f".q{i}{{fill:#{c};stop-color:#{c}}}" for i, c in enumerate(ON_LIGHT))
     dark = "".join(f".q{i}{{fill:#{c};stop-color:#{c}}}" for i, c in enumerate(ON_DARK))
     return f"""
-.plan {{ --large: #d5d8df; --large-line: #7d8494; --green: #9fc3b6; --green-line: #5f8f80; --small: #4d5564;
-  --halo: #ffffff; display: block; width: 100%; height: auto;
-  color: #1d2430; font: 12px system-ui, "DejaVu Sans", sans-serif; }}
+.plan {{ --large: #d5d8df; --large-line: #7d8494; --green: #9fc3b6; --green-line: #5f8f80; --small: #4d5564; \
+--halo: #ffffff;
+  display: block; width: 100%; height: auto; color: #1d2430; font: 12px system-ui, "DejaVu Sans", sans-serif; }}
 .plan text {{ fill: currentColor; }}
 .plan .axis {{ stroke: currentColor; stroke-opacity: .45; fill: none; }}
 .plan .grid {{ stroke: currentColor; stroke-opacity: .09; fill: none; }}
@@ -64,8 +64,8 @@ def _style_sheet() -> str:
 .plan .first circle {{ stroke-width: 2.6; }}
 .plan .site .rank {{ font-size: 9.5px; font-weight: 700; text-anchor: middle; stroke: none; }}
 .plan .low {{ fill: #14181f; }} .plan .high {{ fill: #ffffff; }}
-.plan .label {{ font-weight: 600; paint-order: stroke; stroke: var(--halo); stroke-width: 3.5px;
-  stroke-linejoin: round; }}
+.plan .label {{ font-weight: 600; paint-order: stroke; stroke: var(--halo); stroke-width: 3.5px; \
+stroke-linejoin: round; }}
 .plan .spot {{ fill: var(--halo); stroke: currentColor; stroke-width: 1.3; }}
 .plan .lead {{ stroke: currentColor; stroke-width: .9; fill: none; }}
 .plan .sensor {{ fill: #e8590c; stroke: var(--halo); stroke-width: 1.5; }}
@@ -73,8 +73,9 @@ def _style_sheet() -> str:
 .plan .night {{ display: none; }}
 {light}
 @media screen and (prefers-color-scheme: dark) {{
-.plan {{ --large: #343b48; --large-line: #7f889a; --green: #2f5b4f; --green-line: #6fa493; --small: #a9b2c3;
-  --halo: #12161d; color: #e6e9ef; }}
+.plan {{ --large: #343b48; --large-line: #7f889a; --green: #2f5b4f; --green-line: #6fa493; --small: #a9b2c3; \
+--halo: #12161d;
+  color: #e6e9ef; }}
 .plan .low {{ fill: #ffffff; }} .plan .high {{ fill: #14181f; }}
 .plan .day {{ display: none; }} .plan .night {{ display: inline; }}
 {dark}

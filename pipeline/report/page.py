@@ -56,7 +56,7 @@ def inputs(work: Workspace) -> StageInputs:
     hashes |= work.digests(*(name for name in (*read, *ACCURACY) if work.path(name).is_file()))
     more = {
         "costs": {name: [stage.seconds, stage.peak_mb] for name, stage in stages.items()},
-        "summaries": {name: dict(stage.summary) for name, stage in stages.items()},
+        "summaries": {name: dict(stages[name].summary) for name in ("traffic", "statics")},
     }
     return StageInputs(settings, hashes, more)
 

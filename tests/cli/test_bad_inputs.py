@@ -239,7 +239,8 @@ BAD: dict[str, tuple[Change, str]] = {
     "truncated PCD": (
         put(
             "cloud.pcd",
-            b"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 9\nHEIGHT 1\nPOINTS 9\nDATA binary\n\x00\x00",
+            b"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
+            b"WIDTH 9\nHEIGHT 1\nPOINTS 9\nDATA binary\n\x00\x00",
             edit('sensor = "small"', 'sensor = "small"\npoints = "cloud.pcd"'),
             ONE_SITE,
         ),

@@ -250,6 +250,19 @@ def test_whatever_is_shown_is_an_input(made, tmp_path):
     json.dumps(before, allow_nan=False)
 
 
+def test_what_is_not_shown_is_no_input(made, tmp_path):
+    """A run that was audited says so in the summary of its scores; ``verify`` runs it again without."""
+    about, out, _ = made
+    shutil.copytree(out, tmp_path / "out")
+    audited = a_record()
+    audited["stages"]["score"] = audited["stages"]["tpog"] | {"summary": {"audit": {"misplaced_chords": 0}}}
+    (tmp_path / "out" / "run.json").write_text(json.dumps(audited))
+    audited_costs = report.inputs(about, tmp_path / "out").pop("costs")
+    assert audited_costs["score"] == [1.25, 512.0]
+    for key in ("files", "settings", "summaries"):
+        assert report.inputs(about, tmp_path / "out")[key] == report.inputs(about, out)[key]
+
+
 def test_it_is_the_same_without_kept_scans(tmp_path):
     kept, cast = (finished(tmp_path / str(keep), record=False, scan={"keep": keep}) for keep in (True, False))
     assert not (cast[1] / "scans.parquet").exists()
