@@ -21,11 +21,18 @@ import pipeline
 from pipeline.artefacts import tables
 from pipeline.artefacts.readers import read_tpog
 from pipeline.core.errors import InputError
-from pipeline.effects import registry as effects
+from pipeline.effects import registry
+from pipeline.effects.base import Detect, Effect
 from pipeline.runs import workflow
 from pipeline.scenario.sensors import SensorModel
 from pipeline.scoring import visibility
 from pipeline.sensing import sensors, sites
+from pipeline.scoring.scorer import Scorer
+from pipeline.sensing.scene import Scene
+from tests.stages import run_stage
+from pipeline.stages.base import Workspace
+from pipeline.stages.scan_source import scans
+from pipeline.stages.scene import scene_of
 from pipeline.stages import scan, score, statics, tpog, traffic
 from tests.conftest import BUILDING, SCENARIO, SITES, collection, fcd, feature
 
@@ -121,9 +128,9 @@ def hits(done: tuple[Path, Path], settings: list[str]) -> np.ndarray:
     """Hits of the first site in each voxel, (nx, ny, nz)."""
     folder, out = done
     scenario = pipeline.load(folder, settings)
-    first = sites.of(scenario)[0].site
-    [(_, found)] = visibility.hits_of(scenario, out, read_tpog(out / "tpog.parquet").grid, [first])
-    return found
+    work = Workspace(scenario, out)
+    first = next(iter(scans(work)))
+    return Scorer(scene_of(work), read_tpog(out / "tpog.parquet")).hits(first.beams)
 
 
 def along(one_beam: tuple[Path, Path], *settings: str) -> np.ndarray:
@@ -133,13 +140,13 @@ def along(one_beam: tuple[Path, Path], *settings: str) -> np.ndarray:
     return found[:, 20, 4]
 
 
-def made(name: str, **parameters: object) -> effects.Effect:
-    return effects.make(name, parameters, "effects")
+def made(name: str, **parameters: object) -> Effect:
+    return registry.make(name, registry.effect_class(name).Model.of(parameters))
 
 
-def scene(done: tuple[Path, Path], *settings: str) -> effects.Scene:
+def scene(done: tuple[Path, Path], *settings: str) -> Scene:
     scenario = pipeline.load(done[0], settings)
-    return effects.Scene(scenario, None, tuple(sites.of(scenario)))  # type: ignore[arg-type]
+    return Scene(scenario, None, sites.of(scenario))  # type: ignore[arg-type]
 
 
 # The switch, the limit, the monotonic truth
@@ -422,19 +429,19 @@ def test_a_sensor_that_is_not_rated_is_told(mini: Path, tmp_path: Path, egvs) ->
 
 def test_idle_says_why(done: tuple[Path, Path]) -> None:
     here = scene(done)
-    assert made("rain", rate_mm_h=0).idle(here) == "rate_mm_h is 0"
-    assert made("dropout", share=0).idle(here) == "share is 0"
-    assert made("range_limit", softness=0, rated_range_m=300).idle(here) == "every beam ends before the limit"
+    assert made("rain", rate_mm_h=0).why_idle(here) == "rate_mm_h is 0"
+    assert made("dropout", share=0).why_idle(here) == "share is 0"
+    assert made("range_limit", softness=0, rated_range_m=300).why_idle(here) == "every beam ends before the limit"
     for name, parameters in {
         "rain": {"rate_mm_h": 1},
         "dropout": {"share": 0.1},
         "fog": {"visibility_m": 1e4},
         "range_limit": {"rated_range_m": 300},
     }.items():
-        assert made(name, **parameters).idle(here) is None
-    assert made("range_limit", softness=0, rated_range_m=30).idle(here) is None
+        assert made(name, **parameters).why_idle(here) is None
+    assert made("range_limit", softness=0, rated_range_m=30).why_idle(here) is None
     with pytest.raises(InputError, match="sensor small: no rated_range_m"):
-        made("range_limit", softness=0).idle(here)
+        made("range_limit", softness=0).why_idle(here)
 
 
 def test_a_limit_is_not_idle_for_a_measured_scan(done: tuple[Path, Path]) -> None:
@@ -442,15 +449,13 @@ def test_a_limit_is_not_idle_for_a_measured_scan(done: tuple[Path, Path]) -> Non
     (done[0] / "one.csv").write_text("site,x_m,y_m,z_m\npole_a,10,12,3\n")
     (done[0] / "cloud.csv").write_text("x_m,y_m,z_m\n20,0,1\n")
     measured = scene(done, "sites.points='cloud.csv'", "sites.file='one.csv'")
-    assert made("range_limit", softness=0, rated_range_m=300).idle(measured) is None
+    assert made("range_limit", softness=0, rated_range_m=300).why_idle(measured) is None
 
 
 @pytest.mark.parametrize("name", ON)
 def test_every_effect_names_its_source(name: str) -> None:
-    kind = effects.make(
-        name, {"rain": {"rate_mm_h": 1}, "fog": {"visibility_m": 9}, "dropout": {"share": 0}}.get(name, {}), "here"
-    )
-    assert (kind.NAME, isinstance(kind, effects.Detect)) == (name, True)
+    kind = registry.effect_class(name)
+    assert (kind.NAME, issubclass(kind, Detect)) == (name, True)
     assert len(kind.SOURCE) > 20
     assert all(field.description for field in kind.Model.model_fields.values())
 
@@ -527,14 +532,14 @@ from pipeline.stages import score
 from tests.stages import run_stage
 pipeline.load({folder!r}, {settings!r})
 run_stage(score, pipeline.load({folder!r}, {settings!r}), __import__("pathlib").Path({out!r}), jobs=1)
-print(sorted(name for name in sys.modules if name.startswith("pipeline.effects.")))
+print(sorted(name for name in sys.modules if name.startswith("pipeline.effects.s")))
 """
 
 
 @pytest.mark.system
 @pytest.mark.parametrize(
     ("settings", "expected"),
-    [([], []), (ON["rain"], ["pipeline.effects.registry", "pipeline.effects.score", "pipeline.effects.score.rain"])],
+    [([], []), (ON["rain"], ["pipeline.effects.score", "pipeline.effects.score.rain"])],
     ids=["plain", "rain"],
 )
 def test_what_is_not_named_is_not_imported(
@@ -553,7 +558,7 @@ def test_a_whole_plain_run_imports_no_effect(mini: Path, tmp_path: Path) -> None
 import sys
 import pipeline
 pipeline.run(pipeline.load({str(mini)!r}), {str(tmp_path / "out")!r}, jobs=1)
-print([name for name in sys.modules if name.startswith("pipeline.effects.")])
+print([name for name in sys.modules if name.startswith("pipeline.effects.s")])
 """
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "[]"

@@ -21,9 +21,11 @@ from pipeline.core import files
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Grid, Roi
 from pipeline.effects.score import moving_occlusion as effect
-from pipeline.effects.score.rain import Model as RainModel
 from pipeline.effects.score.rain import Rain
+from pipeline.scenario.effects import MovingOcclusionParameters, RainParameters
 from pipeline.scoring.visibility import UNIT, Beams, Visibility
+from pipeline.sensing.scene import Scene
+from pipeline.sensing.sites import Pose
 from pipeline.sensing import crossings
 from pipeline.stages import score
 from tests.stages import inputs_of, run_stage
@@ -97,8 +99,11 @@ def twin_blocked(
 # Small scenes
 
 
-def site(x: float, y: float, z: float) -> dict[str, Any]:
-    return {"site": "a", "x_m": x, "y_m": y, "z_m": z, "sensor": "small"}
+def occlusion(out: Path, **parameters: Any) -> effect.MovingOcclusion:
+    """The effect, prepared from a finished run."""
+    tpog = pipeline.read_tpog(out / "tpog.parquet")
+    made = effect.MovingOcclusion(MovingOcclusionParameters.of(parameters))
+    return made.prepare(None, tpog, out / "trajectories.parquet")  # type: ignore[arg-type]
 
 
 def replay(frames: dict[int, list[list[float]]], count: int, grid: Grid = GRID) -> effect.Replay:
@@ -109,7 +114,7 @@ def replay(frames: dict[int, list[list[float]]], count: int, grid: Grid = GRID) 
     return effect.Replay.of(count, frame, values)
 
 
-def listed(where: dict[str, Any], ends: Any, grid: Grid = GRID) -> crossings.Crossings:
+def listed(where: tuple[float, float, float], ends: Any, grid: Grid = GRID) -> crossings.Crossings:
     """The crossings of fewer beams than one chunk holds."""
     (found,) = crossings.listed(where, np.asarray(ends, dtype=np.float64), grid)
     return found
@@ -139,10 +144,9 @@ def random_scene(seed: int) -> tuple[np.ndarray, crossings.Crossings, dict[int, 
     counts = draw.integers(0, 9, len(ends))
     first = np.append(0, np.cumsum(counts)).astype(np.int64)
     enter = np.concatenate([np.sort(draw.uniform(0, 25, n)) for n in counts])
-    where = site(*(o + GRID.origin_m).tolist())
     return (
         o,
-        crossings.Crossings(where, GRID, slice(0, 300), first, ends, np.zeros(len(enter), np.int64), enter, enter),
+        crossings.Crossings(o, GRID, slice(0, 300), first, ends, np.zeros(len(enter), np.int64), enter, enter),
         frames,
     )
 
@@ -195,13 +199,13 @@ def recorded(out: Path, grid: Grid) -> dict[int, np.ndarray]:
 
 def test_a_car_parked_in_half_of_the_frames_halves_what_is_behind_it() -> None:
     half = replay({0: [car(10, 0.25)], 2: [car(10, 0.25)]}, 4)  # from x = 8 to 12
-    share = half.share(listed(site(0, 0.25, 1), [[20, 0, 0]]))
+    share = half.share(listed((0, 0.25, 1), [[20, 0, 0]]))
     assert share.tolist() == [1.0] * 17 + [0.5] * 23  # 16 voxels before it, and the first of its own
 
 
 def test_the_nearest_of_two_cars_counts_once() -> None:
     both = replay({0: [car(15, 0.25), car(5, 0.25)], 1: [car(15, 0.25)]}, 2)
-    share = both.share(listed(site(0, 0.25, 1), [[20, 0, 0]]))
+    share = both.share(listed((0, 0.25, 1), [[20, 0, 0]]))
     assert share.tolist() == [1.0] * 7 + [0.5] * 20 + [0.0] * 13
 
 
@@ -209,15 +213,15 @@ def test_a_beam_passes_over_under_and_beside() -> None:
     one = replay({0: [car(10, 0)]}, 1)
     for ends, z in (([20, 0, 0], 1.75), ([20, 0, 0], 1.5), ([20, 1.25, 0], 1.75)):
         assert (one.share(listed(site(0, 0.25, z), [ends])) == 1).all()
-    assert (one.share(listed(site(0, 1.0, 1), [[20, 0, 0]])) == 1).all()  # along its side, to the last bit
+    assert (one.share(listed((0, 1.0, 1), [[20, 0, 0]])) == 1).all()  # along its side, to the last bit
     assert (one.share(listed(site(0, 1.0 - 0.5e-4, 1), [[20, 0, 0]])) == 1).all()  # 0.05 mm deep
     assert (one.share(listed(site(0, 1.0 - 2e-4, 1), [[20, 0, 0]])) == 1).sum() == 17  # 0.2 mm deep
 
 
 def test_a_face_on_a_voxel_face_hides_from_the_second_voxel_on_from_either_side() -> None:
     one = replay({0: [car(10, 0.25)]}, 1)
-    there = one.share(listed(site(0, 0.25, 1), [[20, 0, 0]]))
-    back = one.share(listed(site(20, 0.25, 1), [[-20, 0, 0]]))
+    there = one.share(listed((0, 0.25, 1), [[20, 0, 0]]))
+    back = one.share(listed((20, 0.25, 1), [[-20, 0, 0]]))
     assert there.tolist() == back.tolist() == [1.0] * 17 + [0.0] * 23
 
 
@@ -225,14 +229,14 @@ def test_where_a_beam_ends_at_the_very_range_of_a_voxel_that_voxel_counts() -> N
     stop = -(2 - SHRINK) + 10  # as the slab gives it
     enter = np.array([stop, np.nextafter(stop, 20)])
     ends, none = np.array([[20.0, 0, 0]]), np.zeros(2, np.int64)
-    beam = crossings.Crossings(site(0, 0.25, 1), GRID, slice(0, 1), np.array([0, 2]), ends, none, enter, enter)
+    beam = crossings.Crossings((0, 0.25, 1), GRID, slice(0, 1), np.array([0, 2]), ends, none, enter, enter)
     assert replay({0: [car(10, 0.25)]}, 1).share(beam).tolist() == [1.0, 0.0]
 
 
 def test_a_raised_nose_lets_beams_pass_under_it() -> None:
     level, raised = car(10, 0.25, size=(4, 2, 0.5)), car(10, 0.25, size=(4, 2, 0.5), pitch=0.3)
     level[2] = raised[2] = 1.0
-    beams = listed(site(20, 0.25, 0.8), [[-20, 0, 0]])  # from the front: its nose is 0.59 m up
+    beams = listed((20, 0.25, 0.8), [[-20, 0, 0]])  # from the front: its nose is 0.59 m up
     assert np.argmin(replay({0: [level]}, 1).share(beams)) == 17
     # Lower front edge of the raised box: x = 10 + 2 cos - 0.25 (-sin) ..., z = 1 + 2 sin - 0.25 cos = 1.35; its belly
     # falls to z = 0.8 where 1 + s sin 0.3 - 0.25 cos 0.3 = 0.8, s = 0.1314, x = 10 + s cos 0.3 + 0.25 sin 0.3 =
@@ -241,7 +245,7 @@ def test_a_raised_nose_lets_beams_pass_under_it() -> None:
 
 
 def test_a_vehicle_round_the_sensor_is_ignored_and_counted() -> None:
-    beams = listed(site(10, 0.25, 1), [[9, 0, 0], [0, 0, -0.9], [-9, 1, 0.1]])
+    beams = listed((10, 0.25, 1), [[9, 0, 0], [0, 0, -0.9], [-9, 1, 0.1]])
     inside = replay({0: [car(10, 0.25)], 1: [car(10, 0.25), car(15, 0.25)]}, 2)
     where = np.array([10, 0.25, 1]) - GRID.origin_m
     assert inside.holding(where) == 2
@@ -294,8 +298,8 @@ def test_independent_is_the_product_over_the_voxels_before(ran: tuple[Path, Path
     scenario = pipeline.load(folder, ["roi.voxel_m=1"])
     pipeline.run(scenario, out)
     counts, grid = pipeline.read_tpog(out / "tpog.parquet").counts.ravel(), scenario.roi.grid
-    made = effect.MovingOcclusion(effect.Model(method="independent")).prepare(scenario, out)
-    draw, where = np.random.default_rng(3), site(10, 12, 3)
+    made = occlusion(out, method="independent")
+    draw, where = np.random.default_rng(3), (10.0, 12.0, 3.0)
     ends = np.column_stack([draw.uniform(-12, 28, 60), draw.uniform(-22, -11, 60), np.full(60, -2.9)])
     found = listed(where, ends, grid)
     share, darkest = made.share(found), 1.0
@@ -326,19 +330,19 @@ def test_without_vehicles_in_reach_the_scores_are_the_plain_ones(ran: tuple[Path
 
 def test_independent_without_occupancy_changes_nothing() -> None:
     free = effect.Independent(10, np.zeros(np.prod(GRID.shape), dtype=np.uint32))
-    assert (free.share(listed(site(-1, 0.3, 3), [[20, 1, -2], [3, 3, -3]])) == 1).all()
+    assert (free.share(listed((-1, 0.3, 3), [[20, 1, -2], [3, 3, -3]])) == 1).all()
 
 
 def test_what_is_always_occupied_hides_everything_behind_it() -> None:
     counts = np.zeros(GRID.shape, dtype=np.uint32)
     counts[16] = 10
-    share = effect.Independent(10, counts.ravel()).share(listed(site(0, 0.25, 1), [[20, 0, 0]]))
+    share = effect.Independent(10, counts.ravel()).share(listed((0, 0.25, 1), [[20, 0, 0]]))
     assert share.tolist() == [1.0] * 17 + [0.0] * 23
 
 
 def test_boxes_behind_the_last_crossing_and_behind_the_sensor_hide_nothing() -> None:
     none = replay({0: [car(18, 0.25), car(-4, 0.25), car(1, 4)]}, 1)
-    assert (none.share(listed(site(0, 0.25, 1), [[15, 0, 0]])) == 1).all()
+    assert (none.share(listed((0, 0.25, 1), [[15, 0, 0]])) == 1).all()
 
 
 # Truths
@@ -368,11 +372,13 @@ def test_all_frames_are_the_mean_of_each_and_their_order_does_not_matter() -> No
 def test_it_multiplies_with_rain(ran: tuple[Path, Path]) -> None:
     folder, out = ran
     scenario = pipeline.load(folder, [ON, ALL, "effects.rain.rate_mm_h=30"])
-    where, ends = site(1, -9, 3), np.array([[20.0, 9.0, -2.5]])
-    found = listed(where, ends, scenario.roi.grid)
-    occluded = effect.MovingOcclusion(effect.Model(frames="all")).prepare(scenario, out).share(found)
-    rain = Rain(RainModel(rate_mm_h=30)).detect(found.middle_m, None)  # type: ignore[arg-type]
-    hits = Visibility(scenario, out, scenario.roi.grid).hits(Beams(where, ends))
+    pose, ends = Pose(1, -9, 3), np.array([[20.0, 9.0, -2.5]])
+    found = listed(pose.position_m, ends, scenario.roi.grid)
+    occluded = occlusion(out, frames="all").share(found)
+    rain = Rain(RainParameters(rate_mm_h=30)).detect(found.middle_m, None)  # type: ignore[arg-type]
+    scene = pipeline.build_scene(scenario)
+    visibility = Visibility(scene, pipeline.read_tpog(out / "tpog.parquet"), out / "trajectories.parquet")
+    hits = visibility.borrowed_hits(Beams(pose, scene.sensor("small"), ends))
     assert hits[found.cells].tolist() == np.rint(rain * occluded * UNIT).astype(np.int64).tolist()
     assert occluded.min() < 1 > rain.max()
 
@@ -381,8 +387,8 @@ def test_a_scene_that_is_moved_far_away_gives_the_same_shares() -> None:
     far = Grid((GRID.origin_m[0] + 2.0**18, GRID.origin_m[1] - 2.0**21, 0.0), GRID.voxel_m, GRID.shape)
     boxes, ends = {0: [car(8, 0.5, yaw=0.5)], 1: [car(12, -0.25, yaw=-1)]}, [[20, 0, 0], [19, 1, 0.125]]
     moved = {f: [[x + 2.0**18, y - 2.0**21, *rest] for x, y, *rest in cars] for f, cars in boxes.items()}
-    here = replay(boxes, 3).share(listed(site(0, 0.25, 1), ends))
-    there = replay(moved, 3, far).share(listed(site(2.0**18, 0.25 - 2.0**21, 1), ends, far))
+    here = replay(boxes, 3).share(listed((0, 0.25, 1), ends))
+    there = replay(moved, 3, far).share(listed((2.0**18, 0.25 - 2.0**21, 1), ends, far))
     assert here.tolist() == there.tolist()
     assert len(set(here.tolist())) == 3
 
@@ -422,15 +428,14 @@ def test_a_subset_is_the_same_each_time_and_too_many_are_all(ran: tuple[Path, Pa
 
 def test_only_row_groups_with_replayed_frames_are_read(ran: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     folder, out = ran
-    scenario = pipeline.load(folder)
-    one = effect.MovingOcclusion(effect.Model(frames=1))
-    whole = one.prepare(scenario, out).ready
+    whole = occlusion(out, frames=1).ready
     with_trajectories(out, trajectories(out), groups=40)
     read: list[int] = []
     true = tables.read_group
     monkeypatch.setattr(tables, "read_group", lambda file, group, *more: read.append(group) or true(file, group, *more))
-    parts = one.prepare(scenario, out).ready
-    assert read == [20]
+    read.clear()
+    parts = occlusion(out, frames=1).ready
+    assert read[-1] == 20 and read.count(20) == 1
     assert isinstance(whole, effect.Replay) and isinstance(parts, effect.Replay)
     assert whole.values.tolist() == parts.values.tolist() and len(parts.values) == 2
 
@@ -438,12 +443,14 @@ def test_only_row_groups_with_replayed_frames_are_read(ran: tuple[Path, Path], m
 def test_boxes_beyond_the_sites_and_the_region_are_dropped(ran: tuple[Path, Path]) -> None:
     folder, out = ran
     boxes = trajectories(out)
-    ready = effect.MovingOcclusion(effect.Model(frames=0)).prepare(pipeline.load(folder), out).ready
+    grid, sensor_m = pipeline.load(folder).roi.grid, np.array([10.0, 12.0, 3.0])
+    ready = occlusion(out, frames=0).ready
     away = boxes.set_column(boxes.column_names.index("x_m"), "x_m", pa.compute.add(boxes.column("x_m"), 80.0))
     with_trajectories(out, pa.concat_tables([boxes, away.cast(boxes.schema)]).sort_by("frame"))
-    again = effect.MovingOcclusion(effect.Model(frames=0)).prepare(pipeline.load(folder), out).ready
+    again = occlusion(out, frames=0).ready
     assert isinstance(ready, effect.Replay) and isinstance(again, effect.Replay)
-    assert len(ready.frame) == len(again.frame) > 0
+    assert len(again.frame) == 2 * len(ready.frame)
+    assert len(ready.between(sensor_m, grid).frame) == len(again.between(sensor_m, grid).frame) > 0
 
 
 def test_a_vehicle_between_a_site_and_the_region_hides(ran: tuple[Path, Path]) -> None:
@@ -481,17 +488,17 @@ def test_scores_depend_on_the_trajectories_only_when_they_are_replayed(ran: tupl
 
 
 def test_all_and_zero_are_one_setting(mini: Path, tmp_path: Path) -> None:
-    assert effect.Model(frames="all") == effect.Model(frames=0)  # type: ignore[arg-type]
+    assert MovingOcclusionParameters(frames="all") == MovingOcclusionParameters(frames=0)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        (["method=sometimes"], "moving_occlusion.method: 'sometimes'; Input should be 'frames' or 'independent'"),
-        (["frames=-1"], "moving_occlusion.frames: -1; Input should be greater than or equal to 0"),
-        (["frames=2.5"], "moving_occlusion.frames: 2.5; Input should be a valid integer"),
-        (["frames=true"], "moving_occlusion.frames: True; Input should be a valid integer"),
-        (["frames=most"], "moving_occlusion.frames: 'most'; Input should be a valid integer"),
+        (["method=sometimes"], "moving_occlusion.method: 'sometimes'; input should be 'frames' or 'independent'"),
+        (["frames=-1"], "moving_occlusion.frames: -1; input should be greater than or equal to 0"),
+        (["frames=2.5"], "moving_occlusion.frames: 2.5; input should be a valid integer"),
+        (["frames=true"], "moving_occlusion.frames: True; input should be a valid integer"),
+        (["frames=most"], "moving_occlusion.frames: 'most'; input should be a valid integer"),
         (["frame=7"], "moving_occlusion.frame: unknown key; did you mean frames?"),
         (
             ["method=independent", "frames=7"],
@@ -524,7 +531,7 @@ def test_bad_trajectories_are_refused(ran: tuple[Path, Path]) -> None:
 
 def test_it_shares_only_when_prepared() -> None:
     with pytest.raises(RuntimeError, match="prepare"):
-        effect.MovingOcclusion(effect.Model()).share(listed(site(0, 0, 1), [[20, 0, 0]]))
+        effect.MovingOcclusion(MovingOcclusionParameters()).share(listed((0, 0, 1), [[20, 0, 0]]))
 
 
 # The comparison

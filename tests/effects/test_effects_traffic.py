@@ -21,7 +21,8 @@ from hypothesis import strategies as st
 from pipeline.artefacts import tables
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Grid, Roi
-from pipeline.effects.registry import Scene, make
+from pipeline.effects.registry import effect_class
+from pipeline.sensing.scene import Scene
 from pipeline.effects.traffic import articulated, pedestrians_bicycles, slope
 from pipeline.scenario.loading import from_values, load
 from pipeline.sensing.scanner import Survey
@@ -130,17 +131,18 @@ def test_an_effect_that_cannot_act_gives_the_bytes_of_the_plain_scene_and_says_s
     assert made == plain[0]
     name = next(iter(effects))
     assert re.fullmatch(rf"{name}: named, but .*: skipped, the result is the same", result["notes"][-1])
-    reason = make(name, effects[name], "place").idle(Scene(scene, None, ()))
+    reason = effect_class(name)(scene.effects.named[name]).why_idle(Scene(scene, None, ()))
     assert reason and reason in result["notes"][-1]
     assert inputs_of(traffic, scene, tmp_path) == inputs_of(traffic, scenario(flat, **SMALL), tmp_path)
 
 
 def test_a_flat_network_imports_no_effect(flat, tmp_path):
     code = f"""
-import sys; from pathlib import Path; from pipeline.stages import statics, traffic; from pipeline.scenario.loading import from_values
+import sys; from pathlib import Path; from pipeline.stages import statics, traffic; from tests.stages import run_stage
+from pipeline.scenario.loading import from_values
 scene = from_values({scenario(flat, **(SMALL | {"frames": 8})).model_dump(mode="json")!r}, Path({str(flat)!r}), "place")
 run_stage(traffic, scene, Path({str(tmp_path)!r})); run_stage(statics, scene, Path({str(tmp_path)!r}))
-print([m for m in sys.modules if m.startswith("pipeline.effects")])"""
+print([m for m in sys.modules if m.startswith("pipeline.effects.traffic")])"""
     root = HILL.parent.parent
     done = subprocess.run([sys.executable, "-c", code], cwd=root, check=True, capture_output=True, text=True)
     assert done.stdout.strip() == "[]"
