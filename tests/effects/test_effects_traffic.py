@@ -136,7 +136,8 @@ def test_an_effect_that_cannot_act_gives_the_bytes_of_the_plain_scene_and_says_s
 
 def test_a_flat_network_imports_no_effect(flat, tmp_path):
     code = f"""
-import sys; from pathlib import Path; from pipeline.stages import statics, traffic; from pipeline.scenario.loading import from_values
+import sys; from pathlib import Path
+from pipeline.stages import statics, traffic; from pipeline.scenario.loading import from_values
 scene = from_values({scenario(flat, **(SMALL | {"frames": 8})).model_dump(mode="json")!r}, Path({str(flat)!r}), "place")
 traffic.run(scene, Path({str(tmp_path)!r})); statics.run(scene, Path({str(tmp_path)!r}))
 print([m for m in sys.modules if m.startswith("pipeline.effects")])"""
@@ -646,10 +647,16 @@ WRONG = {
     "a negative rate": ("effects.pedestrians_bicycles.pedestrians_per_h=-1", r"pedestrians_per_h: -1"),
     "a flat person": ("effects.pedestrians_bicycles.pedestrian_m=[0.8,0.6,0]", r"pedestrian_m"),
     "no parts": ("effects.articulated.kinds.car.parts_m=[]", r"articulated\.kinds\.car\.parts_m"),
-    "too many hinges": ("effects.articulated.kinds.car={parts_m=[2,2],hinges_m=[2,3]}", r"hinges_m has 2 values for 2 parts, 1"),
+    "too many hinges": (
+        "effects.articulated.kinds.car={parts_m=[2,2],hinges_m=[2,3]}",
+        r"hinges_m has 2 values for 2 parts, 1",
+    ),
     "a wrong word": ("effects.articulated.kind=1", r"articulated\.kind: unknown key; did you mean kinds\?"),
-    "people beside a finished file": ("effects.pedestrians_bicycles.bicycles_per_h=9", r"finished FCD file, so nobody can be"),
-}  # fmt: skip
+    "people beside a finished file": (
+        "effects.pedestrians_bicycles.bicycles_per_h=9",
+        r"finished FCD file, so nobody can be",
+    ),
+}
 
 
 @pytest.mark.parametrize(("override", "message"), WRONG.values(), ids=WRONG.keys())

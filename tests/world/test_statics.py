@@ -99,12 +99,19 @@ def test_points_are_discs_and_lines_are_strips(tmp_path):
     [
         ([polygon([[0, 0], [4, 0], [4, 0], [4, 4], [4, 4], [4, 4], [0, 4], [0, 0]])], {"doubled points": 3}, [16]),
         # two triangles that share a corner, as one ring
-        ([polygon([[0, 0], [4, 0], [2, 2], [4, 4], [0, 4], [2, 2], [0, 0]])], {"rings that touched themselves": 1}, [4, 4]),
+        (
+            [polygon([[0, 0], [4, 0], [2, 2], [4, 4], [0, 4], [2, 2], [0, 0]])],
+            {"rings that touched themselves": 1},
+            [4, 4],
+        ),
         # a ring that runs round its own hole and back through a point
-        ([polygon([[0, 0], [9, 0], [9, 9], [0, 9], [0, 0], [2, 3], [3, 6], [6, 3], [0, 0]])],
-         {"rings that touched themselves": 1}, [81 - 12]),
+        (
+            [polygon([[0, 0], [9, 0], [9, 9], [0, 9], [0, 0], [2, 3], [3, 6], [6, 3], [0, 0]])],
+            {"rings that touched themselves": 1},
+            [81 - 12],
+        ),
     ],
-)  # fmt: skip
+)
 def test_dirt_with_one_meaning_is_mended_and_counted(tmp_path, features, mended, area):
     world, counts = built(tmp_path, *features)
     assert dict(counts.mended) == mended
