@@ -7,8 +7,8 @@ import pytest
 from scipy import stats
 
 from benchmarks import others, scaling, steps
+from pipeline.artefacts.boxes import FrameBoxes
 from pipeline.core.grid import Grid
-from pipeline.stages import tpog
 
 SHAPE = np.array([12, 6, 4], np.int64)
 ALONG = {
@@ -61,7 +61,7 @@ def test_a_box_off_the_faces_occupies_the_same_by_all_ways() -> None:
     box = np.array(
         [[2.5, 1.5, 0.75, 0.0, 0.0, 1.8, 0.8, 1.3]]
     )  # reaches beyond the centres it covers, not to the next faces
-    batch = tpog.Boxes(np.array([0]), box)
+    batch = FrameBoxes(np.array([0]), box)
     ours = others.by_boxes(batch, grid)
     assert ours.sum() == 4 * 2 * 3
     assert (others.by_centre(batch, grid) == ours).all()
@@ -89,14 +89,14 @@ def test_the_slope_is_that_of_the_larger_half() -> None:
 def test_a_synthetic_junction_is_as_large_as_asked(tmp_path) -> None:
     import pipeline
     from pipeline.sensing import sensors, sites
-    from pipeline.stages import statics
+    from pipeline.world import building
 
     scenario = pipeline.load(
         scaling.prepare(scaling.Size(sites=7, frames=10, vehicles=3, beams=960, triangles=600), tmp_path / "s")
     )
     assert len(sites.of(scenario)) == 7
     assert sensors.resolve("own", scenario.sensors, "").beams == pytest.approx(960, rel=0.1)
-    assert len(statics.build(scenario)[0].faces) == pytest.approx(600, abs=10)
+    assert len(building.build(scenario)[0].faces) == pytest.approx(600, abs=10)
     assert len((scenario.folder / "fcd.csv").read_text().splitlines()) == 1 + 10 * 3
 
 

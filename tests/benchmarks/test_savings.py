@@ -7,19 +7,18 @@ from pathlib import Path
 import numpy as np
 
 import pipeline
+from pipeline.artefacts.boxes import FrameBoxes
 from pipeline.kernels import rays
-from pipeline.sensing import scanner as survey
-from pipeline.stages import statics, tpog
+from pipeline.scoring.occupancy import count
+from pipeline.sensing.scanner import Scanner
 
 
 def test_beams_that_cannot_meet_the_region_are_not_cast_and_would_change_nothing(mini: Path, monkeypatch) -> None:
-    scenario = pipeline.load(mini)
-    world = statics.build(scenario)[0]
-    lean = [survey.Survey(scenario, world).scan(site).scan for site in survey.Survey(scenario, world).sites]
+    scene = pipeline.build_scene(pipeline.load(mini))
+    lean = [Scanner(scene).scan_site(site).rows for site in scene.sites]
     monkeypatch.setattr(rays, "can_meet", lambda o, ends, size, reaches: reaches.fill(True))
-    surveyed = survey.Survey(scenario, world)
-    for site, few in zip(surveyed.sites, lean, strict=True):
-        every = surveyed.scan(site).scan
+    for site, few in zip(scene.sites, lean, strict=True):
+        every = Scanner(scene).scan_site(site).rows
         assert len(few.beam) < len(every.beam)
         same = np.isin(every.beam, few.beam)
         assert every.ends_m[same].tobytes() == few.ends_m.tobytes()
@@ -33,6 +32,6 @@ def test_flat_boxes_take_the_flat_path_and_count_the_same() -> None:
         [rng.uniform(0, 100, n), rng.uniform(0, 50, n), np.full(n, 0.75), rng.uniform(-3, 3, n), np.zeros(n),
          np.tile([4.5, 1.75, 1.5], (n, 1))]
     )  # fmt: skip
-    flat = tpog.count(tpog.Boxes(np.arange(n) // 10, values), grid, 30)
+    flat = count(FrameBoxes(np.arange(n) // 10, values), grid, 30)
     values[:, 4] = 1e-15  # so little that no voxel can tell, but not the flat path
-    assert np.array_equal(flat, tpog.count(tpog.Boxes(np.arange(n) // 10, values), grid, 30))
+    assert np.array_equal(flat, count(FrameBoxes(np.arange(n) // 10, values), grid, 30))

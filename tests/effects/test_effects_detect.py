@@ -26,15 +26,15 @@ from pipeline.effects.base import Detect, Effect
 from pipeline.runs import workflow
 from pipeline.scenario.sensors import SensorModel
 from pipeline.scoring import visibility
-from pipeline.sensing import sensors, sites
 from pipeline.scoring.scorer import Scorer
+from pipeline.sensing import sensors, sites
 from pipeline.sensing.scene import Scene
-from tests.stages import run_stage
+from pipeline.stages import scan, score, statics, tpog, traffic
 from pipeline.stages.base import Workspace
 from pipeline.stages.scan_source import scans
 from pipeline.stages.scene import scene_of
-from pipeline.stages import scan, score, statics, tpog, traffic
 from tests.conftest import BUILDING, SCENARIO, SITES, collection, fcd, feature
+from tests.stages import run_stage
 
 SENSOR = sensors.Sensor("test", (0.0,), (0.0,), 1, 100.0, "this test", rated_range_m=40.0)
 RANGES_M = np.linspace(0.01, 200.0, 400)

@@ -24,9 +24,8 @@ from pipeline.effects.score import moving_occlusion as effect
 from pipeline.effects.score.rain import Rain
 from pipeline.scenario.effects import MovingOcclusionParameters, RainParameters
 from pipeline.scoring.visibility import UNIT, Beams, Visibility
-from pipeline.sensing.scene import Scene
-from pipeline.sensing.sites import Pose
 from pipeline.sensing import crossings
+from pipeline.sensing.sites import Pose
 from pipeline.stages import score
 from tests.stages import inputs_of, run_stage
 

@@ -16,20 +16,25 @@ import shapely
 
 import pipeline
 from pipeline.artefacts import tables
+from pipeline.artefacts.readers import Tpog
 from pipeline.core import files
 from pipeline.core.grid import Grid, Roi
-from pipeline.effects.registry import Scene
 from pipeline.effects.scan.divergence import Divergence
 from pipeline.effects.scan.divergence import nodes as cone_nodes
 from pipeline.effects.scan.foliage import Foliage
 from pipeline.effects.scan.mount_sway import MountSway, tilted
 from pipeline.effects.scan.mount_sway import nodes as sway_nodes
 from pipeline.effects.score.rain import Rain
-from pipeline.scoring import visibility
-from pipeline.sensing import scanner as survey
+from pipeline.scenario.effects import DivergenceParameters, FoliageParameters, MountSwayParameters, RainParameters
+from pipeline.scoring.scorer import Scorer
+from pipeline.sensing import sites
+from pipeline.sensing.scanner import Scanner
 from pipeline.sensing.sensors import Sensor, rotation
-from pipeline.sensing.sites import Site
+from pipeline.sensing.sites import Pose
 from pipeline.stages import scan, statics
+from pipeline.stages.base import Workspace
+from pipeline.stages.scan_source import scans
+from pipeline.stages.scene import scene_of
 from pipeline.world import casting as raycast
 from pipeline.world.casting import Caster, EmptyScan
 from pipeline.world.mesh import World, read_ply
@@ -91,17 +96,14 @@ def hits(folder: Path, out: Path, *sets: str) -> dict[str, np.ndarray]:
     """Hits in each voxel, by site."""
     scenario, out = scanned(folder, out, *sets)
     grid = Grid.over(scenario.roi.box, scenario.roi.voxel_m)
-    names = [site.site for site in survey.sites.of(scenario)]
-    return dict(visibility.hits_of(scenario, out, grid, names))
+    work, empty = Workspace(scenario, out), Tpog(grid, 1, np.zeros(grid.shape, dtype=np.int64))
+    scorer = Scorer(scene_of(work), empty)
+    return {scan.site.name: scorer.hits(scan.beams) for scan in scans(work)}
 
 
 def along(found: dict[str, np.ndarray]) -> np.ndarray:
     """Hits along the only beam of :func:`one_beam`, by the number of the voxel: x from 0 in steps of 0.5 m."""
     return found["only"][:, 20, 4]
-
-
-def site_at(x: float, y: float, z: float, yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> Site:
-    return Site("s", x, y, z, yaw, pitch, roll, "any")
 
 
 def sums(file: Path) -> list[float]:
@@ -138,9 +140,9 @@ def test_radial_moments_of_19_sub_beams() -> None:
 
 def test_sub_beams_lie_in_the_sensors_own_azimuth_and_elevation() -> None:
     sensor = Sensor("s", (10.0,), (0.0,), 8, 100.0, "", divergence_mrad=(8.0, 2.0))
-    site = site_at(0, 0, 0, yaw=30, pitch=-20, roll=40)
-    pose = (site.yaw_deg, site.pitch_deg, site.roll_deg)
-    rays, parent, weights = Divergence(Divergence.Model()).expand(sensor.directions(*pose), sensor, site)
+    mount = Pose(0, 0, 0, yaw_deg=30, pitch_deg=-20, roll_deg=40)
+    pose = mount.angles_deg
+    rays, parent, weights = Divergence(DivergenceParameters()).expand(sensor.directions(*pose), sensor, mount)
     assert parent.tolist() == [i for i in range(8) for _ in range(7)]
     np.testing.assert_array_equal(rays[::7], sensor.directions(*pose))
     np.testing.assert_allclose((rays**2).sum(axis=1), 1, atol=1e-15)
@@ -156,7 +158,7 @@ def test_sub_beams_lie_in_the_sensors_own_azimuth_and_elevation() -> None:
 
 def test_a_beam_along_the_sensors_axis_widens_too() -> None:
     sensor = Sensor("s", (90.0,), (0.0,), 1, 100.0, "", divergence_mrad=(4.0, 4.0))
-    rays, _, _ = Divergence(Divergence.Model()).expand(sensor.directions(), sensor, site_at(0, 0, 0))
+    rays, _, _ = Divergence(DivergenceParameters()).expand(sensor.directions(), sensor, Pose(0, 0, 0))
     assert np.hypot(rays[1:, 0], rays[1:, 1]) == pytest.approx(2e-3, rel=1e-5)
 
 
@@ -328,9 +330,9 @@ def _lengths(position: np.ndarray, ends: np.ndarray) -> list[float]:
 
 
 def _cut(position: np.ndarray, ends: np.ndarray, **parameters: float) -> EmptyScan:
-    cut = Foliage(Foliage.Model(**parameters)).cutter(_world(*CROWNS), ROI)
+    cut = Foliage(FoliageParameters(**parameters)).cutter(_world(*CROWNS), ROI)
     beams = EmptyScan(np.arange(len(ends), dtype=np.uint32), ends, np.zeros(len(ends), dtype=np.bool_))
-    return cut(beams, site_at(*position))
+    return cut(beams, Pose(*position))
 
 
 def test_lengths_within_crooked_and_overlapping_crowns_are_those_of_a_slow_twin() -> None:
@@ -368,7 +370,7 @@ def test_parts_end_within_crowns_and_along_their_beam() -> None:
 def test_beams_through_edges_corners_and_along_faces() -> None:
     """A cube from 10 to 14 m; k = 0.25 a metre. A beam that lies in a face plane is inside, as it met the opaque cube;
     one that only touches an edge passes."""
-    cut = Foliage(Foliage.Model(leaf_area_density=0.5)).cutter(
+    cut = Foliage(FoliageParameters(leaf_area_density=0.5)).cutter(
         _world(([(10, 0), (14, 0), (14, 4), (10, 4)], 0.0, 4.0)), ROI
     )
     cases = {
@@ -383,14 +385,14 @@ def test_beams_through_edges_corners_and_along_faces() -> None:
     }
     for name, (start, end, length) in cases.items():
         beam = EmptyScan(np.zeros(1, dtype=np.uint32), np.array([end], dtype=np.float64), np.zeros(1, dtype=np.bool_))
-        found = cut(beam, site_at(*start))
+        found = cut(beam, Pose(*start))
         assert found.weight[~found.returned].sum() == pytest.approx(math.exp(-0.25 * length), abs=3e-7), name
 
 
 def test_a_crown_that_is_not_closed_stays_opaque() -> None:
     whole = _world((HOOK, 1.0, 4.0))
     open_ = World(whole.vertices_m, whole.faces[1:], whole.solid_of_face[1:], whole.solids)
-    effect = Foliage(Foliage.Model())
+    effect = Foliage(FoliageParameters())
     assert len(effect.opaque(whole).faces) == 0 and len(effect.opaque(open_).faces) == len(open_.faces)
 
 
@@ -509,7 +511,7 @@ def test_skipping_gives_the_score_of_not_skipping(
     place(mini, *standing)
     skipped = hits(mini, tmp_path / "a", *sets)
     for effect in (Divergence, MountSway, Foliage):
-        monkeypatch.setattr(effect, "idle", lambda self, scene: None)
+        monkeypatch.setattr(effect, "why_idle", lambda self, scene: None)
     forced = hits(mini, tmp_path / "b", *sets)
     for site, found in skipped.items():
         np.testing.assert_array_equal(found, forced[site])
@@ -524,10 +526,8 @@ def test_measured_scans_are_taken_as_they_are(mini: Path, tmp_path: Path) -> Non
     assert table.column("weight").to_pylist()[:2] == [1.0, 1.0]
     assert about["sites"][0]["beams_in_roi"] == 2
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m,points\nseen,10,12,3,cloud.csv\n")
-    surveyed = survey.Survey(
-        pipeline.load(mini, [s for sets in EACH.values() for s in sets]), read_ply(out / "statics.ply")[0]
-    )
-    assert set(surveyed.skipped.values()) == {"all scans are measured"} and surveyed.columns == ()
+    scene = pipeline.build_scene(pipeline.load(mini, [s for sets in EACH.values() for s in sets]))
+    assert {effect.why for effect in scene.idle} == {"all scans are measured"} and Scanner(scene).columns == ()
 
 
 @pytest.mark.parametrize(
@@ -547,9 +547,9 @@ def test_divergence_and_sway_compose(mini: Path, tmp_path: Path) -> None:
     products = np.outer(cone_nodes(7)[1], sway_nodes(4)[1]).ravel()
     np.testing.assert_allclose(table.column("weight").to_numpy(), products, rtol=1e-15)
     ends = np.column_stack([table.column(c).to_numpy() for c in ("dx_m", "dy_m", "dz_m")]) / 100
-    site, sensor = survey.sites.of(scenario)[0], Sensor("s", (0.0,), (0.0,), 4, 100.0, "")
-    cone, _, _ = Divergence(Divergence.Model()).expand(np.array([[1.0, 0.0, 0.0]]), sensor, site)
-    both, _, _ = MountSway(MountSway.Model(tilt_deg=0.1)).expand(cone, sensor, site)
+    pose, sensor = sites.of(scenario)[0].pose, Sensor("s", (0.0,), (0.0,), 4, 100.0, "")
+    cone, _, _ = Divergence(DivergenceParameters()).expand(np.array([[1.0, 0.0, 0.0]]), sensor, pose)
+    both, _, _ = MountSway(MountSwayParameters(tilt_deg=0.1)).expand(cone, sensor, pose)
     np.testing.assert_allclose(ends, both, rtol=1e-15, atol=1e-15)
 
 
@@ -575,7 +575,7 @@ def test_foliage_and_rain_compose(mini: Path, tmp_path: Path) -> None:
     clear = [*range(20), *range(28, 80)]  # within the crown the parts' chords, and so their ranges, are shorter
     np.testing.assert_allclose(both[clear], (dry * rain)[clear], atol=1e-9)
     behind = 10.0 + 30.25  # range of the middle of voxel 60
-    loss = Rain(Rain.Model(rate_mm_h=50)).detect(np.array([behind]), Sensor("s", (0.0,), (0.0,), 4, 100.0, ""))[0]
+    loss = Rain(RainParameters(rate_mm_h=50)).detect(np.array([behind]), Sensor("s", (0.0,), (0.0,), 4, 100.0, ""))[0]
     assert both[60] == pytest.approx(math.exp(-1) * loss, abs=1e-9)
 
 
@@ -667,9 +667,7 @@ def test_a_caster_that_knows_no_sites_holds_everything() -> None:
 
 
 def test_idle_looks_at_simulated_sites_only(mini: Path) -> None:
-    scenario = pipeline.load(place(mini, *TREES))
-    world, _ = statics.build(scenario)
-    scene = Scene(scenario, world, survey.sites.of(scenario))
-    assert Foliage(Foliage.Model()).idle(scene) is None
-    assert Divergence(Divergence.Model()).idle(scene) is None
-    assert MountSway(MountSway.Model(tilt_deg=1)).idle(scene) is None
+    scene = pipeline.build_scene(pipeline.load(place(mini, *TREES)))
+    assert Foliage(FoliageParameters()).why_idle(scene) is None
+    assert Divergence(DivergenceParameters()).why_idle(scene) is None
+    assert MountSway(MountSwayParameters(tilt_deg=1)).why_idle(scene) is None

@@ -21,11 +21,16 @@ from hypothesis import strategies as st
 from pipeline.artefacts import tables
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Grid, Roi
+from pipeline.effects import scenes
 from pipeline.effects.registry import effect_class
-from pipeline.sensing.scene import Scene
 from pipeline.effects.traffic import articulated, pedestrians_bicycles, slope
+from pipeline.effects.traffic.articulated import Articulated
+from pipeline.effects.traffic.slope import Slope
+from pipeline.scenario.effects import ArticulatedParameters, SlopeParameters
 from pipeline.scenario.loading import from_values, load
-from pipeline.sensing.scanner import Survey
+from pipeline.sensing import sites
+from pipeline.sensing.scanner import Scanner
+from pipeline.sensing.scene import Scene
 from pipeline.stages import statics, tpog, traffic
 from pipeline.traffic import boxes, fcd, network, sumo, trajectories
 from pipeline.traffic.boxes import Size
@@ -166,7 +171,7 @@ def test_each_switch_acts(flat, plain, climbed, tmp_path):
 
 
 def acts(scene):
-    return make("slope", {}, "place").acts(scene)
+    return Slope(SlopeParameters()).acts(scene)
 
 
 def test_whether_a_network_has_relief_is_told(flat, hill, tmp_path):
@@ -267,10 +272,11 @@ def test_footprints_stand_on_the_hill_and_sites_below_it_are_refused(hill, tmp_p
     }
     assert tops["h"] == pytest.approx(6 + 5, abs=0.2) and spans["h"] == pytest.approx(5 + 10 * GRADE, abs=0.2)
     assert tops["p"] == pytest.approx(10 + 5, abs=0.1) and spans["p"] == pytest.approx(3)
-    Survey(scene, world)
+    Scanner(scenes.resolve(scene, world)).check(sites.of(scene))
     low = values | {"sites": {"grid": {"low_m": [300, 10], "high_m": [300, 10], "spacing_m": 1, "heights_m": [5]}}}
     with pytest.raises(InputError, match=r"z_m = 5 is not above the ground \(z = (6|5\.9\d*)\)"):
-        Survey(from_values(low, tmp_path, "place"), world)
+        below = scenes.resolve(from_values(low, tmp_path, "place"), world)
+        Scanner(below).check(below.sites)
 
 
 def test_a_bridge_keeps_sumos_own_slope(climbed, hill):
@@ -414,12 +420,12 @@ def test_a_long_bus_gets_parts_by_itself_and_a_short_one_does_not():
             ("d", "passenger", 20),
         )
     }
-    found = make("articulated", {}, "place").geometries(sizes, "place")
+    found = Articulated(ArticulatedParameters()).geometries(sizes, "place")
     assert set(found) == {"a", "c"}
     assert found["a"].lengths_m == pytest.approx((10.6, 7.5)) and found["a"].starts_m[1] == pytest.approx(11.25)
     assert found["c"].lengths_m == pytest.approx((6, 10.5)) and found["c"].hinges_m == (4.5,)
     assert found["c"].axles_m == pytest.approx((7.7,))
-    assert make("articulated", {"auto": False}, "place").geometries(sizes, "place") == {}
+    assert Articulated(ArticulatedParameters(auto=False)).geometries(sizes, "place") == {}
 
 
 def test_parts_lie_on_the_slope_of_a_finished_file(tmp_path):
@@ -649,10 +655,16 @@ WRONG = {
     "a negative rate": ("effects.pedestrians_bicycles.pedestrians_per_h=-1", r"pedestrians_per_h: -1"),
     "a flat person": ("effects.pedestrians_bicycles.pedestrian_m=[0.8,0.6,0]", r"pedestrian_m"),
     "no parts": ("effects.articulated.kinds.car.parts_m=[]", r"articulated\.kinds\.car\.parts_m"),
-    "too many hinges": ("effects.articulated.kinds.car={parts_m=[2,2],hinges_m=[2,3]}", r"hinges_m has 2 values for 2 parts, 1"),
+    "too many hinges": (
+        "effects.articulated.kinds.car={parts_m=[2,2],hinges_m=[2,3]}",
+        r"hinges_m has 2 values for 2 parts, 1",
+    ),
     "a wrong word": ("effects.articulated.kind=1", r"articulated\.kind: unknown key; did you mean kinds\?"),
-    "people beside a finished file": ("effects.pedestrians_bicycles.bicycles_per_h=9", r"finished FCD file, so nobody can be"),
-}  # fmt: skip
+    "people beside a finished file": (
+        "effects.pedestrians_bicycles.bicycles_per_h=9",
+        r"finished FCD file, so nobody can be",
+    ),
+}
 
 
 @pytest.mark.parametrize(("override", "message"), WRONG.values(), ids=WRONG.keys())

@@ -11,17 +11,19 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
-import pyarrow as pa
 import pytest
 from hypothesis import event, given, settings
 from hypothesis import strategies as st
 
 import pipeline
 from benchmarks.numerics import boxes as hunt
+from pipeline.artefacts import tables
+from pipeline.artefacts.boxes import FrameBoxes, read_boxes
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Grid
 from pipeline.kernels import boxes
-from pipeline.stages import tpog, traffic
+from pipeline.scoring import occupancy
+from pipeline.stages import traffic
 from tests.oracles import boxes as oracle
 from tests.stages import run_stage
 
@@ -37,8 +39,8 @@ def grid_of(shape=SHAPE, voxel_m=VOXEL_M, origin_m=(0.0, 0.0, 0.0)):
 
 def count(frames, values, grid=None, total=1):
     """Counts by the pipeline's own way in."""
-    batch = tpog.Boxes(np.asarray(frames, np.int64), np.asarray(values, float).reshape(-1, 8))
-    return tpog.count(batch, grid or grid_of(), total)
+    batch = FrameBoxes(np.asarray(frames, np.int64), np.asarray(values, float).reshape(-1, 8))
+    return occupancy.count(batch, grid or grid_of(), total)
 
 
 def cells_of(box, shape=SHAPE, voxel_m=VOXEL_M):
@@ -284,15 +286,17 @@ GOOD = dict(zip(COLUMNS, (1.0, 1.0, 0.5, 0.1, 0.0, 4.5, 1.8, 1.5), strict=True))
 
 @pytest.mark.parametrize("bad", [0.0, -0.0, -1.0, 5e-324, 0.9e-3, math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("name", COLUMNS)
-def test_what_is_no_box_is_refused(name, bad):
+def test_what_is_no_box_is_refused(name, bad, tmp_path):
     if math.isfinite(bad) and not name.startswith(("length", "width", "height")):
         return
     rows = [GOOD, GOOD | {name: bad}]
-    table = pa.table({"frame": pa.array([6, 7], pa.uint32())} | {c: [row[c] for row in rows] for c in COLUMNS})
+    others = {"vehicle": ["a", "b"], "part": [0, 0], "kind": ["passenger"] * 2}
+    columns = {"frame": [6, 7], **others} | {c: [row[c] for row in rows] for c in COLUMNS}
+    tables.write(tmp_path / "trajectories.parquet", "trajectories", columns, {"schema": 1, "frames": 8})
     with pytest.raises(
         InputError, match=r"trajectories.parquet: frame 7: a box with .*; finite values, sizes of at least 0.001 m"
     ) as caught:
-        tpog._boxes(table, grid_of(), Path("trajectories.parquet"))
+        list(read_boxes(tmp_path / "trajectories.parquet", grid_of()))
     assert f"{name} = {bad:g}" in str(caught.value)
 
 
@@ -333,8 +337,11 @@ def test_a_small_traffic_by_brute_force():
         (6, tuple(range(1, 12))),
     ):
         edges = [0, *np.searchsorted(frame, cuts).tolist(), len(frame)]
-        batches = [tpog.Boxes(frame[a:b], values[a:b]) for a, b in itertools.pairwise(edges)]
-        parts = [counts.copy() for counts, _ in tpog._blocks(iter(batches), grid_of(shape), frames // blocks, blocks)]
+        batches = [FrameBoxes(frame[a:b], values[a:b]) for a, b in itertools.pairwise(edges)]
+        parts = [
+            counts.copy()
+            for counts, _ in occupancy.count_blocks(iter(batches), grid_of(shape), frames // blocks, blocks)
+        ]
         assert len(parts) == blocks
         assert np.array_equal(sum(parts), expected), (blocks, cuts)
         for block, part in enumerate(parts):
@@ -431,7 +438,7 @@ def real(tmp_path_factory):
     out = tmp_path_factory.mktemp("real")
     scenario = pipeline.load(SCENARIO, ["traffic.frames=200"])
     run_stage(traffic, scenario, out)
-    batches = list(tpog._read(out / "trajectories.parquet", scenario.roi.grid))
+    batches = list(read_boxes(out / "trajectories.parquet", scenario.roi.grid))
     return np.concatenate([b.frame for b in batches]), np.concatenate([b.values for b in batches]), scenario.roi.grid
 
 
@@ -469,7 +476,7 @@ def counted_by(kernels, frame, values, shape, voxel_m):
 @pytest.mark.system
 def test_the_touching_rule_fails_where_the_0_1_mm_rule_holds(real):
     frame, values, grid = real
-    few = (frame < 3) & tpog._in_reach(values, grid)
+    few = (frame < 3) & occupancy.near_grid(values, grid)
     frame, values = frame[few], values[few]
     for kernels, changes in ((with_fault(), False), (with_fault(("SHRINK_M = 1e-4", "SHRINK_M = 0.0")), True)):
         before = counted_by(kernels, frame, values, grid.shape, grid.voxel_m)

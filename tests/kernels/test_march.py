@@ -21,6 +21,8 @@ from pipeline.core.errors import InputError
 from pipeline.core.grid import Grid
 from pipeline.kernels import march
 from pipeline.scoring.visibility import Beams, in_voxels
+from pipeline.sensing.sensors import CATALOGUE
+from pipeline.sensing.sites import Pose
 from tests.oracles import march as oracle
 
 CORPUS = json.loads((Path(__file__).parent / "data" / "hostile_segments.json").read_text())
@@ -66,8 +68,8 @@ def walked(o, d, shape, voxel_m):
 
 def converted(site_m, beam_m, origin_m, voxel_m, shape):
     """Start and extent as the pipeline hands them to the kernel, from the world frame."""
-    site = {"site": "s", "x_m": site_m[0], "y_m": site_m[1], "z_m": site_m[2]}
-    o, d, _ = in_voxels(Beams(site, np.array([beam_m], float)), Grid(tuple(origin_m), voxel_m, tuple(shape)))
+    beams = Beams(Pose(*site_m), CATALOGUE["VLP-16"], np.array([beam_m], float))
+    o, d, _ = in_voxels(beams, Grid(tuple(origin_m), voxel_m, tuple(shape)))
     return o, d[0]
 
 

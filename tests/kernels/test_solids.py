@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from pipeline.core.grid import Grid
 from pipeline.kernels import solids
-from pipeline.stages import tpog
+from pipeline.scoring import occupancy
 from pipeline.world.mesh import World
 from tests.oracles import boxes as oracle
 
@@ -224,7 +224,7 @@ def world_of(*parts):
 
 
 def filled_by(*parts, grid=GRID):
-    return tpog.static_voxels(world_of(*parts), grid)
+    return occupancy.static_voxels(world_of(*parts), grid)
 
 
 def cells(*ranges):

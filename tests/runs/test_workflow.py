@@ -26,7 +26,7 @@ from pipeline.core.errors import InputError, RunError
 from pipeline.runs import workflow
 from pipeline.runs.locking import alone
 from pipeline.runs.stages import STAGES
-from pipeline.sensing import scanner as survey
+from pipeline.world import casting
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ("statics.ply", "scans.parquet", "trajectories.parquet", "tpog.parquet", "scores.parquet")
@@ -117,7 +117,7 @@ def test_a_changed_setting_runs_what_depends_on_it(
 def test_scoring_again_casts_nothing(done: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     mini, out = done
     casts = []
-    monkeypatch.setattr(survey.Caster, "scan", lambda *_: casts.append(1))
+    monkeypatch.setattr(casting.Caster, "scan", lambda *_: casts.append(1))
     for change in ("score.gamma=2.5", "roi.voxel_m=0.25", "traffic.frames=20"):
         pipeline.run(pipeline.load(mini, [change]), out)
     assert casts == []

@@ -22,8 +22,11 @@ from pipeline.core.grid import Grid
 from pipeline.report.ranking import ScoredSite
 from pipeline.scoring import egvs, uncertainty
 from pipeline.scoring.egvs import EntropyField, binary_entropy
+from pipeline.scoring.scorer import Scorer
 from pipeline.scoring.uncertainty import Estimate, LeaveOut
-from pipeline.scoring.visibility import Visibility
+from pipeline.stages.base import Workspace
+from pipeline.stages.scan_source import scans
+from pipeline.stages.scene import scene_of
 
 GRID = Grid.from_json({"origin_m": [0.0, 0.0, 0.0], "voxel_m": 1.0, "shape": [6, 5, 2]})
 CELLS = np.arange(60)
@@ -191,12 +194,13 @@ def test_scores_say_how_sure_they_are(mini: Path, tmp_path: Path) -> None:
     rows = pipeline.read_scores(tmp_path / "out" / "scores.parquet").to_pylist()
     assert all(row["egvs_se"] > 0 and row["egvs_bias"] < 0 for row in rows)
     assert sorted(row["beats_next"] for row in rows)[-1] == 1.0
-    assert record["stages"]["score"]["summary"]["standard_errors_from"] == "4 groups of 10 frames"
+    assert record.stages["score"].summary["standard_errors_from"] == "4 groups of 10 frames"
     leave_out = LeaveOut.of(tmp_path / "out" / "tpog.parquet", pipeline.read_tpog(tmp_path / "out" / "tpog.parquet"))
     assert leave_out is not None
-    visibility = Visibility(scenario, tmp_path / "out", scenario.roi.grid)
-    for beams, row in zip(visibility.beams(), rows, strict=True):
-        assert leave_out.scores(visibility.hits(beams), 4.0)[0] == pytest.approx(row["egvs"], rel=1e-12)
+    work, tpog = Workspace(scenario, tmp_path / "out"), pipeline.read_tpog(tmp_path / "out" / "tpog.parquet")
+    scorer = Scorer(scene_of(work), tpog, leave_out=leave_out)
+    for scan, row in zip(scans(work), rows, strict=True):
+        assert scorer.score(scan.beams).left_out[0] == pytest.approx(row["egvs"], rel=1e-12)
 
 
 def test_many_blocks_are_joined_as_they_are_read(mini: Path, tmp_path: Path) -> None:

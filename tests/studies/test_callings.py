@@ -24,7 +24,7 @@ def test_every_effect_is_listed_with_its_source(egvs) -> None:
     for call in callings.catalogue():
         assert call.name in printed
         assert call.source
-        assert call.why.endswith("?")  # the question that its module opens with
+        assert call.why.endswith((".", "?"))  # the sentence that its module opens with
 
 
 def test_a_plain_scene_calls_for_none(mini: Path) -> None:

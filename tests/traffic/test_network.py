@@ -41,7 +41,7 @@ def test_network_is_read(tmp_path):
 
 WALKED = """<net><location netOffset="-100.50,20.00" projParameter="+proj=utm +zone=54"/>
   <edge id=":j_w0" function="walkingarea"><lane id=":j_w0_0" index="0" allow="pedestrian" shape="0,0 1,0 1,1"/></edge>
-  <edge id=":j_c0" function="crossing"><lane id=":j_c0_0" index="0" allow="pedestrian" width="4" shape="0,0 9,0"/></edge>
+  <edge id=":j_c0" function="crossing"><lane id=":j_c0_0" allow="pedestrian" width="4" shape="0,0 9,0"/></edge>
   <edge id="in" from="a" to="j" name="High Street"><lane id="in_0" index="0" allow="pedestrian" length="99.5"
     width="2.00" shape="-100,0 -50,0,1.5 0,0"/><lane id="in_1" index="1" shape="-100,3 0,3"/></edge>
   <edge id="out" from="j" to="b"><lane id="out_0" index="0" allow="pedestrian" shape="0,0 5,5"/></edge>

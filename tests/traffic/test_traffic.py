@@ -149,7 +149,8 @@ ROUTES = """<routes>
   <vType id="mini" length="3" width="1.5" height="1.4"/>
   <flow id="l" type="lorry" from="{0}" to="{1}" begin="0" end="100" period="6"/>
   <flow id="m" type="mini" from="{1b}" to="{0b}" begin="0" end="100" period="3"/>
-  <vehicle id="parked" type="mini" depart="0"><route edges="{0}"/><stop lane="{0}_0" endPos="60" duration="900"/></vehicle>
+  <vehicle id="parked" type="mini" depart="0"><route edges="{0}"/>
+    <stop lane="{0}_0" endPos="60" duration="900"/></vehicle>
 </routes>
 """
 
@@ -186,7 +187,8 @@ def test_own_routes_get_their_sizes_from_sumo(town, tmp_path):
 
 
 CONFIG = """<configuration>
-  <input><net-file value="net.xml"/><route-files value="own.rou.xml"/><additional-files value="more/red.add.xml"/></input>
+  <input><net-file value="net.xml"/><route-files value="own.rou.xml"/>
+    <additional-files value="more/red.add.xml"/></input>
   <output><tripinfo-output value="/nowhere/trips.xml"/><fcd-output.geo value="true"/></output>
   <time><begin value="25200"/><end value="25300"/><step-length value="0.1"/></time>
   <processing><device.rerouting.threads value="4"/><time-to-teleport value="5"/></processing>
@@ -227,7 +229,8 @@ def test_a_jam_without_end_fails_with_its_numbers(town, tmp_path):
     """All signals of the town stay red."""
     text = (town / "net.xml").read_text()
     red = [
-        f'<tlLogic id="{name}" type="static" programID="red" offset="0"><phase duration="60" state="{"r" * len(state)}"/></tlLogic>'
+        f'<tlLogic id="{name}" type="static" programID="red" offset="0">'
+        f'<phase duration="60" state="{"r" * len(state)}"/></tlLogic>'
         for name, state in re.findall(r'<tlLogic id="([^"]+)".*?state="([^"]+)"', text, re.S)
     ]
     assert len(red) == 4
@@ -264,7 +267,8 @@ def test_no_vehicle_at_all_fails(town, tmp_path):
         run_stage(traffic, scenario(tmp_path, network="net.xml", **keys), tmp_path / "out")
 
 
-NODES = """<nodes><node id="a" x="0" y="0" z="0"/><node id="b" x="400" y="0" z="40"/><node id="c" x="800" y="0" z="40"/></nodes>"""
+NODES = """<nodes><node id="a" x="0" y="0" z="0"/><node id="b" x="400" y="0" z="40"/>
+<node id="c" x="800" y="0" z="40"/></nodes>"""
 EDGES = """<edges><edge id="ab" from="a" to="b" numLanes="2"/><edge id="bc" from="b" to="c" numLanes="2"/></edges>"""
 
 

@@ -20,6 +20,7 @@ def write(name, text):
 
 CAR_ROUTE = '<routes><vehicle id="v" depart="0"><route edges="nowhere"/></vehicle></routes>'
 BOMB = '<!DOCTYPE net [<!ENTITY a "b">]><net>&a;</net>'
+FCD = "timestep_time;vehicle_id;vehicle_x;vehicle_y;vehicle_angle;vehicle_type"
 BAD = {
     "period between steps": (
         nothing,
@@ -27,51 +28,102 @@ BAD = {
         InputError,
         r"traffic\.frame_period_s = 0\.3: is no whole number of steps of 0\.25 s; for example 0\.25 or 0\.5",
     ),
-    "warm-up between steps": (nothing, {"network": "net.xml", "warmup_s": 10.1}, InputError, r"warmup_s = 10\.1: is no whole"),
+    "warm-up between steps": (
+        nothing,
+        {"network": "net.xml", "warmup_s": 10.1},
+        InputError,
+        r"warmup_s = 10\.1: is no whole",
+    ),
     "step below a millisecond": (
-        nothing, {"network": "net.xml", "step_s": 0.0004}, InputError, r"step_s = 0\.0004: is no whole number of milliseconds",
+        nothing,
+        {"network": "net.xml", "step_s": 0.0004},
+        InputError,
+        r"step_s = 0\.0004: is no whole number of milliseconds",
     ),
-    "no network": (nothing, {"network": "none.net.xml"}, InputError, r"traffic\.network = 'none\.net\.xml': no such file"),
+    "no network": (
+        nothing,
+        {"network": "none.net.xml"},
+        InputError,
+        r"traffic\.network = 'none\.net\.xml': no such file",
+    ),
     "a map in another format": (
-        write("m.osm.pbf", "OSMHeader"), {"network": "m.osm.pbf"}, InputError, r"m\.osm\.pbf: is in the PBF format",
+        write("m.osm.pbf", "OSMHeader"),
+        {"network": "m.osm.pbf"},
+        InputError,
+        r"m\.osm\.pbf: is in the PBF format",
     ),
-    "no routes": (nothing, {"network": "net.xml", "routes": ["r.xml"]}, InputError, r"traffic\.routes = 'r\.xml': no such file"),
+    "no routes": (
+        nothing,
+        {"network": "net.xml", "routes": ["r.xml"]},
+        InputError,
+        r"traffic\.routes = 'r\.xml': no such file",
+    ),
     "empty network": (write("e.xml", "<net/>"), {"network": "e.xml"}, InputError, r"e\.xml: the network has no road"),
-    "no network inside": (write("e.xml", "<routes/>"), {"network": "e.xml"}, InputError, r"e\.xml: its root is <routes>"),
-    "malformed network": (write("e.xml", "<net><edge"), {"network": "e.xml"}, InputError, r"e\.xml: is not well-formed XML"),
+    "no network inside": (
+        write("e.xml", "<routes/>"),
+        {"network": "e.xml"},
+        InputError,
+        r"e\.xml: its root is <routes>",
+    ),
+    "malformed network": (
+        write("e.xml", "<net><edge"),
+        {"network": "e.xml"},
+        InputError,
+        r"e\.xml: is not well-formed XML",
+    ),
     "network with entities": (write("e.xml", BOMB), {"network": "e.xml"}, InputError, r"e\.xml: declares XML entities"),
     "damaged edge": (
-        write("e.xml", '<net><edge id="a" from="b"/></net>'), {"network": "e.xml"}, InputError, r"<edge id='a'> is not as in a",
+        write("e.xml", '<net><edge id="a" from="b"/></net>'),
+        {"network": "e.xml"},
+        InputError,
+        r"<edge id='a'> is not as in a",
     ),
     "kind unknown to SUMO": (
         nothing,
         {"network": "net.xml", "kinds": [car(vclass="saucer").model_dump()]},
-        InputError, r"kind 'car' has the vClass 'saucer'",
+        InputError,
+        r"kind 'car' has the vClass 'saucer'",
     ),
     "trips too long": (nothing, {"network": "net.xml", "min_trip_m": 5000}, InputError, r"to another that is 5000 m"),
     "routes off the network": (
-        write("r.xml", CAR_ROUTE), {"network": "net.xml", "routes": ["r.xml"]}, RunError, r"sumo ended with exit code 1:\n.*nowh",
+        write("r.xml", CAR_ROUTE),
+        {"network": "net.xml", "routes": ["r.xml"]},
+        RunError,
+        r"sumo ended with exit code 1:\n.*nowh",
     ),
     "configuration names no network": (
-        write("c.sumocfg", "<configuration/>"), {"sumocfg": "c.sumocfg"}, InputError, r"c\.sumocfg: names no net-file",
+        write("c.sumocfg", "<configuration/>"),
+        {"sumocfg": "c.sumocfg"},
+        InputError,
+        r"c\.sumocfg: names no net-file",
     ),
     "configuration names a missing file": (
         write("c.sumocfg", '<configuration><net-file value="gone.xml"/></configuration>'),
-        {"sumocfg": "c.sumocfg"}, InputError, r"c\.sumocfg: net-file = 'gone\.xml': no such file",
+        {"sumocfg": "c.sumocfg"},
+        InputError,
+        r"c\.sumocfg: net-file = 'gone\.xml': no such file",
     ),
     "configuration lets vehicles jump": (
-        write("c.sumocfg", '<configuration><net-file value="net.xml"/><no-internal-links value="true"/></configuration>'),
-        {"sumocfg": "c.sumocfg"}, InputError, r"no-internal-links = 'true': lets vehicles jump",
+        write(
+            "c.sumocfg", '<configuration><net-file value="net.xml"/><no-internal-links value="true"/></configuration>'
+        ),
+        {"sumocfg": "c.sumocfg"},
+        InputError,
+        r"no-internal-links = 'true': lets vehicles jump",
     ),
     "unknown type in a finished file": (
-        write("f.csv", "timestep_time;vehicle_id;vehicle_x;vehicle_y;vehicle_angle;vehicle_type\n0;v;1;2;3;tram\n1;v;1;2;3;tram\n"),
-        {"fcd": "f.csv", "frames": 1, "warmup_s": 0, "frame_period_s": 1}, InputError, r"vehicle type 'tram' has no known size",
+        write("f.csv", f"{FCD}\n0;v;1;2;3;tram\n1;v;1;2;3;tram\n"),
+        {"fcd": "f.csv", "frames": 1, "warmup_s": 0, "frame_period_s": 1},
+        InputError,
+        r"vehicle type 'tram' has no known size",
     ),
     "too few frames in a finished file": (
-        write("f.csv", "timestep_time;vehicle_id;vehicle_x;vehicle_y;vehicle_angle;vehicle_type\n0;v;1;2;3;car\n1;v;1;2;3;car\n"),
-        {"fcd": "f.csv", "frames": 9, "warmup_s": 0, "frame_period_s": 1}, InputError, r"frames = 9: the file has 2 frames",
+        write("f.csv", f"{FCD}\n0;v;1;2;3;car\n1;v;1;2;3;car\n"),
+        {"fcd": "f.csv", "frames": 9, "warmup_s": 0, "frame_period_s": 1},
+        InputError,
+        r"frames = 9: the file has 2 frames",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(("prepare", "keys", "error", "message"), BAD.values(), ids=BAD.keys())

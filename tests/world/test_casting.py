@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Roi
+from pipeline.effects import scenes
 from pipeline.kernels import rays
 from pipeline.scenario import loading
-from pipeline.sensing import scanner as survey
+from pipeline.sensing.scanner import Scanner
 from pipeline.sensing.sensors import CATALOGUE
-from pipeline.stages import statics
 from pipeline.world.casting import Caster, standing_on, with_planes
 from pipeline.world.mesh import World
 from tests.oracles import cast
@@ -400,14 +400,13 @@ def test_shipped_scene_agrees_with_brute_force(name, site):
     """Every fifth beam of a site against all triangles; ``make numerics`` holds every beam of every site against
     them."""
     loaded = loading.load(f"scenarios/{name}")
-    world = statics.build(loaded)[0]
-    surveyed = survey.Survey(loaded, world)
-    place = surveyed.sites[site]
-    scan = surveyed.scan(place).scan
+    scene = scenes.build(loaded)
+    place, world = scene.sites[site], scene.world
+    scan = Scanner(scene).scan_site(place).rows
     chosen = slice(None, None, 5)
-    d = CATALOGUE[place.sensor].directions(place.yaw_deg, place.pitch_deg, place.roll_deg)[scan.beam[chosen]]
+    d = CATALOGUE[place.sensor].directions(*place.pose.angles_deg)[scan.beam[chosen]]
     corners = world.triangles_m - np.asarray(loaded.roi.box.origin_m)
-    true, _ = cast.first_hits(np.asarray(place.position_m) - loaded.roi.box.origin_m, d, corners)
+    true, _ = cast.first_hits(np.asarray(place.pose.position_m) - loaded.roi.box.origin_m, d, corners)
     reach = CATALOGUE[place.sensor].range_m
     assert (scan.returned[chosen] == (true <= reach)).all()
     assert np.abs(scan.ends_m[chosen] - d * np.minimum(true, reach)[:, None]).max() < 1e-9

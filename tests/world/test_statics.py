@@ -9,9 +9,10 @@ import pytest
 import trimesh
 
 from pipeline.core.errors import InputError
+from pipeline.effects import scenes
 from pipeline.scenario import loading
 from pipeline.scenario.loading import from_values
-from pipeline.sensing import scanner as survey
+from pipeline.sensing.scanner import Scanner
 from pipeline.stages import statics
 from pipeline.world import building
 from pipeline.world.mesh import World, read_ply, write_ply
@@ -39,7 +40,7 @@ def load(folder, **settings):
 def built(folder, *features):
     """The world and the counts of a GeoJSON file."""
     (folder / "s.geojson").write_text(collection(*features))
-    return statics.build(load(folder, footprints=["s.geojson"]))
+    return building.build(load(folder, footprints=["s.geojson"]))
 
 
 def volumes(world):
@@ -52,7 +53,7 @@ def volumes(world):
 def mesh_of(folder, mesh, **settings):
     """The world and the counts of a mesh file."""
     mesh.export(folder / "m.ply")
-    return statics.build(load(folder, meshes=[{"file": "m.ply", **settings}]))
+    return building.build(load(folder, meshes=[{"file": "m.ply", **settings}]))
 
 
 @pytest.mark.parametrize(
@@ -99,12 +100,19 @@ def test_points_are_discs_and_lines_are_strips(tmp_path):
     [
         ([polygon([[0, 0], [4, 0], [4, 0], [4, 4], [4, 4], [4, 4], [0, 4], [0, 0]])], {"doubled points": 3}, [16]),
         # two triangles that share a corner, as one ring
-        ([polygon([[0, 0], [4, 0], [2, 2], [4, 4], [0, 4], [2, 2], [0, 0]])], {"rings that touched themselves": 1}, [4, 4]),
+        (
+            [polygon([[0, 0], [4, 0], [2, 2], [4, 4], [0, 4], [2, 2], [0, 0]])],
+            {"rings that touched themselves": 1},
+            [4, 4],
+        ),
         # a ring that runs round its own hole and back through a point
-        ([polygon([[0, 0], [9, 0], [9, 9], [0, 9], [0, 0], [2, 3], [3, 6], [6, 3], [0, 0]])],
-         {"rings that touched themselves": 1}, [81 - 12]),
+        (
+            [polygon([[0, 0], [9, 0], [9, 9], [0, 9], [0, 0], [2, 3], [3, 6], [6, 3], [0, 0]])],
+            {"rings that touched themselves": 1},
+            [81 - 12],
+        ),
     ],
-)  # fmt: skip
+)
 def test_dirt_with_one_meaning_is_mended_and_counted(tmp_path, features, mended, area):
     world, counts = built(tmp_path, *features)
     assert dict(counts.mended) == mended
@@ -165,13 +173,13 @@ def test_poly_xml(tmp_path):
         '<additional><poly id="a" type="building" fill="1" shape="{a}"><param key="height" value="3"/></poly>'
         '<poly id="c" fill="0" shape="{c}"/><poi id="p" x="0" y="0"/></additional>'.format(**shapes)
     )
-    world, counts = statics.build(load(tmp_path, polygons=["s.poly.xml"]))
+    world, counts = building.build(load(tmp_path, polygons=["s.poly.xml"]))
     assert volumes(world) == pytest.approx([48], rel=1e-12)
     assert sum(counts.left_out.values()) == 2
     for name in "bd":
         (tmp_path / "s.poly.xml").write_text(f'<additional><poly id="x" fill="1" shape="{shapes[name]}"/></additional>')
         with pytest.raises(InputError, match="poly x"):
-            statics.build(load(tmp_path, polygons=["s.poly.xml"]))
+            building.build(load(tmp_path, polygons=["s.poly.xml"]))
 
 
 BOX = trimesh.creation.box((4, 6, 8))
@@ -223,25 +231,25 @@ def test_a_soup_of_separate_triangles_is_sewn(tmp_path):
 def test_a_vertex_that_is_no_number_is_refused(tmp_path, value):
     (tmp_path / "m.obj").write_text(f"v 0 0 0\nv 1 0 0\nv 0 {value} 0\nf 1 2 3\n")
     with pytest.raises(InputError, match=r"m\.obj: vertex 2"):
-        statics.build(load(tmp_path, meshes=[{"file": "m.obj"}]))
+        building.build(load(tmp_path, meshes=[{"file": "m.obj"}]))
 
 
 def test_a_mesh_without_triangles_is_refused(tmp_path):
     (tmp_path / "m.obj").write_text("v 0 0 0\nv 1 0 0\n")
     with pytest.raises(InputError, match=r"m\.obj"):
-        statics.build(load(tmp_path, meshes=[{"file": "m.obj"}]))
+        building.build(load(tmp_path, meshes=[{"file": "m.obj"}]))
 
 
 def test_a_mesh_of_nothing_but_degenerate_triangles_is_refused(tmp_path):
     (tmp_path / "m.obj").write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 1 2\nf 1 2 3\n")
     with pytest.raises(InputError, match=r"m\.obj"):
-        statics.build(load(tmp_path, meshes=[{"file": "m.obj"}]))
+        building.build(load(tmp_path, meshes=[{"file": "m.obj"}]))
 
 
 def test_ground_reaches_beyond_everything(tmp_path):
     (tmp_path / "s.geojson").write_text(collection(polygon([[p[0] + 300, p[1]] for p in SQUARE])))
     loaded = load(tmp_path, footprints=["s.geojson"], ground=True)
-    world, _ = statics.build(loaded)
+    world, _ = building.build(loaded)
     ground = world.triangles_m[world.solid_of_face == 1]
     assert (ground[..., 2] == 0).all()
     assert ground[..., 0].max() == 304 + building.GROUND_MARGIN_M
@@ -272,13 +280,20 @@ def test_ply_comes_back_bit_for_bit(tmp_path):
             read_ply(tmp_path / "w.ply")
 
 
-def survey_at(folder, *sites, features, ground=True):
+def checked_at(folder, *sites, features, ground=True):
     (folder / "s.geojson").write_text(collection(*features))
     (folder / "sites.csv").write_text(
         "site,x_m,y_m,z_m\n" + "".join(f"s{i},{x!r},{y!r},{z!r}\n" for i, (x, y, z) in enumerate(sites))
     )
     loaded = load(folder, footprints=["s.geojson"], ground=ground)
-    return survey.Survey(loaded, statics.build(loaded)[0])
+    return checked(loaded, building.build(loaded)[0])
+
+
+def checked(loaded, world):
+    """The scene, once all of its sites are checked."""
+    scene = scenes.resolve(loaded, world)
+    Scanner(scene).check(scene.sites)
+    return scene
 
 
 HOUSES = (
@@ -309,7 +324,7 @@ HOUSES = (
     ],
 )
 def test_free_places(tmp_path, site):
-    assert len(survey_at(tmp_path, site, features=HOUSES).sites) == 1
+    assert len(checked_at(tmp_path, site, features=HOUSES).sites) == 1
 
 
 @pytest.mark.parametrize(
@@ -328,7 +343,7 @@ def test_free_places(tmp_path, site):
 )
 def test_impossible_places(tmp_path, site, message):
     with pytest.raises(InputError, match=message):
-        survey_at(tmp_path, site, features=HOUSES)
+        checked_at(tmp_path, site, features=HOUSES)
 
 
 @pytest.mark.parametrize("degrees", range(3, 90, 7))
@@ -340,10 +355,10 @@ def test_a_site_on_an_oblique_wall_is_no_matter_of_rounding(tmp_path, degrees):
         for y in (-1.1, 0.0, 0.3)
         for d in (-5e-7, -1e-12, 0.0, 1e-12)
     ]
-    assert len(survey_at(tmp_path, *walls, features=[polygon(house.tolist())]).sites) == len(walls)
+    assert len(checked_at(tmp_path, *walls, features=[polygon(house.tolist())]).sites) == len(walls)
     deep = (*(float(v) for v in turn @ [1.999, 0.3] + 20), 3.0)
     with pytest.raises(InputError, match="inside it"):
-        survey_at(tmp_path, deep, features=[polygon(house.tolist())])
+        checked_at(tmp_path, deep, features=[polygon(house.tolist())])
 
 
 def test_a_site_inside_an_inverted_solid_is_found_and_an_open_one_is_not(tmp_path):
@@ -355,9 +370,9 @@ def test_a_site_inside_an_inverted_solid_is_found_and_an_open_one_is_not(tmp_pat
         loaded = load(tmp_path, meshes=[{"file": "m.ply", "offset_m": (20, 20, 3)}])
         if refused:
             with pytest.raises(InputError, match="inside m_0"):
-                survey.Survey(loaded, world)
+                checked(loaded, world)
         else:
-            assert len(survey.Survey(loaded, world).sites) == 1
+            assert len(checked(loaded, world).sites) == 1
 
 
 def test_closed_means_each_side_met_by_its_opposite():
@@ -377,7 +392,7 @@ def test_closed_means_each_side_met_by_its_opposite():
 
 def test_shipped_statics_are_closed_and_clean():
     for name in ("nishishinjuku", "ingolstadt"):
-        world, counts = statics.build(loading.load(f"scenarios/{name}"))
+        world, counts = building.build(loading.load(f"scenarios/{name}"))
         kinds = [kind for _, kind in world.solids]
         assert [k for k, closed in zip(kinds, world.closed, strict=True) if not closed] == ["ground"]
         assert (world.signs[world.closed] == 1).all()
