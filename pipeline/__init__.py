@@ -35,7 +35,7 @@ from pipeline.core.version import __version__
 if TYPE_CHECKING:
     from pipeline.artefacts.readers import Tpog, read_scans, read_scores, read_tpog, read_trajectories, read_visibility
     from pipeline.core.errors import EgvsError, InputError, RunError
-    from pipeline.effects.scenes import build as build_scene
+    from pipeline.effects.built_scene import build_scene
     from pipeline.runs.workflow import run, verify
     from pipeline.scenario.loading import load
     from pipeline.scenario.models import Scenario
@@ -59,7 +59,7 @@ _HOME = {
     "Site": "sensing.sites",
     "Tpog": "artefacts.readers",
     "World": "world.mesh",
-    "build_scene": "effects.scenes:build",
+    "build_scene": "effects.built_scene",
     "load": "scenario.loading",
     "read_scans": "artefacts.readers",
     "read_scores": "artefacts.readers",
@@ -69,7 +69,7 @@ _HOME = {
     "run": "runs.workflow",
     "verify": "runs.workflow",
 }
-"""Public name -> the module that it is from, and the name there where that is another one."""
+"""Public name -> the module that it is from."""
 
 __all__ = [
     "EgvsError",
@@ -99,8 +99,7 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name in _HOME:
-        module, _, there = _HOME[name].partition(":")
-        return getattr(importlib.import_module(f"pipeline.{module}"), there or name)
+        return getattr(importlib.import_module(f"pipeline.{_HOME[name]}"), name)
     raise AttributeError(f"module 'pipeline' has no attribute {name!r}")
 
 

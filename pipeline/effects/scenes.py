@@ -2,24 +2,11 @@
 
 from __future__ import annotations
 
-from pipeline.effects import on_traffic, registry
+from pipeline.effects import registry
 from pipeline.scenario.models import Scenario
 from pipeline.sensing import sites
 from pipeline.sensing.scene import IdleEffect, Scene
-from pipeline.world import building
 from pipeline.world.mesh import World
-
-
-def build(scenario: Scenario) -> Scene:
-    """The scene of a scenario, its static world built in memory; nothing is written.
-
-    Raises
-    ------
-    InputError
-        When the scenario, or a file that it names, is wrong.
-    """
-    world, _ = building.build(scenario, on_traffic.ground(scenario))
-    return resolve(scenario, world)
 
 
 def resolve(scenario: Scenario, world: World) -> Scene:

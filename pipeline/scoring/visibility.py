@@ -52,12 +52,15 @@ class Beams:
         Where each piece ends, seen from the sensor along the world's axes, (n, 3) float64.
     weight
         The share of its beam that each row is, (n,) float64; None where every row is a whole beam.
+    place
+        Where messages point to.
     """
 
     pose: Pose
     sensor: Sensor
     ends_m: NDArray[np.float64]
     weight: NDArray[np.float64] | None = None
+    place: str = "scan"
 
     @classmethod
     def of(cls, scan: Scan) -> Beams:
@@ -115,7 +118,7 @@ class Visibility:
         whole = float(len(beams.ends_m) if beams.weight is None else beams.weight.sum())
         most = MOST_CROSSINGS / (sum(self._grid.shape) + 3)
         if whole >= most:  # no sum over voxels may leave 64 bits
-            raise InputError(f"sensor {beams.sensor.name}", f"{whole:g} beams with effects", f"fewer than {most:g}")
+            raise InputError(beams.place, f"{whole:g} beams with effects", f"fewer than {most:g}")
         for piece in crossings.listed(beams.pose.position_m, beams.ends_m, self._grid):
             share = np.ones(len(piece.cells)) if beams.weight is None else beams.weight[piece.rows][piece.piece]
             for effect in self._effects:
@@ -129,9 +132,8 @@ class Visibility:
 def in_voxels(beams: Beams, grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
     """Sensor (3,), beams (n, 3) and shape (3,) as :mod:`pipeline.kernels.march` wants them; InputError for what no grid
     holds."""
-    pose, ends_m = beams.pose, beams.ends_m
-    place = f"scan from ({pose.x_m:g}, {pose.y_m:g}, {pose.z_m:g})"
-    o_m = grid.to_grid_m(np.array(pose.position_m))
+    place, ends_m = beams.place, beams.ends_m
+    o_m = grid.to_grid_m(np.array(beams.pose.position_m))
     with np.errstate(over="ignore"):
         o, d = o_m / grid.voxel_m, ends_m / grid.voxel_m
     if not (np.isfinite(o).all() and np.isfinite(d).all()):

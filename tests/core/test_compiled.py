@@ -20,6 +20,8 @@ OUTER = (
 )
 CALL = """
 from pipeline.kernels.outer import outer
+
+pytestmark = pytest.mark.system
 print(outer(1), "compiled" if outer.stats.cache_misses else "kept")
 """
 

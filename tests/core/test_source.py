@@ -94,7 +94,7 @@ CHANGED = {
     "kernels/boxes.py": {"tpog", "scan", "score", "page"},  # whose depth of contact the other kernels share
     "kernels/foliage.py": set(),  # an effect's
     "kernels/rays.py": {"scan", "score", "page"},  # without kept scans, these two cast
-    "traffic/demand.py": {"traffic"},
+    "traffic/demand.py": {"statics", "traffic"},  # statics asks the network whether it has relief
     "core/grid.py": {"statics", "scan", "traffic", "tpog", "score", "page"},
     "studies/accuracy.py": set(),
     "cli/app.py": set(),
@@ -102,6 +102,7 @@ CHANGED = {
 }
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("file", CHANGED)
 def test_a_changed_line_changes_the_digest_of_what_imports_it(file: str, tmp_path: Path) -> None:
     shutil.copytree(PACKAGE, tmp_path / "pipeline", ignore=shutil.ignore_patterns("__pycache__"))

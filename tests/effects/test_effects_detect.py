@@ -93,7 +93,7 @@ def stages(folder: Path, out: Path) -> tuple[Path, Path]:
     out.mkdir()
     scenario = pipeline.load(folder)
     for stage in (statics, scan, traffic, tpog, score):
-        stage.run(scenario, out)
+        run_stage(stage, scenario, out)
     return folder, out
 
 
@@ -464,7 +464,7 @@ def test_every_effect_names_its_source(name: str) -> None:
 
 
 BAD = {
-    "negative rain": ("rain.rate_mm_h=-1", "effects.rain.rate_mm_h: -1; Input should be greater than or equal to 0"),
+    "negative rain": ("rain.rate_mm_h=-1", "effects.rain.rate_mm_h: -1; input should be greater than or equal to 0"),
     "too much rain": ("rain.rate_mm_h=301", "effects.rain.rate_mm_h: 301"),
     "rain that is no number": ("rain.rate_mm_h=nan", "effects.rain.rate_mm_h: nan"),
     "rain in words": ("rain.rate_mm_h=heavy", "effects.rain.rate_mm_h: 'heavy'"),
@@ -510,7 +510,7 @@ def test_only_the_score_runs_again(mini: Path, tmp_path: Path) -> None:
     def states(*settings: str) -> dict[str, str]:
         seen: dict[str, str] = {}
         workflow.run(
-            pipeline.load(mini, settings), tmp_path / "out", told=lambda stage, state, _: seen.__setitem__(stage, state)
+            pipeline.load(mini, settings), tmp_path / "out", listener=lambda stage, state, _: seen.__setitem__(stage, state)
         )
         return seen
 
@@ -532,7 +532,7 @@ from pipeline.stages import score
 from tests.stages import run_stage
 pipeline.load({folder!r}, {settings!r})
 run_stage(score, pipeline.load({folder!r}, {settings!r}), __import__("pathlib").Path({out!r}), jobs=1)
-print(sorted(name for name in sys.modules if name.startswith("pipeline.effects.s")))
+print(sorted(name for name in sys.modules if name.startswith(("pipeline.effects.scan", "pipeline.effects.score", "pipeline.effects.traffic"))))
 """
 
 
@@ -558,7 +558,7 @@ def test_a_whole_plain_run_imports_no_effect(mini: Path, tmp_path: Path) -> None
 import sys
 import pipeline
 pipeline.run(pipeline.load({str(mini)!r}), {str(tmp_path / "out")!r}, jobs=1)
-print([name for name in sys.modules if name.startswith("pipeline.effects.s")])
+print([name for name in sys.modules if name.startswith(("pipeline.effects.scan", "pipeline.effects.score", "pipeline.effects.traffic"))])
 """
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "[]"

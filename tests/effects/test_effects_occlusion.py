@@ -211,10 +211,10 @@ def test_the_nearest_of_two_cars_counts_once() -> None:
 def test_a_beam_passes_over_under_and_beside() -> None:
     one = replay({0: [car(10, 0)]}, 1)
     for ends, z in (([20, 0, 0], 1.75), ([20, 0, 0], 1.5), ([20, 1.25, 0], 1.75)):
-        assert (one.share(listed(site(0, 0.25, z), [ends])) == 1).all()
+        assert (one.share(listed((0, 0.25, z), [ends])) == 1).all()
     assert (one.share(listed((0, 1.0, 1), [[20, 0, 0]])) == 1).all()  # along its side, to the last bit
-    assert (one.share(listed(site(0, 1.0 - 0.5e-4, 1), [[20, 0, 0]])) == 1).all()  # 0.05 mm deep
-    assert (one.share(listed(site(0, 1.0 - 2e-4, 1), [[20, 0, 0]])) == 1).sum() == 17  # 0.2 mm deep
+    assert (one.share(listed((0, 1.0 - 0.5e-4, 1), [[20, 0, 0]])) == 1).all()  # 0.05 mm deep
+    assert (one.share(listed((0, 1.0 - 2e-4, 1), [[20, 0, 0]])) == 1).sum() == 17  # 0.2 mm deep
 
 
 def test_a_face_on_a_voxel_face_hides_from_the_second_voxel_on_from_either_side() -> None:

@@ -68,7 +68,7 @@ def walked(o, d, shape, voxel_m):
 
 def converted(site_m, beam_m, origin_m, voxel_m, shape):
     """Start and extent as the pipeline hands them to the kernel, from the world frame."""
-    beams = Beams(Pose(*site_m), CATALOGUE["VLP-16"], np.array([beam_m], float))
+    beams = Beams(Pose(*site_m), CATALOGUE["VLP-16"], np.array([beam_m], float), place="scans.parquet: site s")
     o, d, _ = in_voxels(beams, Grid(tuple(origin_m), voxel_m, tuple(shape)))
     return o, d[0]
 

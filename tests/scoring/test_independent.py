@@ -24,6 +24,7 @@ from pipeline.scenario import loading
 from pipeline.stages import scan, score, statics, tpog, traffic
 from pipeline.world.mesh import World, read_ply, write_ply
 from tests.oracles import cast
+from tests.stages import run_stage
 
 pytestmark = pytest.mark.system  # SUMO makes the traffic
 
@@ -53,7 +54,7 @@ def runs(tmp_path_factory):
         folders[name] = tmp_path_factory.mktemp(name)
         loaded = load(name)
         for stage in (traffic, statics, tpog, scan, score):
-            stage.run(loaded, folders[name])
+            run_stage(stage, loaded, folders[name])
     return folders
 
 
@@ -309,7 +310,7 @@ def test_a_scene_moved_by_4000_km_gives_the_same_bits(runs, tmp_path):
             columns[axis] = pa.array(np.round(table[axis].to_numpy() * 2**16) / 2**16 + by)
         pq.write_table(pa.table(columns, schema=schema), folder / "trajectories.parquet")
         for stage in (tpog, scan, score):
-            stage.run(loaded, folder)
+            run_stage(stage, loaded, folder)
         scores = ["site", "egvs", "egvs_limit", "rank", "entropy_seen", "returns"]
         kept_columns = {"tpog": None, "visibility": None, "scans": None, "scores": scores}
         found.append(

@@ -28,7 +28,7 @@ def load(folder, *overrides):
 def run(folder, out, *overrides, stages=STAGES, jobs=None):
     loaded = load(folder, *overrides)
     for stage in stages:
-        stage.run(loaded, out, jobs=jobs)
+        run_stage(stage, loaded, out, jobs=jobs)
     return {row["site"]: row for row in read_scores(out / "scores.parquet").to_pylist()}
 
 

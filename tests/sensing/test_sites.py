@@ -35,7 +35,7 @@ def of_lines(mini: Path, *rules: dict[str, Any]) -> tuple[sites.Site, ...]:
 
 
 def places(found: tuple[sites.Site, ...]) -> list[tuple[str, float, float, float]]:
-    return [(site.site, *site.position_m) for site in found]
+    return [(site.name, *site.pose.position_m) for site in found]
 
 
 # --- GeoJSON ----------------------------------------------------------------------------------------------------------
@@ -141,7 +141,7 @@ def test_the_end_of_a_line_has_a_site_though_tenths_do_not_add_up(mini: Path) ->
 
 def test_many_sites_have_names_of_one_length(mini: Path) -> None:
     found = of_lines(mini, {"line": [[0, 0], [120, 0]], "spacing": 1, "heights": [3]})
-    assert [found[i].site for i in (0, 9, 120)] == ["a001", "a010", "a121"]
+    assert [found[i].name for i in (0, 9, 120)] == ["a001", "a010", "a121"]
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Roi
-from pipeline.effects import scenes
+from pipeline.effects.built_scene import build_scene
 from pipeline.kernels import rays
 from pipeline.scenario import loading
 from pipeline.sensing.scanner import Scanner
@@ -400,7 +400,7 @@ def test_shipped_scene_agrees_with_brute_force(name, site):
     """Every fifth beam of a site against all triangles; ``make numerics`` holds every beam of every site against
     them."""
     loaded = loading.load(f"scenarios/{name}")
-    scene = scenes.build(loaded)
+    scene = build_scene(loaded)
     place, world = scene.sites[site], scene.world
     scan = Scanner(scene).scan_site(place).rows
     chosen = slice(None, None, 5)
