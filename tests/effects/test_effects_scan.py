@@ -490,7 +490,7 @@ def test_an_effect_that_can_change_nothing_is_skipped_and_leaves_no_trace(
     keeps = f"scan.keep={keep}"
     pipeline.run(pipeline.load(mini, [keeps]), tmp_path / "plain", jobs=1)
     record = pipeline.run(pipeline.load(mini, [keeps, *sets]), tmp_path / "named", jobs=1)
-    said = record["stages"]["scan"]["said"]
+    said = record.stages["scan"].summary
     if case.startswith("bare"):
         assert "skipped" not in said  # beams of pole_b pass it
         return

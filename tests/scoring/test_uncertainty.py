@@ -185,7 +185,7 @@ def test_scores_say_how_sure_they_are(mini: Path, tmp_path: Path) -> None:
     rows = pipeline.read_scores(tmp_path / "out" / "scores.parquet").to_pylist()
     assert all(row["egvs_se"] > 0 and row["egvs_bias"] < 0 for row in rows)
     assert sorted(row["beats_next"] for row in rows)[-1] == 1.0
-    assert record["stages"]["score"]["said"]["standard_errors_from"] == "4 groups of 10 frames"
+    assert record.stages["score"].summary["standard_errors_from"] == "4 groups of 10 frames"
     leave_out = LeaveOut.of(tmp_path / "out" / "tpog.parquet", pipeline.read_tpog(tmp_path / "out" / "tpog.parquet"))
     assert leave_out is not None
     visibility = Visibility(scenario, tmp_path / "out", scenario.roi.grid)

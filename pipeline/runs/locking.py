@@ -1,0 +1,80 @@
+"""Locks that keep processes apart; each goes with its process, however that ends."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from pipeline.core.errors import InputError, RunError
+
+
+@contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """Keep two runs out of one folder."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = (folder / ".lock").open("w")
+    except OSError as error:
+        raise InputError(folder, f"cannot be written ({error.strerror})", "a folder of yours") from None
+    with lock:
+        if not _take(lock.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB):
+            raise RunError(f"{folder}: another run is at work there")
+        yield
+
+
+@contextmanager
+def locked(path: Path, *, shared: bool = False, wait: bool = True, remove: bool = False) -> Iterator[bool]:
+    """Hold a lock file; yields whether it is held (without ``wait`` it may not be).
+
+    Parameters
+    ----------
+    shared
+        Others may share it; a file that cannot be written will do then.
+    remove
+        Remove the file at the end. Who waited for it then takes the one that stands in its place.
+    """
+    while True:
+        descriptor = _open(path, shared)
+        try:
+            kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
+            if not _take(descriptor, kind if wait else kind | fcntl.LOCK_NB):
+                yield False
+                return
+            if not _is_still(descriptor, path):
+                continue
+            try:
+                yield True
+            finally:
+                if remove:
+                    path.unlink(missing_ok=True)
+            return
+        finally:
+            os.close(descriptor)
+
+
+def _open(path: Path, shared: bool) -> int:
+    try:
+        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    except PermissionError:
+        if not shared:
+            raise
+    return os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+
+
+def _take(descriptor: int, kind: int) -> bool:
+    try:
+        fcntl.flock(descriptor, kind)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _is_still(descriptor: int, path: Path) -> bool:
+    """Whether the file that is held is the one that stands at ``path``: its holder before may have removed it."""
+    try:
+        return os.path.samestat(os.fstat(descriptor), path.stat())
+    except FileNotFoundError:
+        return False

@@ -1,0 +1,121 @@
+"""What is known of a run: ``run.json``, written anew after each stage, so that an interrupted run goes on from the last
+whole one."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from pipeline.core import files
+from pipeline.core.cost import Cost
+from pipeline.core.errors import InputError
+from pipeline.core.version import __version__
+from pipeline.runs.stages import STAGES
+from pipeline.scenario.models import Scenario
+
+RECORD = "run.json"
+
+
+@dataclass(frozen=True)
+class StageRecord:
+    """The last run of one stage.
+
+    Attributes
+    ----------
+    inputs
+        The key of :class:`pipeline.runs.stages.Inputs`.
+    files, artefacts
+        Name -> sha256 of what it read and of what it wrote.
+    summary
+        What the stage says of it.
+    cost
+        Of the run that made it, which may be another one where it came from the store.
+    """
+
+    inputs: str
+    files: dict[str, str]
+    artefacts: dict[str, str]
+    summary: dict[str, Any]
+    cost: Cost
+
+    def to_json(self) -> dict[str, Any]:
+        """As ``run.json`` holds it."""
+        return {**self.__dict__, "cost": self.cost.to_json()}
+
+    @classmethod
+    def from_json(cls, value: Any) -> StageRecord | None:
+        """From ``run.json``; None for what another version of this program wrote: the stage is not known then."""
+        match value:
+            case {
+                "inputs": str(inputs),
+                "files": dict(read),
+                "artefacts": dict(artefacts),
+                "summary": dict(summary),
+                "cost": {"seconds": int() | float() as seconds, "peak_mb": int() | float() as peak_mb},
+            } if all(isinstance(digest, str) for digest in (*read.values(), *artefacts.values())):
+                return cls(inputs, read, artefacts, summary, Cost(seconds=seconds, peak_mb=peak_mb))
+        return None
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """What ``run.json`` holds.
+
+    Attributes
+    ----------
+    egvs
+        This program's version.
+    scenario, scenario_folder
+        As resolved, and where its files are, seen from the run's folder.
+    stages
+        Those that are done, in the order of running.
+    """
+
+    egvs: str
+    seed: int
+    scenario: dict[str, Any]
+    scenario_folder: str
+    stages: dict[str, StageRecord]
+
+    @classmethod
+    def of(cls, scenario: Scenario, folder: Path) -> RunRecord:
+        """Before the first stage."""
+        home = Path(os.path.relpath(scenario.folder, folder)).as_posix()
+        return cls(__version__, scenario.seed, scenario.model_dump(mode="json"), home, {})
+
+    @classmethod
+    def read(cls, folder: Path) -> RunRecord:
+        """From ``folder / "run.json"``; InputError when it is none."""
+        path = folder / RECORD
+        try:
+            value: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+            stages = {name: StageRecord.from_json(stage) for name, stage in value["stages"].items()}
+        except (FileNotFoundError, NotADirectoryError):
+            raise InputError(path, "no such file", "a folder that egvs run has written") from None
+        except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            raise InputError(path, f"is not a run's record ({error})", "remove it and run again") from None
+        for key, kind in (("egvs", str), ("seed", int), ("scenario", dict), ("scenario_folder", str)):
+            if not isinstance(value.get(key), kind):
+                found = f"is not a run's record ({key!r} is {value.get(key)!r})"
+                raise InputError(path, found, "remove it and run again")
+        known = {name: stage for name in STAGES if (stage := stages.get(name)) is not None}
+        return cls(value["egvs"], value["seed"], value["scenario"], value["scenario_folder"], known)
+
+    @classmethod
+    def going_on(cls, scenario: Scenario, folder: Path) -> RunRecord:
+        """What is known of earlier work in this folder, with the scenario as it is now."""
+        record = cls.of(scenario, folder)
+        return replace(record, stages=cls.read(folder).stages) if (folder / RECORD).is_file() else record
+
+    def having(self, name: str, stage: StageRecord | None) -> RunRecord:
+        """With a stage as it is now; without it for None."""
+        stages = {**self.stages, name: stage}
+        return replace(self, stages={n: known for n in STAGES if (known := stages.get(n)) is not None})
+
+    def write(self, folder: Path) -> None:
+        """Write ``folder / "run.json"``."""
+        value = {**self.__dict__, "stages": {name: stage.to_json() for name, stage in self.stages.items()}}
+        files.write_text(folder / RECORD, json.dumps(value, indent=2, ensure_ascii=False) + "\n")

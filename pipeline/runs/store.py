@@ -1,0 +1,315 @@
+"""The store: what a stage once made, kept under the hash of everything that it depends on.
+
+    <store>/<stage>-<key>/          artefacts, companions, and entry.json: hashes, summary, cost
+    <store>/.locks/<stage>-<key>    held by the one process that makes this entry; others wait for it, then take it
+    <store>/.work/                  what is not whole yet, or no longer
+    <store>/.lock                   shared by those who read or lay down an entry, held alone by those who remove one
+
+An entry is written aside, then renamed: it is there whole or not at all, whenever a process is killed. Every file's
+hash is checked when it is taken; an entry that is damaged is removed, so that it is made again. The entries used
+longest ago go first when all of them take more than a bound. A store that cannot be written is named once, and done
+without.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from pipeline.core import files
+from pipeline.core.cost import Cost
+from pipeline.core.errors import InputError
+from pipeline.core.progress import Progress, silent
+from pipeline.runs.locking import locked
+from pipeline.runs.stages import Made
+
+PLACE, MAX_GB = "EGVS_STORE", "EGVS_STORE_MAX_GB"
+"""Environment variables: where the store is (empty for none), and how much it may hold."""
+
+DEFAULT_PLACE = Path("runs", ".store")
+DEFAULT_MAX_GB = 10.0
+
+_ENTRY = "entry.json"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What the store holds of one stage.
+
+    Attributes
+    ----------
+    made
+        What came of the stage; the cost is that of making it.
+    sizes
+        Bytes of each file, artefacts and companions.
+    created, last_used
+        Seconds since the epoch.
+    """
+
+    folder: Path
+    stage: str
+    key: str
+    made: Made
+    hashes: dict[str, str]
+    sizes: dict[str, int]
+    created: float
+    last_used: float
+
+    @property
+    def bytes(self) -> int:
+        """Of all files."""
+        return sum(self.sizes.values())
+
+
+class _Damaged(Exception):
+    """An entry is not as it was written."""
+
+
+def _to_stderr(message: str) -> None:
+    print(f"egvs: {message}", file=sys.stderr)
+
+
+class Store:
+    """A folder of entries that processes share.
+
+    Parameters
+    ----------
+    folder
+        None for a store that keeps nothing.
+    bound_bytes
+        What all entries together may take.
+    note
+        Called with what a user should know: that an entry was damaged, or that the store cannot be written.
+    """
+
+    def __init__(
+        self, folder: Path | None, bound_bytes: float = DEFAULT_MAX_GB * 1e9, note: Callable[[str], None] = _to_stderr
+    ) -> None:
+        self.folder, self.bound_bytes, self._note = folder, bound_bytes, note
+        self._can_write = folder is not None
+        if folder is not None:
+            self._clear_work(folder)
+
+    @classmethod
+    def default(cls) -> Store:
+        """Where ``EGVS_STORE`` says, else beside the runs."""
+        place, most = os.environ.get(PLACE), os.environ.get(MAX_GB)
+        try:
+            bound_gb = DEFAULT_MAX_GB if most is None else float(most)
+        except ValueError:
+            bound_gb = math.nan
+        if not 0 <= bound_gb < math.inf:
+            raise InputError(MAX_GB, f"{most!r}", "how many GB the store may hold, for example 10")
+        folder = DEFAULT_PLACE if place is None else Path(place) if place else None
+        return cls(folder, bound_gb * 1e9)
+
+    # ---- one entry
+
+    def take(self, stage: str, key: str, out: Path, *, link: bool = False) -> Entry | None:
+        """Lay an entry's files into ``out``; None where there is no such entry, or it was damaged.
+
+        ``link`` gives the files a second name instead of copying them: for folders in which files are replaced, never
+        written into.
+        """
+        if self.folder is None or not (folder := self._place(stage, key)).is_dir():
+            return None
+        try:
+            with self._shared():
+                entry = _read(folder)
+                for name, digest in entry.hashes.items():
+                    _lay(folder / name, out / name, digest, link)
+                with suppress(OSError):  # a store that can only be read
+                    os.utime(folder / _ENTRY)
+                return entry
+        except _Damaged as damage:
+            self._note(f"{folder}: the kept {stage} is damaged ({damage}), and made again")
+        with suppress(OSError), self._alone():
+            self._remove(folder)
+        return None
+
+    def find(self, stage: str, key: str) -> Entry | None:
+        """An entry, its files unread; None where there is none."""
+        if self.folder is None:
+            return None
+        with suppress(_Damaged), self._shared():
+            return _read(self._place(stage, key))
+        return None
+
+    @contextmanager
+    def maker(self, stage: str, key: str, *, wait: bool = True, progress: Progress = silent) -> Iterator[bool]:
+        """Be the only one that makes an entry; yields whether one is (without ``wait`` another may be, and a store that
+        cannot be written keeps nobody apart)."""
+        if not self._can_write or self.folder is None:
+            yield True
+            return
+        lock = self.folder / ".locks" / self._place(stage, key).name
+        try:
+            lock.parent.mkdir(parents=True, exist_ok=True)
+            lock.touch()
+        except OSError as error:
+            self._do_without(error)
+            yield True
+            return
+        with locked(lock, wait=False, remove=True) as mine:
+            if mine or not wait:
+                yield mine
+                return
+        progress("waits for another run that makes the same", 0, 0)
+        with locked(lock, remove=True):
+            yield True
+
+    def put(self, stage: str, key: str, out: Path, made: Made, *, link: bool = False) -> None:
+        """Keep what a stage made in ``out``, unless it is kept already; for its :meth:`maker`."""
+        if not self._can_write or self.folder is None or (final := self._place(stage, key)).exists():
+            return
+        work = self.folder / ".work" / final.name
+        try:
+            try:
+                shutil.rmtree(work, ignore_errors=True)
+                work.mkdir(parents=True)
+                for name in (*made.artefacts, *made.companions):
+                    _copy(out / name, work / name, link)
+                (work / _ENTRY).write_text(_to_json(stage, key, work, made), encoding="utf-8")
+                with self._shared():
+                    work.rename(final)
+            except BaseException:
+                shutil.rmtree(work, ignore_errors=True)
+                raise
+            self.prune(self.bound_bytes)
+        except OSError as error:
+            self._do_without(error)
+
+    # ---- all entries
+
+    def entries(self) -> list[Entry]:
+        """All that are sound, the one used last first."""
+        found = []
+        for folder in self._folders():
+            with suppress(_Damaged):
+                found.append(_read(folder))
+        return sorted(found, key=lambda entry: entry.last_used, reverse=True)
+
+    def prune(self, most_bytes: float) -> list[Entry]:
+        """Remove the entries used longest ago until the others take at most ``most_bytes``, all below 0; those
+        removed."""
+        removed: list[Entry] = []
+        if sum(entry.bytes for entry in self.entries()) <= most_bytes or not self._folders():
+            return removed
+        with self._alone():
+            kept = self.entries()
+            for folder in set(self._folders()) - {entry.folder for entry in kept}:
+                self._remove(folder)  # damaged
+            while kept and sum(entry.bytes for entry in kept) > most_bytes:
+                removed.append(kept.pop())
+                self._remove(removed[-1].folder)
+        return removed
+
+    def _folders(self) -> list[Path]:
+        if self.folder is None or not self.folder.is_dir():
+            return []
+        return [path for path in self.folder.iterdir() if not path.name.startswith(".") and path.is_dir()]
+
+    def _place(self, stage: str, key: str) -> Path:
+        assert self.folder is not None
+        return self.folder / f"{stage}-{key[:32]}"
+
+    def _remove(self, folder: Path) -> None:
+        """Take an entry away, whole; for those who hold the store alone."""
+        assert self.folder is not None
+        aside = self.folder / ".work" / f"removed-{folder.name}-{os.getpid()}-{time.monotonic_ns()}"
+        aside.parent.mkdir(exist_ok=True)
+        with suppress(FileNotFoundError):  # somebody else was first
+            folder.rename(aside)
+        shutil.rmtree(aside, ignore_errors=True)
+
+    @contextmanager
+    def _shared(self) -> Iterator[None]:
+        """Keep out those who remove entries."""
+        assert self.folder is not None
+        with ExitStack() as held:
+            with suppress(OSError):  # a store that can only be read, and in which nobody ever wrote with locks
+                held.enter_context(locked(self.folder / ".lock", shared=True))
+            yield
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        assert self.folder is not None
+        with locked(self.folder / ".lock"):
+            yield
+
+    def _clear_work(self, folder: Path) -> None:
+        """Remove what killed processes left; who is still at work holds its lock."""
+        places = [place for name in (".work", ".locks") if (place := folder / name).is_dir()]
+        for name in {path.name for place in places for path in place.iterdir()}:
+            if name.startswith("removed-"):
+                shutil.rmtree(folder / ".work" / name, ignore_errors=True)
+                continue
+            with suppress(OSError), locked(folder / ".locks" / name, wait=False, remove=True) as free:
+                if free:
+                    shutil.rmtree(folder / ".work" / name, ignore_errors=True)
+
+    def _do_without(self, error: OSError) -> None:
+        self._can_write = False
+        why = error.strerror or error
+        self._note(f"{self.folder}: the store cannot be written ({why}); the run goes on without it")
+
+
+def _lay(kept: Path, path: Path, digest: str, link: bool) -> None:
+    """One file into a run's folder, whole or not at all; :class:`_Damaged` when it is not as it was kept."""
+    if not (kept.is_file() and os.access(kept, os.R_OK)):
+        raise _Damaged(f"{kept.name} is missing, or cannot be read")
+    with files.aside(path) as partial:
+        if link:
+            path.unlink(missing_ok=True)  # to rename one name of a file over another one does nothing
+        _copy(kept, partial, link)
+        if files.sha256_of(partial) != digest:
+            raise _Damaged(f"{kept.name} has other bytes than were kept")
+
+
+def _copy(path: Path, other: Path, link: bool) -> None:
+    """A file under another name: a second name where ``link`` asks for it and the disk allows it, else a copy."""
+    other.parent.mkdir(parents=True, exist_ok=True)
+    if link:
+        other.unlink(missing_ok=True)
+        with suppress(OSError):
+            os.link(path, other)
+            return
+    shutil.copyfile(path, other)
+
+
+def _to_json(stage: str, key: str, folder: Path, made: Made) -> str:
+    names = (*made.artefacts, *made.companions)
+    about = {
+        "stage": stage,
+        "key": key,
+        "artefacts": made.artefacts,
+        "companions": {name: files.sha256_of(folder / name) for name in made.companions},
+        "bytes": {name: (folder / name).stat().st_size for name in names},
+        "summary": made.summary,
+        "cost": asdict(made.cost),
+        "created": time.time(),
+    }
+    return json.dumps(about, indent=1, ensure_ascii=False) + "\n"
+
+
+def _read(folder: Path) -> Entry:
+    try:
+        value = json.loads((folder / _ENTRY).read_text(encoding="utf-8"))
+        last_used = (folder / _ENTRY).stat().st_mtime
+        made = Made(dict(value["artefacts"]), tuple(value["companions"]), dict(value["summary"]), Cost(**value["cost"]))
+        hashes = {**value["artefacts"], **value["companions"]}
+        sizes = {str(name): int(size) for name, size in value["bytes"].items()}
+        entry = Entry(folder, value["stage"], value["key"], made, hashes, sizes, float(value["created"]), last_used)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise _Damaged(f"{_ENTRY}: {error}") from None
+    if folder.name != f"{entry.stage}-{entry.key[:32]}":
+        raise _Damaged(f"{_ENTRY} is of {entry.stage}-{entry.key[:32]}")
+    return entry
