@@ -16,6 +16,7 @@ from __future__ import annotations
 import json
 import math
 import multiprocessing
+import os
 import re
 import statistics
 import sys
@@ -33,6 +34,7 @@ from pyarrow import csv
 import pipeline
 from pipeline.core.cost import let_go
 from pipeline.runs import workflow
+from pipeline.runs.record import StageRecord
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE, FIGURE = ROOT / "docs" / "scaling.md", ROOT / "docs" / "images" / "scaling.png"
@@ -184,12 +186,13 @@ def _held_mb() -> float:
 
 def measure(size: Size, folder: Path, pipe: Any) -> None:
     """Send seconds and MB of each stage, medians of some runs."""
+    os.environ["EGVS_STORE"] = ""  # nothing is fetched that is to be measured
     workflow.run(pipeline.load(prepare(Size(sites=2, frames=10), folder / "warm")), folder / "warm" / "run")
     scenario, begin, held = pipeline.load(prepare(size, folder / "scene")), time.perf_counter(), _held_mb()
     found: list[dict[str, tuple[float, float]]] = []
     for turn in range(REPEATS):
         clock = _Clock(held)
-        workflow.run(scenario, folder / f"run{turn}", told=clock)
+        workflow.run(scenario, folder / f"run{turn}", listener=clock)
         found.append(clock.costs)
         if time.perf_counter() - begin > ENOUGH_S:
             break
@@ -204,9 +207,9 @@ class _Clock:
         self._held, self._start = held, 0.0
         self.costs: dict[str, tuple[float, float]] = {}
 
-    def __call__(self, stage: str, state: str, record: dict[str, Any]) -> None:
-        if state == "done":
-            self.costs[stage] = (time.process_time() - self._start, max(record["cost"]["peak_mb"] - self._held, 1.0))
+    def __call__(self, stage: str, state: str, record: StageRecord | None) -> None:
+        if state == "done" and record is not None:
+            self.costs[stage] = (time.process_time() - self._start, max(record.cost.peak_mb - self._held, 1.0))
         _held_mb()  # lets go of what the stage left
         self._start = time.process_time()
 

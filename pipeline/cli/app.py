@@ -296,6 +296,28 @@ def new(
     results.print_new_scenario(openstreetmap.new(folder, osm, place, lefthand=lefthand))
 
 
+@app.command()
+def store(
+    prune: Annotated[bool, typer.Option("--prune", help="Remove the entries used longest ago, down to --max.")] = False,
+    most: Annotated[
+        str | None, typer.Option("--max", metavar="SIZE", help="For --prune, e.g. 2G; EGVS_STORE_MAX_GB by default.")
+    ] = None,
+    clear: Annotated[bool, typer.Option("--clear", help="Remove every entry.")] = False,
+) -> None:
+    """What earlier runs made and what of it is kept; a run fetches from there what it would make again."""
+    from pipeline.cli import store_table
+    from pipeline.runs.store import Store
+
+    if most is not None and not prune:
+        raise InputError("--max", "without --prune", "egvs store --prune --max 2G")
+    kept = Store.default()
+    if clear or prune:
+        bound = -1.0 if clear else kept.bound_bytes if most is None else store_table.bytes_of(most)
+        store_table.print_removed(kept, kept.prune(bound))
+    else:
+        store_table.print_store(kept)
+
+
 def _resolved(path: Path, set_: list[str] | None, out: Path | None) -> tuple[Scenario, Path]:
     """The scenario with ``--set`` laid over it, and the run's folder."""
     from pipeline.runs.workflow import default_folder

@@ -1,0 +1,359 @@
+"""The store: whole whatever happens to it, shared by all runs, bounded, and never believed where it is damaged.
+
+Evidence: real runs in processes of their own, started together or killed at steps of their work; entries that are cut,
+changed and removed; the program with one line changed. Nothing waits for a clock."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+from pathlib import Path
+
+import pytest
+
+import pipeline
+from pipeline.artefacts import schemas
+from pipeline.core import files, source
+from pipeline.core.errors import InputError
+from pipeline.runs import stages, workflow
+from pipeline.runs.stages import STAGES
+from pipeline.runs.store import Entry, Store
+from tests.runs import children
+from tests.runs.children import Child, Job
+
+ROOT = Path(__file__).resolve().parents[2]
+DATA = ("statics.ply", "scans.parquet", "trajectories.parquet", "tpog.parquet", "scores.parquet")
+
+
+def states(scenario: pipeline.Scenario, out: Path, **options: object) -> dict[str, str]:
+    """Run, and say of each stage whether it was skipped, fetched or made."""
+    seen: dict[str, str] = {}
+    workflow.run(scenario, out, listener=lambda stage, state, _: seen.__setitem__(stage, state), **options)  # type: ignore[arg-type]
+    return seen
+
+
+def digests(out: Path) -> dict[str, str]:
+    return {name: files.sha256_of(out / name) for name in DATA}
+
+
+def assert_whole(store: Path) -> list[Entry]:
+    """Every entry is there whole, and nothing else is."""
+    kept = Store(store, note=pytest.fail)
+    entries = kept.entries()
+    assert {entry.folder for entry in entries} == {path for path in store.iterdir() if path.name[0] != "."}
+    for entry in entries:
+        for name, digest in entry.hashes.items():
+            assert files.sha256_of(entry.folder / name) == digest
+    for place in (".work", ".locks"):
+        assert not (store / place).is_dir() or not list((store / place).iterdir())
+    return entries
+
+
+@pytest.fixture
+def done(mini: Path, tmp_path: Path) -> tuple[pipeline.Scenario, Path]:
+    """A scenario, and the folder of its finished run."""
+    scenario = pipeline.load(mini)
+    assert set(states(scenario, tmp_path / "out").values()) == {"done"}
+    return scenario, tmp_path / "out"
+
+
+@pytest.fixture(scope="module")
+def junction(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The shipped junction, cut down to a second's work: SUMO runs in it."""
+    folder = tmp_path_factory.mktemp("junction") / "junction"
+    shutil.copytree(ROOT / "scenarios" / "nishishinjuku", folder)
+    text = (folder / "scenario.toml").read_text()
+    for long, short in (
+        ("frames = 5000", "frames = 20"),
+        ("warmup_s = 300", "warmup_s = 20"),
+        ("vehicles = 50", "vehicles = 5"),
+        ("voxel_m = 0.25", "voxel_m = 1.0"),
+        ('"statics.geojson"', ""),
+        ("VLP-32C", "VLP-16"),
+    ):
+        assert long in text
+        text = text.replace(long, short)
+    (folder / "scenario.toml").write_text(text)
+    (folder / "sites.csv").write_text("".join((folder / "sites.csv").read_text().splitlines(keepends=True)[:3]))
+    return folder
+
+
+def test_a_second_folder_makes_nothing(
+    junction: Path, tmp_path: Path, store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing is simulated, cast or counted, and the folder holds the same plain files, SUMO's among them."""
+    scenario = pipeline.load(junction)
+    one, other = tmp_path / "one", tmp_path / "other"
+    assert set(states(scenario, one).values()) == {"done"}
+
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("a stage was made")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(stages, "make", refuse)
+        assert set(states(scenario, other).values()) == {"fetched"}
+        assert set(states(scenario, other).values()) == {"skipped"}
+    names = {p.relative_to(one).as_posix() for p in one.rglob("*") if p.is_file()}
+    assert {"sumo/run.sumocfg", *DATA, "report.html"} < names
+    for name in names - {"run.json", ".lock"}:
+        assert (other / name).read_bytes() == (one / name).read_bytes()
+    assert (
+        json.loads((other / "run.json").read_text())["stages"] == json.loads((one / "run.json").read_text())["stages"]
+    )
+    assert workflow.verify(other) == []
+    (other / "tpog.parquet").write_bytes(b"of the user's own")  # which harms the store not
+    assert_whole(store)
+
+
+def test_a_changed_and_a_former_setting(done: tuple[pipeline.Scenario, Path]) -> None:
+    """What a folder held before it was run with other settings comes back from the store."""
+    scenario, out = done
+    before = digests(out)
+    changed = pipeline.load(scenario.folder, ["score.gamma=9"])
+    again = {"score": "done", "report": "done"}
+    assert states(changed, out) == {**dict.fromkeys(STAGES, "skipped"), **again}
+    assert states(scenario, out) == {**dict.fromkeys(STAGES, "skipped"), **dict.fromkeys(again, "fetched")}
+    assert digests(out) == before
+
+
+def test_a_file_that_the_kept_stage_does_not_have_goes(mini: Path, tmp_path: Path) -> None:
+    """Hits of sites are kept by one setting, and not by the other."""
+    plain, seen = pipeline.load(mini), pipeline.load(mini, ['score.keep_visibility="all"'])
+    pipeline.run(plain, tmp_path / "plain")
+    pipeline.run(seen, tmp_path / "out")
+    assert (tmp_path / "out" / "visibility.parquet").exists()
+    assert states(plain, tmp_path / "out")["score"] == "fetched"
+    assert not (tmp_path / "out" / "visibility.parquet").exists()
+
+
+def test_a_stage_with_options_is_made_and_not_kept(done: tuple[pipeline.Scenario, Path], tmp_path: Path, store) -> None:
+    scenario, _ = done
+    options = {"score": {"audit": True}}
+    assert states(scenario, tmp_path / "other", options=options)["score"] == "done"
+    before = assert_whole(store)
+    states(pipeline.load(scenario.folder, ["score.gamma=9"]), tmp_path / "third", options=options)
+    assert {e.stage for e in assert_whole(store) if e.folder not in {b.folder for b in before}} == {"report"}
+
+
+def test_a_stage_called_by_itself_is_made_and_kept(done: tuple[pipeline.Scenario, Path], tmp_path: Path) -> None:
+    scenario, out = done
+    seen: list[str] = []
+    workflow.run_one("statics", scenario, out, listener=lambda _, state, __: seen.append(state))
+    assert seen == ["runs", "done"]
+    other = pipeline.load(scenario.folder, ["statics.ground=false"])
+    workflow.run_one("statics", other, out)
+    assert states(other, tmp_path / "other")["statics"] == "fetched"
+
+
+def a_changed_byte(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(bytes(data))
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-1])
+
+
+DAMAGE = {
+    "a changed byte": ("tpog-*/tpog.parquet", a_changed_byte),
+    "an artefact cut short": ("tpog-*/tpog.parquet", cut),
+    "a missing artefact": ("tpog-*/tpog.parquet", Path.unlink),
+    "no note": ("tpog-*/entry.json", Path.unlink),
+    "an empty note": ("tpog-*/entry.json", lambda path: path.write_text("")),
+    "a note of something else": ("tpog-*/entry.json", lambda path: path.write_text("[]")),
+    "a note with holes": ("tpog-*/entry.json", lambda path: path.write_text('{"stage": "tpog", "artefacts": {}}')),
+}
+
+
+@pytest.mark.parametrize("case", DAMAGE)
+def test_a_damaged_entry_is_named_and_made_again(
+    done: tuple[pipeline.Scenario, Path], tmp_path: Path, store: Path, capsys: pytest.CaptureFixture[str], case: str
+) -> None:
+    scenario, out = done
+    pattern, damage = DAMAGE[case]
+    (path,) = store.glob(pattern)
+    damage(path)
+    expected = {**dict.fromkeys(STAGES, "fetched"), "tpog": "done"}
+    found = states(scenario, tmp_path / "other")
+    assert {stage: state for stage, state in found.items() if stage != "report"} == {
+        stage: state
+        for stage, state in expected.items()
+        if stage != "report"  # which shows what the tpog cost
+    }
+    said = capsys.readouterr().err
+    assert "the kept tpog is damaged" in said and "Traceback" not in said
+    assert digests(tmp_path / "other") == digests(out)
+    assert_whole(store)
+    assert states(scenario, tmp_path / "third")["tpog"] == "fetched"
+
+
+def test_several_at_once_make_every_stage_once(mini: Path, tmp_path: Path, store: Path) -> None:
+    running = [Child(Job(mini, tmp_path / str(number), store)) for number in range(4)]
+    jobs = [child.join() for child in running]
+    assert [job.exit_code for job in jobs] == [0] * 4
+    for stage in STAGES:
+        assert sorted(job.states[stage] for job in jobs) == ["done"] + ["fetched"] * 3, stage
+    assert len({tuple(digests(job.out).values()) for job in jobs}) == 1
+    assert len(assert_whole(store)) == len(STAGES)
+
+
+def test_who_comes_second_waits_and_takes_it(done: tuple[pipeline.Scenario, Path], tmp_path: Path, store: Path) -> None:
+    scenario, out = done
+    kept = Store(store)
+    entry = next(entry for entry in kept.entries() if entry.stage == "statics")
+    kept.prune(-1)
+    with kept.maker("statics", entry.key):
+        child = Child(Job(scenario.folder, tmp_path / "other", store))
+        assert child.waits.wait(timeout=120)
+        kept.put("statics", entry.key, out, entry.made)
+    job = child.join()
+    assert (job.exit_code, job.states["statics"], job.states["scan"]) == (0, "fetched", "done")
+    assert_whole(store)
+
+
+def test_killed_at_ten_steps_the_store_is_whole_and_the_next_run_ends_in_the_same_bytes(
+    junction: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = children.run(Job(junction, tmp_path / "whole", tmp_path / "store"))
+    assert (whole.exit_code, set(whole.states.values())) == (0, {"done"})
+    assert whole.steps > 50
+    steps = random.Random(20).sample(range(1, whole.steps), 10)
+    for step in steps:
+        out, store = tmp_path / str(step), tmp_path / f"store{step}"
+        assert children.run(Job(junction, out, store, kill_at=step)).exit_code == -signal.SIGKILL
+        for path in out.glob("*.p*"):  # whatever is there under its own name is whole
+            if path.suffix in (".parquet", ".ply"):
+                assert files.sha256_of(path) == files.sha256_of(whole.out / path.name)
+        if store.exists():
+            assert_whole(store)
+        monkeypatch.setenv("EGVS_STORE", str(store))
+        pipeline.run(pipeline.load(junction), out)
+        assert digests(out) == digests(whole.out)
+        assert not list(out.glob(".*.partial"))
+        assert len(assert_whole(store)) >= len(STAGES)
+
+
+def test_what_was_used_longest_ago_goes_first(
+    done: tuple[pipeline.Scenario, Path], store: Path, tmp_path: Path
+) -> None:
+    kept = Store(store)
+    for age, entry in enumerate(sorted(kept.entries(), key=lambda e: e.stage)):
+        os.utime(entry.folder / "entry.json", (1e9 - age, 1e9 - age))
+    kept.take("traffic", next(e.key for e in kept.entries() if e.stage == "traffic"), tmp_path / "taken")
+    order = [entry.stage for entry in kept.entries()]
+    assert order == ["traffic", *sorted(set(STAGES) - {"traffic"})]
+    sizes = {entry.stage: entry.bytes for entry in kept.entries()}
+    removed = kept.prune(sizes["traffic"] + sizes["report"] + sizes["scan"])
+    assert [entry.stage for entry in removed] == ["tpog", "statics", "score"]
+    assert [entry.stage for entry in assert_whole(store)] == ["traffic", "report", "scan"]
+    assert len(kept.prune(-1)) == 3
+    assert not assert_whole(store)
+
+
+def test_the_bound_holds_from_the_first_entry_on(
+    mini: Path, tmp_path: Path, store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("EGVS_STORE_MAX_GB", "0.0001")
+    scenario = pipeline.load(mini)
+    assert set(states(scenario, tmp_path / "out").values()) == {"done"}
+    entries = assert_whole(store)
+    assert 0 < sum(entry.bytes for entry in entries) <= 1e5 and len(entries) < len(STAGES)
+    monkeypatch.setenv("EGVS_STORE_MAX_GB", "lots")
+    with pytest.raises(InputError, match="EGVS_STORE_MAX_GB: 'lots'"):
+        pipeline.run(scenario, tmp_path / "out")
+
+
+def test_a_store_that_cannot_be_written_is_named_once(
+    mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("EGVS_STORE", str(tmp_path / "file" / "store"))
+    assert set(states(pipeline.load(mini), tmp_path / "out").values()) == {"done"}
+    assert capsys.readouterr().err.count("the store cannot be written") == 1
+
+
+def test_an_empty_name_is_no_store(
+    done: tuple[pipeline.Scenario, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, egvs
+) -> None:
+    scenario, _ = done
+    monkeypatch.setenv("EGVS_STORE", "")
+    assert set(states(scenario, tmp_path / "other").values()) == {"done"}
+    assert egvs("store")[1].strip() == "EGVS_STORE is empty: nothing is kept"
+
+
+def test_by_default_it_lies_beside_the_runs(mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("EGVS_STORE")
+    monkeypatch.chdir(tmp_path)
+    pipeline.run(pipeline.load(mini))
+    assert len(assert_whole(tmp_path / "runs" / ".store")) == len(STAGES)
+
+
+def test_the_command_line_lists_prunes_and_clears(done: tuple[pipeline.Scenario, Path], store: Path, egvs) -> None:
+    code, printed, _ = egvs("store")
+    assert code == 0
+    assert {line.split()[0] for line in printed.splitlines()} == {"stage", *STAGES, f"{store}:"}
+    assert "6 entries" in printed and "of at most 10 GB" in printed
+    assert "removed 0 entries" in egvs("store", "--prune")[1]
+    largest = max(entry.bytes for entry in Store(store).entries())
+    assert egvs("store", "--prune", "--max", f"{largest / 1e3}K")[0] == 0
+    assert 0 < len(assert_whole(store)) < 6
+    assert "0 entries, 0 B are left" in egvs("store", "--clear")[1]
+    for words, message in ((("--max", "2G"), "without --prune"), (("--prune", "--max", "much"), "--max: 'much'")):
+        code, _, said = egvs("store", *words)
+        assert (code, message in said) == (2, True), said
+
+
+def test_a_run_says_what_it_fetched(done: tuple[pipeline.Scenario, Path], tmp_path: Path, egvs) -> None:
+    scenario, _ = done
+    code, printed, said = egvs("run", scenario.folder, "--out", tmp_path / "other")
+    assert (code, said.count("from store")) == (0, len(STAGES)), said
+    assert "nothing to do" not in printed
+
+
+CHANGED_LINES = {
+    "kernels/march.py": {"score", "report"},
+    "kernels/rays.py": {"scan", "score", "report"},
+    "kernels/solids.py": {"scan", "tpog", "score", "report"},
+    "stages/traffic.py": {"traffic"},
+    "world/mesh.py": {"statics", "scan", "tpog", "score", "report"},
+    "effects/score/rain.py": {"score", "report"},
+    "effects/score/fog.py": set(),
+    "studies/accuracy.py": set(),
+    "data_schemas/tpog.schema.json": {"tpog"},
+}
+
+
+def test_one_changed_line_makes_what_depends_on_it_again(
+    mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And nothing else: a stage whose source is another one, and that writes what it wrote before, changes no later
+    one, but for the report, which shows what stages cost. The program's text is that of a copy, so that nothing is
+    compiled anew."""
+    copy = tmp_path / "pipeline"
+    shutil.copytree(ROOT / "pipeline", copy, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "data_schemas", copy / "data_schemas")
+    monkeypatch.setattr(source, "_ROOT", copy)
+    monkeypatch.setattr(schemas, "folder", lambda: copy / "data_schemas")
+
+    def forget() -> None:
+        for remembered in (source.of, source._read, source._path):
+            remembered.cache_clear()
+
+    def made() -> set[str]:
+        forget()
+        found = states(scenario, tmp_path / "out")
+        assert set(found.values()) <= {"done", "skipped"}
+        return {stage for stage, state in found.items() if state == "done"}
+
+    scenario = pipeline.load(mini, ["effects.rain.rate_mm_h=20"])
+    assert made() == set(STAGES)
+    assert made() == set()
+    for name, again in CHANGED_LINES.items():
+        path = copy / name
+        path.write_text(path.read_text(encoding="utf-8") + "\n", encoding="utf-8")
+        assert made() - {"report"} == again - {"report"}, name
+    forget()
