@@ -7,7 +7,8 @@ import re
 from latex2mathml.converter import convert
 
 _WORD = re.compile(r"\\(?:text|begin|end)\{[^{}]*\}|\\mathrm\{([^{}]*)\}|\\[A-Za-z]+|([A-Za-z]{2,})")
-_FUNCTION = re.compile(r"(<mi>(?:ln|log|exp|sin|cos|tan)</mi>)(?!<mo)")
+_NAME = r"(?:<msub>)?<mi>(?:ln|log|exp|sin|cos|tan)</mi>(?:<mn>\d</mn></msub>)?+"
+_APART = re.compile(rf"(?<=</mi>)(?={_NAME})|(?<=</msub>)(?={_NAME})|({_NAME})(?!<mo|</ms)")
 
 
 def mathml(latex: str, display: str = "inline") -> str:
@@ -18,4 +19,4 @@ def mathml(latex: str, display: str = "inline") -> str:
         return rf"\text{{{word}}}" if word else match[0]
 
     text = _WORD.sub(upright, re.sub(r"\\mathrel\{(.)\}", r"\1", " ".join(latex.split())))
-    return _FUNCTION.sub(r'\1<mspace width="0.17em" />', convert(text, display=display))
+    return _APART.sub(lambda m: (m[1] or "") + '<mspace width="0.17em" />', convert(text, display=display))

@@ -47,12 +47,13 @@ def _table(model: dict[str, Any], models: dict[str, Any], prefix: str, heading: 
             needed = key in model.get("required", [])
             default = "**needed**" if needed else f"`{json.dumps(field.get('default'))}`".replace("`null`", "")
             rows.append(f"| `{key}` | {default} | {_cell(field.get('description', ''))} |")
-    text = [f"## `{heading}`", "", model.get("description", "").split("\n")[0], ""] if rows else []
+    text = [f"## `{heading}`", "", _cell(model.get("description", "").split("\n\n")[0]), ""] if rows else []
     return text + (["| key | default | meaning |", "|---|---|---|", *rows, ""] if rows else []) + below
 
 
 def _cell(text: str) -> str:
-    return text.replace("|", "\\|").replace("\n", " ")
+    """Text for a table's cell, its reStructuredText roles and literals as code."""
+    return re.sub(r"(?::\w+:)?(`+)~?([^`]+)\1", r"`\2`", text).replace("|", "\\|").replace("\n", " ")
 
 
 def names(package: str) -> str:
@@ -70,5 +71,5 @@ def _name(full: str, path: Path) -> str:
     for node in ast.parse(path.read_text(encoding="utf-8")).body:
         if isinstance(node, ast.ClassDef | ast.FunctionDef) and node.name == name:
             about = _cell((ast.get_docstring(node) or "").split("\n\n")[0])
-            return f"| [`pipeline.{name}`][{full}] | {about.replace('``', '`')} |"
+            return f"| [`pipeline.{name}`][{full}] | {about} |"
     raise ValueError(f"{full} is neither a class nor a function of {path}")

@@ -11,11 +11,12 @@ import html
 import textwrap
 import tomllib
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "pipeline"
-_WIDE, _HIGH, _GAP, _ROW = 236, 62, 28, 112
+_WIDE, _LANE, _HIGH, _GAP, _ROW = 232, 6, 84, 18, 134
 
 
 
@@ -52,18 +53,39 @@ def _reduced() -> dict[str, set[str]]:
     return {name: {o for o in mine if not any(o in reach[p] for p in mine)} for name, mine in direct.items()}
 
 
-def _places(arrows: dict[str, set[str]]) -> dict[str, tuple[float, int]]:
-    """Middle and row of each box: as low as its arrows allow, below what it carries."""
+def _rows(arrows: dict[str, set[str]]) -> tuple[list[list[str]], list[list[str]]]:
+    """Rows from low to high, each box as low as its arrows allow, and the arrows as chains of places from row to row: an
+    arrow that skips rows gets a place of its own in each (``a>b@3``), so that it passes between the boxes."""
     row: dict[str, int] = {}
     for name in packages():
         row[name] = 1 + max((row[other] for other in arrows[name]), default=-1)
     rows = [[name for name in packages() if row[name] == at] for at in range(max(row.values()) + 1)]
-    places: dict[str, tuple[float, int]] = {}
-    for at, names in enumerate(rows):
-        names.sort(key=lambda name: sum(places[o][0] for o in arrows[name]) / max(1, len(arrows[name])))
-        for k, name in enumerate(names):
-            places[name] = ((k - (len(names) - 1) / 2) * (_WIDE + _GAP), at)
-    return places
+    chains = []
+    for name, others in arrows.items():
+        for other in sorted(others):
+            between = [f"{name}>{other}@{at}" for at in range(row[name] - 1, row[other], -1)]
+            for at, place in zip(range(row[name] - 1, row[other], -1), between, strict=True):
+                rows[at].append(place)
+            chains.append([name, *between, other])
+    return rows, chains
+
+
+def _places(rows: list[list[str]], chains: list[list[str]]) -> dict[str, float]:
+    """Middle of each place; rows are sorted by where their neighbours are, up and down a few times."""
+    beside: dict[str, list[str]] = {place: [] for row in rows for place in row}
+    for chain in chains:
+        for one, other in pairwise(chain):
+            beside[one].append(other)
+            beside[other].append(one)
+    x = {place: float(k) for row in rows for k, place in enumerate(row)}
+    for row in [*rows, *reversed(rows)] * 6:
+        row.sort(key=lambda place: sum(x[other] for other in beside[place]) / max(1, len(beside[place])))
+        widths = [_LANE if ">" in place else _WIDE for place in row]
+        at = -(sum(widths) + _GAP * (len(row) - 1)) / 2
+        for place, width in zip(row, widths, strict=True):
+            x[place] = at + width / 2
+            at += width + _GAP
+    return x
 
 
 def _about(name: str) -> str:
@@ -71,34 +93,36 @@ def _about(name: str) -> str:
 
 
 def _box(name: str, x: float, y: float) -> str:
-    lines = textwrap.wrap(_about(name), 38)
-    lines = [*lines[:1], lines[1] + " …"] if len(lines) > 2 else lines
+    lines = textwrap.wrap(_about(name), 34)
+    lines = [*lines[:2], lines[2] + " …"] if len(lines) > 3 else lines
     text = "".join(
-        f"<text x='{x:.0f}' y='{y + 38 + 14 * k:.0f}' class='wings-about'>{html.escape(line)}</text>"
+        f"<text x='{x:.0f}' y='{y + 41 + 16 * k:.0f}' class='wings-about'>{html.escape(line)}</text>"
         for k, line in enumerate(lines)
     )
     return (
         f"<a href='api/{name}.html'><rect x='{x - _WIDE / 2:.0f}' y='{y:.0f}' width='{_WIDE}' height='{_HIGH}' rx='6'/>"
-        f"<text x='{x:.0f}' y='{y + 20:.0f}' class='wings-name'>{name}</text>{text}</a>"
+        f"<text x='{x:.0f}' y='{y + 21:.0f}' class='wings-name'>{name}</text>{text}</a>"
     )
 
 
 def picture() -> str:
     """The picture as one element of HTML, in the colours of the page around it."""
-    arrows = _reduced()
-    places = _places(arrows)
-    top = max(at for _, at in places.values())
-    left = min(x for x, _ in places.values()) - _WIDE / 2 - 4
-    boxes = {name: (x, 4 + (top - at) * _ROW) for name, (x, at) in places.items()}
+    rows, chains = _rows(_reduced())
+    x = _places(rows, chains)
+    y = {place: 4 + (len(rows) - 1 - at) * _ROW for at, row in enumerate(rows) for place in row}
+    left = min(x[name] for name in packages()) - _WIDE / 2 - 4
+    left = min(left, *(x[place] - _LANE for place in x))
     lines = []
-    for name, others in arrows.items():
-        for other in sorted(others):
-            (x0, y0), (x1, y1) = boxes[name], boxes[other]
-            y0 += _HIGH
-            bend = min(60, (y1 - y0) * 0.6)
-            lines.append(f"<path d='M{x0:.0f} {y0:.0f} C{x0:.0f} {y0 + bend:.0f} {x1:.0f} {y1 - bend:.0f} {x1:.0f} {y1 - 4:.0f}'/>")
-    body = "".join([*lines, *(_box(name, *at) for name, at in boxes.items())])
-    view = f"{left:.0f} 0 {-2 * left:.0f} {top * _ROW + _HIGH + 8}"
+    for chain in chains:
+        path = f"M{x[chain[0]]:.0f} {y[chain[0]] + _HIGH}"
+        for one, other in pairwise(chain):
+            low, high = y[one] + _HIGH, y[other] - (5 if other == chain[-1] else 0)
+            bend = (high - low) * 0.6
+            path += f"C{x[one]:.0f} {low + bend:.0f} {x[other]:.0f} {high - bend:.0f} {x[other]:.0f} {high}"
+            path += f"V{y[other] + _HIGH}" if other != chain[-1] else ""
+        lines.append(f"<path d='{path}'/>")
+    body = "".join([*lines, *(_box(name, x[name], y[name]) for name in packages())])
+    view = f"{left:.0f} 0 {-2 * left:.0f} {(len(rows) - 1) * _ROW + _HIGH + 8}"
     head = "<marker id='tip' viewBox='0 0 8 8' refX='7' refY='4' markerWidth='7' markerHeight='7' orient='auto'><path d='M0 0L8 4L0 8z' class='wings-tip'/></marker>"
     title = "The packages in layers, each with arrows to those that it builds on"
     return f"<div class='wings'><svg viewBox='{view}' role='img' aria-label='{title}'><defs>{head}</defs>{body}</svg></div>"
