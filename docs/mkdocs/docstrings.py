@@ -1,7 +1,7 @@
-"""Docstrings are written in reStructuredText (numpydoc); this griffe extension turns what they use of it into Markdown.
+"""Turns what docstrings (numpydoc) use of reStructuredText into Markdown; an extension of griffe.
 
-Formulas (``.. math::``, ``:math:``) become MathML, roles (``:func:`` and its like) links where the reference has the name,
-``text::`` with an indented block code, simple tables pipe tables. Sections are left to griffe's numpy parser.
+Formulas (``.. math::``, ``:math:``) become MathML, roles (``:func:`` and its like) links where the reference has the
+name, ``text::`` with an indented block code, simple tables pipe tables. Sections are left to griffe's numpy parser.
 """
 
 from __future__ import annotations

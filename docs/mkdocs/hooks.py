@@ -1,5 +1,6 @@
-"""What the site takes from the program while it is built, so that no page repeats it: formulas as MathML, the picture of
-the packages, tables of the artefacts' columns and of a scenario's keys, and one page of reference for each package."""
+"""Puts into the site, while it is built, what it takes from the program, so that no page repeats it: the picture of the
+packages, tables of the artefacts' columns and of a scenario's keys, a page of reference for each package; and formulas
+as MathML."""
 
 from __future__ import annotations
 

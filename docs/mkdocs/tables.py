@@ -57,7 +57,7 @@ def _cell(text: str) -> str:
 
 
 def names(package: str) -> str:
-    """What a package offers by name: each with a link to its entry in the reference and the first line of its docstring."""
+    """What a package offers by name: a link to its entry in the reference, and what its docstring opens with."""
     rows = ["| name | what it is |", "|---|---|"]
     for node in ast.walk(ast.parse((ROOT / package / "__init__.py").read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(f"{package}."):

@@ -1,13 +1,14 @@
-"""The picture of the packages: boxes in layers, an arrow from each package to those that it builds on.
+"""Draws the packages: boxes in layers, an arrow from each package to those that it builds on.
 
-An arrow is left out where a chain of others says the same (transitive reduction), so what is drawn is all that one has to
-know: everything below a box that arrows lead to may be used by it, nothing above.
+An arrow is left out where a chain of others says the same (transitive reduction), so what is drawn is all that one has
+to know: a package may use everything that its arrows lead to, directly or further down, and nothing above.
 """
 
 from __future__ import annotations
 
 import ast
 import html
+import re
 import textwrap
 import tomllib
 from functools import cache
@@ -16,22 +17,26 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "pipeline"
+_TITLE = "The packages in layers, each with arrows to those that it builds on"
+_TIP = (
+    "<defs><marker id='tip' viewBox='0 0 8 8' refX='7' refY='4' markerWidth='7' markerHeight='7' orient='auto'>"
+    "<path d='M0 0L8 4L0 8z' class='wings-tip'/></marker></defs>"
+)
 _WIDE, _LANE, _HIGH, _GAP, _ROW = 232, 6, 84, 18, 134
-
 
 
 @cache
 def packages() -> tuple[str, ...]:
     """All packages, from low to high, in the order of the layers in ``pyproject.toml``; others come last."""
     here = sorted(p.parent.name for p in PACKAGE.glob("*/__init__.py"))
-    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"].get("importlinter", {})
-    layers = [layer for c in contracts.get("contracts", []) if c["type"] == "layers" for layer in c["layers"]]
-    order = [name.strip().strip("()").split(".")[-1] for layer in reversed(layers) for name in layer.replace("|", ":").split(":")]
+    tools = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]
+    layers = next(c["layers"] for c in tools["importlinter"]["contracts"] if c["type"] == "layers")
+    order = re.findall(r"\w+(?=[\s)|:]|$)", "\n".join(reversed(layers)))
     return tuple(sorted(here, key=lambda name: (order.index(name) if name in order else len(order), name)))
 
 
 def _imports(name: str) -> set[str]:
-    """The packages that one imports, lazily or only to check types too."""
+    """The packages that one imports: lazily, only to check types, or by a name in a string too."""
     found: set[str] = set()
     for path in (PACKAGE / name).rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -39,6 +44,8 @@ def _imports(name: str) -> set[str]:
                 found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
             elif isinstance(node, ast.Import):
                 found |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.Constant) and re.fullmatch(r"pipeline\.\w+\.[\w.]*", str(node.value)):
+                found.add(str(node.value))
     parts = [module.split(".") for module in found]
     return {p[1] for p in parts if p[0] == "pipeline" and len(p) > 1 and p[1] in packages()} - {name}
 
@@ -54,8 +61,9 @@ def _reduced() -> dict[str, set[str]]:
 
 
 def _rows(arrows: dict[str, set[str]]) -> tuple[list[list[str]], list[list[str]]]:
-    """Rows from low to high, each box as low as its arrows allow, and the arrows as chains of places from row to row: an
-    arrow that skips rows gets a place of its own in each (``a>b@3``), so that it passes between the boxes."""
+    """Rows from low to high, each box as low as its arrows allow, and the arrows as chains of places from row to row.
+
+    An arrow that skips rows gets a place of its own in each (``a>b@3``), so that it passes between the boxes."""
     row: dict[str, int] = {}
     for name in packages():
         row[name] = 1 + max((row[other] for other in arrows[name]), default=-1)
@@ -89,7 +97,9 @@ def _places(rows: list[list[str]], chains: list[list[str]]) -> dict[str, float]:
 
 
 def _about(name: str) -> str:
-    return (ast.get_docstring(ast.parse((PACKAGE / name / "__init__.py").read_text(encoding="utf-8"))) or "").strip(". \n")
+    return (ast.get_docstring(ast.parse((PACKAGE / name / "__init__.py").read_text(encoding="utf-8"))) or "").strip(
+        ". \n"
+    )
 
 
 def _box(name: str, x: float, y: float) -> str:
@@ -123,6 +133,4 @@ def picture() -> str:
         lines.append(f"<path d='{path}'/>")
     body = "".join([*lines, *(_box(name, x[name], y[name]) for name in packages())])
     view = f"{left:.0f} 0 {-2 * left:.0f} {(len(rows) - 1) * _ROW + _HIGH + 8}"
-    head = "<marker id='tip' viewBox='0 0 8 8' refX='7' refY='4' markerWidth='7' markerHeight='7' orient='auto'><path d='M0 0L8 4L0 8z' class='wings-tip'/></marker>"
-    title = "The packages in layers, each with arrows to those that it builds on"
-    return f"<div class='wings'><svg viewBox='{view}' role='img' aria-label='{title}'><defs>{head}</defs>{body}</svg></div>"
+    return f"<div class='wings'><svg viewBox='{view}' role='img' aria-label='{_TITLE}'>{_TIP}{body}</svg></div>"

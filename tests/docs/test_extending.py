@@ -1,4 +1,4 @@
-"""The packages of docs/extending.md do what the page says: each is installed beside the program, as a package of somebody
+"""The packages of docs/extending.md do what the page says: each is installed beside the program, as one of somebody
 else's would be, and used by name."""
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def install(files: dict[str, str], folder: Path) -> Path:
 
 
 def egvs(*arguments: object, beside: Path) -> tuple[int, str]:
-    """The command line in a process of its own that sees the folder ``beside``; its exit code and all that it prints."""
+    """The command line in a process of its own that sees the folder ``beside``: exit code, and all that it prints."""
     done = subprocess.run(
         [sys.executable, "-c", "from pipeline.cli.app import main; main()", *map(str, arguments)],
         env=os.environ | {"PYTHONPATH": str(beside), "COLUMNS": "200"},
@@ -85,7 +85,9 @@ def test_an_effect_of_another_package_is_listed_and_checked(mini: Path, tmp_path
     assert code == 0 and "blind_zone" in text and "the sensor's datasheet" in text
     code, text = egvs("run", mini, "--out", tmp_path / "out", "--set", "effects.blind_zone.nearest=1", beside=beside)
     assert code == 2 and "effects.blind_zone" in text and "nearest_m" in text, text
-    code, text = egvs("run", mini, "--out", tmp_path / "out", "--set", "effects.blind_zone.nearest_m=1", beside=tmp_path)
+    code, text = egvs(
+        "run", mini, "--out", tmp_path / "out", "--set", "effects.blind_zone.nearest_m=1", beside=tmp_path
+    )
     assert code == 2 and "unknown effect" in text, text
 
 
