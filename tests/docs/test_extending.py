@@ -65,6 +65,7 @@ def test_the_example_is_short(heading: str) -> None:
     assert len(modules[0].splitlines()) <= _LINES
 
 
+@pytest.mark.system
 def test_an_effect_of_another_package_acts(mini: Path, tmp_path: Path) -> None:
     beside = install(package("An effect"), tmp_path / "installed")
 
@@ -79,6 +80,7 @@ def test_an_effect_of_another_package_acts(mini: Path, tmp_path: Path) -> None:
     assert all(0 < less < score for less, score in zip(thinned, plain, strict=True))
 
 
+@pytest.mark.system
 def test_an_effect_of_another_package_is_listed_and_checked(mini: Path, tmp_path: Path) -> None:
     beside = install(package("An effect"), tmp_path / "installed")
     code, text = egvs("effects", beside=beside)
@@ -91,6 +93,7 @@ def test_an_effect_of_another_package_is_listed_and_checked(mini: Path, tmp_path
     assert code == 2 and "unknown effect" in text, text
 
 
+@pytest.mark.system
 def test_a_format_of_another_package_is_read(mini: Path, tmp_path: Path) -> None:
     beside = install(package("A format of point clouds"), tmp_path / "installed")
     points = ("20 -2 0.5", "30 2.25 1", "nan nan nan", "25 0.125 0")
@@ -107,9 +110,10 @@ def test_a_format_of_another_package_is_read(mini: Path, tmp_path: Path) -> None
     (mini / "scan.xyz").write_text("1 2\n")
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m,points\npole_a,10,12,3,scan.xyz\n")
     code, text = egvs("run", mini, "--out", tmp_path / "wrong", beside=beside)
-    assert code == 2 and "has 2 numbers a line; right: three: x, y and z" in text, text
+    assert code == 2 and "has 2 numbers a line; three: x, y and z" in text, text
 
 
+@pytest.mark.system
 def test_a_format_of_another_package_is_written(tmp_path: Path) -> None:
     beside = install(package("A format of point clouds"), tmp_path / "installed")
     code = """
