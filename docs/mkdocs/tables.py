@@ -47,8 +47,9 @@ def _table(model: dict[str, Any], models: dict[str, Any], prefix: str, heading: 
             needed = key in model.get("required", [])
             default = "**needed**" if needed else f"`{json.dumps(field.get('default'))}`".replace("`null`", "")
             rows.append(f"| `{key}` | {default} | {_cell(field.get('description', ''))} |")
-    text = [f"## `{heading}`", "", _cell(model.get("description", "").split("\n\n")[0]), ""] if rows else []
-    return text + (["| key | default | meaning |", "|---|---|---|", *rows, ""] if rows else []) + below
+    text = [f"## `{heading}`", "", _cell(model.get("description", "").split("\n\n")[0]), ""]
+    rows = ["| key | default | meaning |", "|---|---|---|", *rows, ""] if rows else []
+    return [*(text if rows or not below else []), *rows, *below]
 
 
 def _cell(text: str) -> str:

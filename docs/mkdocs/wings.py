@@ -22,7 +22,7 @@ _TIP = (
     "<defs><marker id='tip' viewBox='0 0 8 8' refX='7' refY='4' markerWidth='7' markerHeight='7' orient='auto'>"
     "<path d='M0 0L8 4L0 8z' class='wings-tip'/></marker></defs>"
 )
-_WIDE, _LANE, _HIGH, _GAP, _ROW = 232, 6, 84, 18, 134
+_WIDE, _LANE, _HIGH, _GAP, _ROW = 316, 6, 62, 18, 92
 
 
 @cache
@@ -103,15 +103,15 @@ def _about(name: str) -> str:
 
 
 def _box(name: str, x: float, y: float) -> str:
-    lines = textwrap.wrap(_about(name), 34)
-    lines = [*lines[:2], lines[2] + " …"] if len(lines) > 3 else lines
+    lines = textwrap.wrap(_about(name), 47)
+    lines = [lines[0], lines[1] + " …"] if len(lines) > 2 else lines
     text = "".join(
-        f"<text x='{x:.0f}' y='{y + 41 + 16 * k:.0f}' class='wings-about'>{html.escape(line)}</text>"
+        f"<text x='{x:.0f}' y='{y + 37 + 15 * k:.0f}' class='wings-about'>{html.escape(line)}</text>"
         for k, line in enumerate(lines)
     )
     return (
         f"<a href='api/{name}.html'><rect x='{x - _WIDE / 2:.0f}' y='{y:.0f}' width='{_WIDE}' height='{_HIGH}' rx='6'/>"
-        f"<text x='{x:.0f}' y='{y + 21:.0f}' class='wings-name'>{name}</text>{text}</a>"
+        f"<text x='{x:.0f}' y='{y + 19:.0f}' class='wings-name'>{name}</text>{text}</a>"
     )
 
 
@@ -133,4 +133,5 @@ def picture() -> str:
         lines.append(f"<path d='{path}'/>")
     body = "".join([*lines, *(_box(name, x[name], y[name]) for name in packages())])
     view = f"{left:.0f} 0 {-2 * left:.0f} {(len(rows) - 1) * _ROW + _HIGH + 8}"
-    return f"<div class='wings'><svg viewBox='{view}' role='img' aria-label='{_TITLE}'>{_TIP}{body}</svg></div>"
+    head = f"<svg viewBox='{view}' style='max-width: {-2 * left:.0f}px' role='img' aria-label='{_TITLE}'>"
+    return f"<div class='wings'>{head}{_TIP}{body}</svg></div>"
