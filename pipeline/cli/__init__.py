@@ -1,1 +1,1 @@
-"""The command line: what the user types, and the tables that answer."""
+"""The command line: parse, call, print."""

@@ -1,1 +1,1 @@
-""""""
+"""Files of other programs: point clouds, OpenStreetMap, XML that is not trusted."""

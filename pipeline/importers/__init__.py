@@ -1,1 +1,1 @@
-""""""
+"""Scenarios made from other people's maps."""

@@ -1,1 +1,1 @@
-"""The report: figures seen from above, and the page that shows a run to a reader who has not read the paper."""
+"""The page that shows what came of a run."""

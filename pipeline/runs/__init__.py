@@ -1,1 +1,1 @@
-"""Runs of a whole scenario: the stages in order, and what is kept between runs."""
+"""Runs of a whole scenario: the stages in order, and the store of what they made."""

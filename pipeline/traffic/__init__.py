@@ -1,1 +1,1 @@
-""""""
+"""Who moves where: SUMO, its networks and demand, recorded traffic, boxes, trajectories."""

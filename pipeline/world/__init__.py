@@ -1,1 +1,1 @@
-""""""
+"""What stands there: footprints, meshes, terrain, one triangle mesh, and casting rays at it."""

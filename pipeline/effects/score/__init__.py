@@ -1,1 +1,1 @@
-""""""
+"""Effects on what a beam is worth in a voxel."""

@@ -1,1 +1,1 @@
-""""""
+"""Effects on who moves, and on the ground."""

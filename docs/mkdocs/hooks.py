@@ -1,0 +1,89 @@
+"""Puts into the site, while it is built, what it takes from the program, so that no page repeats it: the picture of the
+packages, tables of the artefacts' columns and of a scenario's keys, a page of reference for each package; and formulas
+as MathML."""
+
+from __future__ import annotations
+
+import ast
+import html as htmllib
+import re
+import sys
+from pathlib import Path
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
+from mkdocs.utils import get_relative_url
+
+sys.path.insert(0, str(Path(__file__).parent))
+import tables
+import wings
+from formulas import mathml
+
+ROOT = Path(__file__).resolve().parents[2]
+_FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
+_ELSEWHERE = "https://unpkg.com/iframe-worker/shim"
+_INSERT = re.compile(r"<!-- (columns of|keys of|names of|picture of) (\w+) -->")
+
+
+def on_config(config: MkDocsConfig) -> None:
+    """The entry ``API`` of the navigation: the public API, then the packages from low to high."""
+    pages = ["api/index.md", *(f"api/{name}.md" for name in wings.packages())]
+    for entry in config.nav or []:
+        if "API" in entry:
+            entry["API"] = pages
+
+
+def on_files(files: Files, config: MkDocsConfig) -> None:
+    """One page a package, with every module that says something."""
+    for name in wings.packages():
+        folder = ROOT / "pipeline" / name
+        modules = [".".join(p.relative_to(ROOT).with_suffix("").parts) for p in sorted(folder.rglob("*.py"))]
+        text = f"# {name}\n\n{_first_line(folder / '__init__.py')}\n"
+        text += "".join(f"\n::: {module}\n" for module in modules if not module.endswith("__init__"))
+        files.append(File.generated(config, f"api/{name}.md", content=text))
+
+
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Tables and pictures in place of ``<!-- columns of scores -->`` and its like."""
+    del config, files
+    if page.file.src_uri == "artefacts.md":
+        told = {name for what, name in _INSERT.findall(markdown) if what == "columns of"}
+        untold = {p.name.split(".")[0] for p in tables.SCHEMAS.glob("*.schema.json")} - {"scenario"} - told
+        if untold:
+            raise ValueError(f"docs/artefacts.md says nothing of {', '.join(sorted(untold))}")
+    return _INSERT.sub(lambda m: _MAKE[m[1]](m[2]), markdown)
+
+
+def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Formulas of the pages; those of docstrings are MathML already."""
+    del page, config, files
+    return _FORMULA.sub(lambda m: mathml(_plain(m[3]), "block" if m[2] == "[" else "inline"), html)
+
+
+def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
+    """No script from elsewhere: what lets the search work from disk is our own."""
+    del config
+    return output.replace(_ELSEWHERE, get_relative_url("mkdocs/search_from_disk.js", page.url))
+
+
+def on_post_template(output_content: str, template_name: str, config: MkDocsConfig) -> str:
+    """The same for the page of what is not found."""
+    del template_name, config
+    return output_content.replace(_ELSEWHERE, "mkdocs/search_from_disk.js")
+
+
+def _plain(text: str) -> str:
+    return htmllib.unescape(text)
+
+
+def _first_line(path: Path) -> str:
+    return (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "").split("\n\n")[0]
+
+
+_MAKE = {
+    "columns of": tables.columns,
+    "keys of": tables.keys,
+    "names of": tables.names,
+    "picture of": lambda _: wings.picture(),
+}

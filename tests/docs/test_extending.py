@@ -1,0 +1,134 @@
+"""The packages of docs/extending.md do what the page says: each is installed beside the program, as one of somebody
+else's would be, and used by name."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import pipeline
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "extending.md"
+_BLOCK = re.compile(r'^```\w+ title="([^"]+)"\n(.*?)^```$', re.DOTALL | re.MULTILINE)
+_LINES = 35  # what a page of thirty lines may come to
+
+
+def package(heading: str) -> dict[str, str]:
+    """The files that the page shows under one heading, by name."""
+    part = re.search(rf"^## {re.escape(heading)}\n(.*?)(?=^## |\Z)", PAGE.read_text(encoding="utf-8"), re.DOTALL | re.M)
+    assert part, f"{PAGE.name} has no heading {heading!r}"
+    return dict(_BLOCK.findall(part[1]))
+
+
+def install(files: dict[str, str], folder: Path) -> Path:
+    """What an installer makes of a package: its modules, and its metadata with the entry points."""
+    project = tomllib.loads(files["pyproject.toml"])["project"]
+    about = folder / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
+    about.mkdir(parents=True)
+    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n")
+    groups = (
+        f"[{group}]\n" + "".join(f"{name} = {value}\n" for name, value in entries.items())
+        for group, entries in project["entry-points"].items()
+    )
+    (about / "entry_points.txt").write_text("\n".join(groups))
+    for name, text in files.items():
+        if name.endswith(".py"):
+            (folder / name).write_text(text)
+    return folder
+
+
+def egvs(*arguments: object, beside: Path) -> tuple[int, str]:
+    """The command line in a process of its own that sees the folder ``beside``: exit code, and all that it prints."""
+    done = subprocess.run(
+        [sys.executable, "-c", "from pipeline.cli.app import main; main()", *map(str, arguments)],
+        env=os.environ | {"PYTHONPATH": str(beside), "COLUMNS": "200"},
+        capture_output=True,
+        text=True,
+    )
+    return done.returncode, done.stdout + done.stderr
+
+
+def scores(folder: Path) -> list[float]:
+    return list(pipeline.read_scores(folder / "scores.parquet").column("egvs").to_pylist())
+
+
+@pytest.mark.parametrize("heading", ["An effect", "A format of point clouds"])
+def test_the_example_is_short(heading: str) -> None:
+    modules = [text for name, text in package(heading).items() if name.endswith(".py")]
+    assert len(modules) == 1
+    assert len(modules[0].splitlines()) <= _LINES
+
+
+@pytest.mark.system
+def test_an_effect_of_another_package_acts(mini: Path, tmp_path: Path) -> None:
+    beside = install(package("An effect"), tmp_path / "installed")
+
+    def run(out: str, *settings: str) -> list[float]:
+        code, text = egvs("run", mini, "--out", tmp_path / out, *settings, beside=beside)
+        assert code == 0, text
+        return scores(tmp_path / out)
+
+    plain = run("plain")
+    assert run("near", "--set", "effects.blind_zone.nearest_m=0.001") == plain  # its limit: nothing is that near
+    thinned = run("far", "--set", "effects.blind_zone.nearest_m=15")
+    assert all(0 < less < score for less, score in zip(thinned, plain, strict=True))
+
+
+@pytest.mark.system
+def test_an_effect_of_another_package_is_listed_and_checked(mini: Path, tmp_path: Path) -> None:
+    beside = install(package("An effect"), tmp_path / "installed")
+    code, text = egvs("effects", beside=beside)
+    assert code == 0 and "blind_zone" in text and "the sensor's datasheet" in text
+    code, text = egvs("run", mini, "--out", tmp_path / "out", "--set", "effects.blind_zone.nearest=1", beside=beside)
+    assert code == 2 and "effects.blind_zone" in text and "nearest_m" in text, text
+    code, text = egvs(
+        "run", mini, "--out", tmp_path / "out", "--set", "effects.blind_zone.nearest_m=1", beside=tmp_path
+    )
+    assert code == 2 and "unknown effect" in text, text
+
+
+@pytest.mark.system
+def test_a_format_of_another_package_is_read(mini: Path, tmp_path: Path) -> None:
+    beside = install(package("A format of point clouds"), tmp_path / "installed")
+    points = ("20 -2 0.5", "30 2.25 1", "nan nan nan", "25 0.125 0")
+    (mini / "scan.xyz").write_text("\n".join(points) + "\n")
+    (mini / "scan.csv").write_text("\n".join(["x_m,y_m,z_m", *(line.replace(" ", ",") for line in points)]) + "\n")
+
+    def run(cloud: str) -> list[float]:
+        (mini / "sites.csv").write_text(f"site,x_m,y_m,z_m,points\npole_a,10,12,3,{cloud}\n")
+        code, text = egvs("run", mini, "--out", tmp_path / cloud, beside=beside)
+        assert code == 0, text
+        return scores(tmp_path / cloud)
+
+    assert run("scan.xyz") == run("scan.csv")
+    (mini / "scan.xyz").write_text("1 2\n")
+    (mini / "sites.csv").write_text("site,x_m,y_m,z_m,points\npole_a,10,12,3,scan.xyz\n")
+    code, text = egvs("run", mini, "--out", tmp_path / "wrong", beside=beside)
+    assert code == 2 and "has 2 numbers a line; three: x, y and z" in text, text
+
+
+@pytest.mark.system
+def test_a_format_of_another_package_is_written(tmp_path: Path) -> None:
+    beside = install(package("A format of point clouds"), tmp_path / "installed")
+    code = """
+import sys, numpy as np, pathlib
+from pipeline.formats.point_clouds import read_points, write_points
+points = np.array([[1 / 3, -2e5, 1e-17], [0.1, 2.0, 3.0]])
+path = pathlib.Path(sys.argv[1])
+write_points(path, points)
+read, dropped = read_points(path, "here")
+assert dropped == 0 and read.tobytes() == points.tobytes()
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code, tmp_path / "scan.xyz"],
+        env=os.environ | {"PYTHONPATH": str(beside)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
