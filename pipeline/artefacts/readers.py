@@ -1,4 +1,4 @@
-"""How does one get artefacts back as arrays?
+"""Artefacts as arrays and tables, for notebooks, stages, and people who want to compute further.
 
 Readers for notebooks, for the stages, and for people who want to compute further. Each checks what it reads and says
 which file is wrong. Tables come as Arrow tables (``.to_pandas()`` where pandas is installed), grids as NumPy arrays.

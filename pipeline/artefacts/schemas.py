@@ -1,4 +1,4 @@
-"""Which columns does an artefact have?
+"""The columns of the artefacts, with types and units.
 
 The answer stands once, in ``data_schemas/<artefact>.schema.json`` (Frictionless Table Schema with ``unit`` and
 ``arrow_type`` beside each field). This module is the only one that reads that folder.

@@ -1,10 +1,8 @@
-"""How do artefacts get onto disk whole, and back?
+"""Writes artefacts whole and reads them back; all Parquet goes through here.
 
-The only module that reads and writes Parquet, and the only one that knows how a file is written: aside first
-(``.<name>.partial``), then renamed, so that a killed run leaves no half-written artefact.
-
-Metadata is one JSON object under the Parquet key ``egvs``. Nothing in a file depends on the clock, the machine, the
-number of threads or the path."""
+Files appear under their names only when they are whole (:mod:`pipeline.core.files`). Metadata is one JSON object under the
+Parquet key ``egvs``. Nothing in a file depends on the clock, the machine, the number of threads or the path.
+"""
 
 from __future__ import annotations
 

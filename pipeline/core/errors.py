@@ -1,4 +1,4 @@
-"""What can go wrong, and who can mend it?
+"""What can go wrong, and who can mend it: the errors that reach a user.
 
 Every error that reaches a user is an :class:`EgvsError`. Its text is one line (or a short list of lines) that names the
 place (file, key or row), what was found there, and what would be right. ``exit_code`` is what the command line ends

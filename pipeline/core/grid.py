@@ -1,4 +1,4 @@
-"""Where is a voxel, and which voxel holds a point?
+"""The region of interest and its voxels: where a voxel is, and which one holds a point.
 
 A grid has an ``origin_m`` (world frame, metres), a ``voxel_m`` (edge length) and a ``shape`` (voxels along x, y, z).
 Voxel (ix, iy, iz) is the half-open box [origin + i * voxel, origin + (i + 1) * voxel) on each axis.

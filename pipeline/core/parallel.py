@@ -1,4 +1,4 @@
-"""How is work spread over threads without the outcome knowing?
+"""Spreads work over threads without the outcome knowing.
 
 Results come back in the order of the work, whatever the order of finishing, and only a few are held at once.
 """

@@ -2,6 +2,6 @@
 
 from pathlib import Path
 
-from pipeline.core import compiled
+from pipeline.kernels import compile_cache
 
-compiled.keep_beside(Path(__file__).resolve().parent)
+compile_cache.keep_beside(Path(__file__).resolve().parent)

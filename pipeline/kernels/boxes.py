@@ -1,4 +1,4 @@
-r"""Which voxels does a vehicle's box occupy, and in how many frames?
+r"""Counts which voxels a vehicle's box occupies, and in how many frames.
 
 Frame: the grid's own, in metres (the world's axes, zero at the grid's origin).
 A box occupies a voxel when the box, made ``SHRINK_M`` (0.1 mm) smaller on each of its six sides, and the voxel share

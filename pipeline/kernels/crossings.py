@@ -1,4 +1,4 @@
-"""Which voxels do beam pieces cross, listed with their ranges?
+"""Lists which voxels beam pieces cross, with their ranges.
 
 Frame: the grid's own, in voxel units, as in :mod:`pipeline.kernels.march`, whose decisions these are.
 """

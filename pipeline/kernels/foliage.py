@@ -1,4 +1,4 @@
-r"""Where does the leaves' share of a beam end?
+r"""Finds where the leaves' share of a beam ends.
 
 Frame: any one with the world's axes, in metres, float64. A crown is a closed surface of triangles with one leaf density
 throughout; along a beam the share that gets as far as a depth s of leaves is :math:`e^{-k s}`, where overlapping crowns

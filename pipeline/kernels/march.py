@@ -1,4 +1,4 @@
-r"""Which voxels does a segment cross?
+r"""Walks a segment through the grid and tells which voxels it crosses.
 
 Frame: the grid's own, in voxel units, so that voxel :math:`(i, j, k)` is :math:`[i, i+1) \times [j, j+1) \times [k,
 k+1)`. A segment is :math:`p(t) = o + t\,d,\ 0 \le t \le 1`. It crosses a voxel when the chord that they share is longer

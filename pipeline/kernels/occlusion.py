@@ -1,4 +1,4 @@
-r"""How often do moving boxes stop the beams of one sensor before each voxel?
+r"""Counts how often moving boxes stop the beams of one sensor before each voxel.
 
 Frame: the grid's own, in metres (the world's axes, zero at the grid's origin). A box stops a beam when the beam and the
 box, made ``SHRINK_M`` (0.1 mm) smaller on each of its six sides, share a chord. So a box is here exactly as deep as

@@ -1,4 +1,4 @@
-r"""Where exactly does a ray meet a triangle?
+r"""Finds exactly where a ray meets a triangle.
 
 Frame: any one with the world's axes, in metres, float64; ray :math:`o + t\,d` with unit :math:`d`, so t is the range.
 

@@ -1,4 +1,4 @@
-r"""Which voxels does static geometry fill, and which points lie inside a solid?
+r"""Finds which voxels static geometry fills, and which points lie inside a solid.
 
 Frame: the grid's own, in metres. Two questions, because a triangle mesh is only a surface:
 

@@ -1,4 +1,4 @@
-r"""How uncertain is a voxel, and what does a site make of that?
+r"""The published score: how uncertain a voxel is, and what a site makes of that.
 
 .. math:: H(p) = -p \log_2 p - (1 - p) \log_2 (1 - p), \qquad
           EGVS = \sum_v H(p(v)) \, \min(\gamma, hits(v))

@@ -1,4 +1,4 @@
-r"""How far may a score be off because the traffic was short?
+r"""Estimates how far a score may be off because the traffic was short.
 
 The TPOG keeps its counts block by block. Leave one group of blocks out, compute every site's score from the rest, and
 do so for each group: the delete-a-group jackknife. With k groups of T_g frames, h_g = T / T_g, the score S of all

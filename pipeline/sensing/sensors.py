@@ -1,4 +1,4 @@
-r"""Which way does each beam of a sensor point?
+r"""Sensors: which way each beam points, how far it reaches; the catalogue.
 
 A sensor is a table: one elevation and one azimuth offset a ring, an azimuth step, a maximum range. Beam ``k`` of ring
 ``r`` at azimuth index ``a`` is :math:`k = a \cdot channels + r`. Its direction in the sensor's frame (x forward, z up)

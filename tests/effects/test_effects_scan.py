@@ -35,8 +35,10 @@ from pipeline.stages import scan, statics
 from pipeline.stages.base import Workspace
 from pipeline.stages.scan_source import scans
 from pipeline.stages.scene import scene_of
+from pipeline.world import building
 from pipeline.world import casting as raycast
 from pipeline.world.casting import Caster, EmptyScan
+from pipeline.world.footprints import Footprint
 from pipeline.world.mesh import World, read_ply
 from tests.conftest import collection, feature
 from tests.stages import run_stage
@@ -298,12 +300,12 @@ def test_the_densest_leaves_give_the_plain_scan(mini: Path, tmp_path: Path) -> N
 
 
 def _world(*polygons: tuple[list[tuple[float, float]], float, float]) -> World:
-    builder = statics._Builder()
+    builder = building._Builder()
     for number, (ring, base, top) in enumerate(polygons):
-        footprint = statics.Footprint(
+        footprint = Footprint(
             str(number), "tree_crown", shapely.orient_polygons(shapely.Polygon(ring)), base, top
         )
-        builder.add(*statics._extrude(footprint), footprint.name, footprint.kind)
+        builder.add(*building._extrude(footprint), footprint.name, footprint.kind)
     return builder.world()
 
 
@@ -493,7 +495,7 @@ def test_an_effect_that_can_change_nothing_is_skipped_and_leaves_no_trace(
     keeps = f"scan.keep={keep}"
     pipeline.run(pipeline.load(mini, [keeps]), tmp_path / "plain", jobs=1)
     record = pipeline.run(pipeline.load(mini, [keeps, *sets]), tmp_path / "named", jobs=1)
-    said = record["stages"]["scan"]["summary"]
+    said = record.stages["scan"].summary
     if case.startswith("bare"):
         assert "skipped" not in said  # beams of pole_b pass it
         return

@@ -54,8 +54,8 @@ def test_properties_of_a_feature_are_its_pose_sensor_and_scan(mini: Path) -> Non
     first, second = of_geojson(
         mini, collection(point(0, 1, 2, name="a", **own), point(3, 4, 5, name="b", yaw_deg=None))
     )
-    assert first == sites.Site("a", 0, 1, 2, 90, -7.5, 1, "VLP-16", "measured.ply")
-    assert second == sites.Site("b", 3, 4, 5, 0, 0, 0, "small", None)
+    assert first == sites.Site("a", sites.Pose(0, 1, 2, 90, -7.5, 1), "VLP-16", "measured.ply")
+    assert second == sites.Site("b", sites.Pose(3, 4, 5), "small")
 
 
 def test_a_run_from_geojson_scores_what_a_run_from_csv_does(mini: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-r"""How much of a beam gets past a thin pole?
+r"""How much of a beam gets past a thin pole.
 
 Model: a beam is a cone with a Gaussian profile, whose intensity has fallen to :math:`1/e^2` at half the sensor's full
 angle :math:`\Theta` on either side: with a the angle across (azimuth) and e along the elevation,

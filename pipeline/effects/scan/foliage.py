@@ -1,4 +1,4 @@
-r"""How much of a beam gets through a tree crown?
+r"""How much of a beam gets through a tree crown.
 
 Model: leaves that are small, many and placed at random in the crown. A stretch of s metres within leaves of density LAD
 (one-sided leaf area a volume, m2/m3) lets through

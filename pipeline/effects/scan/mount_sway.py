@@ -1,4 +1,4 @@
-r"""What does a sensor see from a pole that moves?
+r"""What a sensor sees from a pole that moves.
 
 Model: the mount tilts by a rotation vector :math:`(\alpha, \beta, 0)`: one turn by :math:`\sqrt{\alpha^2 + \beta^2}`
 about the horizontal axis :math:`(\alpha, \beta)` of the world through the sensor, with :math:`\alpha, \beta`

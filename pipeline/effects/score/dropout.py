@@ -1,4 +1,4 @@
-r"""What if a constant share of returns is lost?
+r"""A constant share of returns is lost.
 
 Model: :math:`detect(r) = 1 - share`, whatever the range. It is the expectation of dropping each return by the throw of
 a die, as the LiDAR of CARLA does under ``dropoff_general_rate`` (Dosovitskiy et al. 2017, CoRL, PMLR 78).

@@ -1,4 +1,4 @@
-r"""How much of a return does fog take away?
+r"""How much of a return fog takes away.
 
 Model: the pulse is thinned on its way out and back, by an extinction that follows from how far one sees and falls with
 the wavelength,

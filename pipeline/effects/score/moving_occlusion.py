@@ -1,4 +1,4 @@
-r"""How often do vehicles hide what is behind them?
+r"""How often vehicles hide what is behind them.
 
 The plain scene scans an empty road. With traffic on it, a beam ends at the first vehicle that it meets. Two models of
 the share of a beam b that gets as far as voxel v:

@@ -1,4 +1,4 @@
-r"""How much of a return does rain take away?
+r"""How much of a return rain takes away.
 
 Model: the pulse is thinned on its way out and back,
 

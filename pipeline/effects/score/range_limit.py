@@ -1,4 +1,4 @@
-r"""From how far does a target of some reflectivity come back?
+r"""How far away a target of some reflectivity still comes back.
 
 Model: a target that is larger than the beam's footprint and scatters like Lambert returns a power that goes as
 :math:`\rho \cos\theta / r^2` (Höfle and Pfeifer 2007, ISPRS J. Photogramm. Remote Sens. 62(6), 415-433). The sensor's

@@ -12,7 +12,7 @@ import pytest
 
 import pipeline
 
-CORE = Path(pipeline.__file__).parent / "core"
+PACKAGE = Path(pipeline.__file__).parent
 INNER = "import numba\n\n\n@numba.njit(cache=True)\ndef inner(x):\n    return x + {}\n"
 OUTER = (
     "import numba\n\nfrom pipeline.kernels.inner import inner\n\n\n"
@@ -32,7 +32,7 @@ def package(tmp_path: Path) -> Path:
     kernels = tmp_path / "pipeline" / "kernels"
     kernels.mkdir(parents=True)
     (tmp_path / "pipeline" / "__init__.py").write_text("")
-    shutil.copytree(CORE, tmp_path / "pipeline" / "core", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(PACKAGE / "core", tmp_path / "pipeline" / "core", ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(CORE.parent / "kernels" / "__init__.py", kernels)
     (kernels / "inner.py").write_text(INNER.format(1))
     (kernels / "outer.py").write_text(OUTER)
