@@ -214,7 +214,7 @@ def accuracy(
     with show.Screen("accuracy") as screen:
         found = what_it_costs.study(
             scenario, set_ or (), folder, tolerance=tolerance, budget_s=_seconds(budget), seeds=seeds, jobs=jobs,
-            progress=screen.progress, told=screen.setting,
+            progress=screen.progress, listener=screen.setting,
         )  # fmt: skip
     show.accuracy(found, _again("run", scenario, set_))
 
@@ -243,16 +243,17 @@ def effects(
     """Print which effects exist; for a scenario, which it calls for, and why."""
     from pipeline.cli import screen as show
     from pipeline.runs import workflow
-    from pipeline.studies import effects as callings
+    from pipeline.studies import ablation as ablations
+    from pipeline.studies import effect_overview
 
     if scenario is None:
         if ablation:
             raise InputError("--ablation", "without a scenario", "egvs effects SCENARIO --ablation")
-        show.effects(callings.catalogue())
+        show.effects(effect_overview.catalogue())
         return
     resolved = _load(scenario, set_)
     folder = out or workflow.default_folder(resolved)
-    prices, calls = callings.prices(resolved, folder), callings.called(resolved)
+    prices, calls = effect_overview.prices(resolved, folder), effect_overview.called(resolved)
     show.effects(calls, prices)
     untold = [
         call.name
@@ -268,7 +269,7 @@ def effects(
                 "--ablation", "the scenario names no effect", "name one, e.g. --set effects.rain.rate_mm_h=20"
             )
         with show.Screen() as screen:
-            changes = callings.ablation(resolved, folder, jobs=jobs, progress=screen.progress)
+            changes = ablations.ablation(resolved, folder, jobs=jobs, progress=screen.progress)
         show.ablation(changes)
 
 

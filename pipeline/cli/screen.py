@@ -21,8 +21,11 @@ from pipeline.sensing.sensors import Sensor
 
 if TYPE_CHECKING:
     from pipeline.runs.record import RunRecord, StageRecord
-    from pipeline.studies.accuracy import Row, Seeds, Study
-    from pipeline.studies.effects import Call, Change, Price
+    from pipeline.studies.ablation import Change
+    from pipeline.studies.accuracy import AccuracyStudy
+    from pipeline.studies.comparison import Row
+    from pipeline.studies.effect_overview import Call, Price
+    from pipeline.studies.seeds import Seeds
 
 
 NARROW, WIDE = 110, 190
@@ -244,7 +247,7 @@ def summary(folder: Path, found: dict[str, Any]) -> None:
     console.print(f"next: egvs run {folder}", markup=False)
 
 
-def accuracy(study: Study, command: str) -> None:
+def accuracy(study: AccuracyStudy, command: str) -> None:
     """What the study found: two tables, what was left out, the recommendation (``command`` and what it takes)."""
     console = Console(width=None if sys.stdout.isatty() else WIDE, highlight=False, soft_wrap=True)
     wide = console.width >= WIDE - 10
@@ -320,7 +323,7 @@ def _seeds(console: Console, seeds: Seeds) -> None:
     console.print(f"90 % intervals hold the score of all runs together in {seeds.covered:.1%} of cases")
 
 
-def _recommendation(study: Study, command: str) -> str:
+def _recommendation(study: AccuracyStudy, command: str) -> str:
     if study.empty:
         return "every score is 0, so that there is nothing to choose by: look where the region of interest and the traffic are"
     rivals = [row for row in study.rows if row.kind in ("approximates", "scenario")]

@@ -78,7 +78,7 @@ def artefacts_of(stage: str) -> tuple[str, ...]:
 def inputs(stage: str, scenario: Scenario, out: Path) -> Inputs:
     """Everything that a stage's artefacts depend on; ``out`` holds those of the stages before."""
     read: dict[str, Any] = module_of(stage).inputs(scenario, out)
-    about = {"egvs": __version__, "stage": stage, "inputs": read, "program": _program(stage, scenario)}
+    about = {"stage": stage, "inputs": read, "program": program(stage, scenario)}
     return Inputs(files.hash_of(about), dict(read["files"]))
 
 
@@ -105,12 +105,13 @@ def _companions(module: ModuleType, out: Path) -> dict[str, tuple[int, int, int]
     return found
 
 
-def _program(stage: str, scenario: Scenario) -> dict[str, Any]:
+def program(stage: str, scenario: Scenario) -> dict[str, Any]:
     """What a stage's artefacts depend on beside its inputs: its source, that of the effects that the scenario names for
-    it, its schemas and templates, and the libraries."""
+    it, its schemas and templates, and the versions of this program and of the libraries."""
     own, effects = source.of(module_name(stage)), _effects(stage, scenario)
     libraries = own.libraries.union(*(effect.libraries for _, effect in effects.values()))
     return {
+        "egvs": __version__,
         "source": own.digest,
         "effects": {name: (parameters, effect.digest) for name, (parameters, effect) in effects.items()},
         "files": {path.name: files.sha256_of(path) for path in _data(stage)},

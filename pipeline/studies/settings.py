@@ -1,4 +1,4 @@
-r"""Which settings does the accuracy study try?
+r"""The settings that the accuracy study tries.
 
 One knob at a time around the scenario's own setting, and a small full grid of those that cost most. Two kinds, which
 are never mixed: a setting that *approximates* the scenario's number more or less well (how long and how finely traffic
@@ -75,6 +75,10 @@ class Setting:
     steps: float = 0.0
 
 
+OWN = Setting(SCENARIO, SCENARIO, "")
+"""The scenario as it is."""
+
+
 def reference(scenario: Scenario, times: int) -> Setting:
     """The scenario with its traffic watched for ``times`` as long."""
     frames = scenario.traffic.frames * times
@@ -91,7 +95,7 @@ def is_default(scenario: Scenario, own: Scenario) -> bool:
 
 def settings(scenario: Scenario) -> list[Setting]:
     """All settings but the reference, the scenario's own first; the cheap and telling ones before the others."""
-    found = [Setting(SCENARIO, SCENARIO, "")]
+    found = [OWN]
     watched = sorted(_watched(scenario), key=lambda setting: setting.steps)
     for setting in (*_measures(scenario), *_quality(scenario), *_thinned(scenario), *watched):
         if setting.overrides not in [other.overrides for other in found if other.without == setting.without]:

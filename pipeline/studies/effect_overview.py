@@ -1,27 +1,23 @@
-"""Which effects exist, which does a scene call for, and what do they change?
+"""Which effects exist, which of them a scenario calls for, and what an accuracy study says that each costs.
 
 Steps of :func:`called`: build the static world in memory; ask every named effect whether it can change the result; say
-for each effect whether it is on, and why. Steps of :func:`ablation`: run the plain scene, then the scene with one named
-effect at a time, and all of them; stages that an effect does not touch are not run again."""
+for each effect whether it is on, and why."""
 
 from __future__ import annotations
 
 import importlib
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.artefacts.readers import read_accuracy, read_scores
+from pipeline.artefacts.readers import read_accuracy
 from pipeline.core import files
-from pipeline.core.progress import Progress, silent
 from pipeline.effects import registry as effects
-from pipeline.runs import workflow
 from pipeline.scenario.models import Scenario
 from pipeline.sensing import sites
 from pipeline.stages import statics
-from pipeline.studies import settings as knobs
-from pipeline.studies import trials
+from pipeline.studies.measuring import inputs_of
+from pipeline.studies.settings import SCENARIO, WITH, WITHOUT
 
 
 @dataclass(frozen=True)
@@ -58,28 +54,6 @@ class Price:
     regret: float
 
 
-@dataclass(frozen=True)
-class Change:
-    """What one effect (or all) does to the scores.
-
-    Attributes
-    ----------
-    effect
-        Its name; "all" for all that the scenario names together; "none" for the plain scene.
-    seconds
-        Time of all stages but the report; a stage that the effect does not touch counts with what it took in the plain
-        scene.
-    sites, scores, ranks
-        Of each site, in the order of the sites.
-    """
-
-    effect: str
-    seconds: float
-    sites: tuple[str, ...]
-    scores: tuple[float, ...]
-    ranks: tuple[int, ...]
-
-
 def catalogue() -> list[Call]:
     """Every effect that exists."""
     return [Call(name, *effects.KINDS[name], "", _summary(name), _source(name)) for name in effects.KINDS]
@@ -95,15 +69,15 @@ def prices(scenario: Scenario, out: Path) -> dict[str, Price] | None:
     """What ``egvs accuracy`` found of each effect, from ``out / "accuracy.parquet"``; None when it was not run on this
     scenario."""
     study = read_accuracy(out / "accuracy.parquet")
-    if study is None or study[1]["inputs"] != files.hash_of(trials.inputs_of(scenario)):
+    if study is None or study[1]["inputs"] != files.hash_of(inputs_of(scenario)):
         return None
     rows = {row["setting"]: row for row in study[0]}
-    found, own = {}, rows[knobs.SCENARIO]["seconds"]
+    priced, own = {}, rows[SCENARIO]["seconds"]
     for name in effects.KINDS:
-        for beginning, sign in ((knobs.WITH, 1.0), (knobs.WITHOUT, -1.0)):
+        for beginning, sign in ((WITH, 1.0), (WITHOUT, -1.0)):
             if (row := rows.get(f"{beginning}{name}")) is not None:
-                found[name] = Price(sign * (row["seconds"] - own), row["error"], row["tau"], row["regret"])
-    return found
+                priced[name] = Price(sign * (row["seconds"] - own), row["error"], row["tau"], row["regret"])
+    return priced
 
 
 def _call(name: str, scene: effects.Scene) -> Call:
@@ -136,25 +110,3 @@ def _source(name: str) -> str:
 
 def _summary(name: str) -> str:
     return str(_module(name).__doc__).strip().splitlines()[0]
-
-
-def ablation(scenario: Scenario, out: Path, *, jobs: int | None = None, progress: Progress = silent) -> list[Change]:
-    """Run the plain scene, each named effect alone, and all together, under ``out / "ablation"``; a run is resumed as
-    any other."""
-    alone = {name: {name: parameters} for name, parameters in scenario.effects.items()}
-    variants: dict[str, dict[str, Any]] = {"none": {}, **alone}
-    if len(alone) > 1:
-        variants["all"] = dict(scenario.effects)
-    plain, changes = out / "ablation" / "none", []
-    for name, named in variants.items():
-        folder = out / "ablation" / name
-        if not folder.exists() and plain.exists():
-            shutil.copytree(plain, folder, ignore=shutil.ignore_patterns(".lock"))
-        record = workflow.run(scenario.with_effects(named), folder, jobs=jobs, progress=progress)
-        seconds = sum(done.cost.seconds for stage, done in record.stages.items() if stage != "report")
-        scores = read_scores(folder / "scores.parquet")
-        names = tuple(scores["site"].to_pylist())
-        changes.append(
-            Change(name, seconds, names, tuple(scores["egvs"].to_pylist()), tuple(scores["rank"].to_pylist()))
-        )
-    return changes
