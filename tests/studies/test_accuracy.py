@@ -454,7 +454,7 @@ def test_nothing_that_is_as_long_as_the_reference_is_compared_with_it(junction: 
 
 @pytest.mark.parametrize("width", [80, 120, 190])
 def test_tables_fit_the_terminal(mini: Path, tmp_path: Path, few: None, width: int, capsys, monkeypatch) -> None:
-    study = study_of(mini, [], tmp_path / "out", budget_s=5.0)
+    study = study_of(mini, [], tmp_path / "out")
     rows = [replace(row, front=row.kind != "measures", recommended=row.kind == "scenario") for row in study.rows]
     study = replace(study, rows=rows)  # the same marks whatever the seconds
     monkeypatch.setattr(show, "WIDE", width)
