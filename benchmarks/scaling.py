@@ -29,12 +29,12 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from pipeline.runs.record import StageRecord
 from pyarrow import csv
 
 import pipeline
 from pipeline.core.cost import let_go
 from pipeline.runs import workflow
-from pipeline.runs.record import StageRecord
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE, FIGURE = ROOT / "docs" / "scaling.md", ROOT / "docs" / "images" / "scaling.png"

@@ -7,6 +7,7 @@ two cores."""
 
 from __future__ import annotations
 
+import os
 import sys
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
@@ -18,8 +19,8 @@ import numpy as np
 
 from pipeline.core.parallel import threads
 from pipeline.core.progress import silent
+from pipeline.studies.measuring import SettingRunner
 from pipeline.studies.settings import Setting
-from pipeline.studies.trials import Bench
 
 SCENARIO = Path(__file__).resolve().parent.parent / "scenarios" / "nishishinjuku"
 WATCHED = ("traffic.frames=5000", "traffic.frame_period_s=1.0")
@@ -28,10 +29,11 @@ STEPS_S, AGAINST_S, FIRST_SEED, SEEDS = (0.1, 0.25, 0.5, 1.0), 0.25, 100, 16
 
 def trial(step_s: float, seed: int) -> tuple[list[str], list[float], float]:
     """Sites, their shares of the limit, and seconds of the traffic stage, of one run."""
+    os.environ["EGVS_STORE"] = ""  # nothing is fetched that is to be measured
     with tempfile.TemporaryDirectory() as folder:
-        bench = Bench(SCENARIO, WATCHED, Path(folder), 1, silent)
-        found = bench.run(Setting("run", "seed", "seed", (f"seed={seed}", f"traffic.step_s={step_s}")))
-        return found.sites, found.shares, bench.spent("traffic", found.stages["traffic"]).seconds[0]
+        runner = SettingRunner(SCENARIO, WATCHED, Path(folder), 1, silent)
+        found = runner.run(Setting("run", "seed", "seed", (f"seed={seed}", f"traffic.step_s={step_s}")))
+        return found.sites, found.shares, runner.times("traffic", found.stages["traffic"]).seconds[0]
 
 
 def change(shares: Any, against: Any) -> tuple[Any, Any]:

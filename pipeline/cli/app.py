@@ -220,7 +220,7 @@ def accuracy(
             seeds=seeds,
             jobs=jobs,
             progress=screen.progress,
-            told=screen.setting_event,
+            listener=screen.setting_event,
         )
     study_tables.print_study(outcome, arguments.command("run", scenario, set_))
 
@@ -240,15 +240,16 @@ def effects(
     """Print which effects exist; for a scenario, which it calls for, and why."""
     from pipeline.cli import effect_tables
     from pipeline.cli.progress import Screen
-    from pipeline.studies import effects as study
+    from pipeline.studies import ablation as ablations
+    from pipeline.studies import effect_overview
 
     if scenario is None:
         if ablation:
             raise InputError("--ablation", "without a scenario", "egvs effects SCENARIO --ablation")
-        effect_tables.print_effects(study.catalogue())
+        effect_tables.print_effects(effect_overview.catalogue())
         return
     resolved, folder = _resolved(scenario, set_, out)
-    prices, calls = study.prices(resolved, folder), study.called(resolved)
+    prices, calls = effect_overview.prices(resolved, folder), effect_overview.called(resolved)
     effect_tables.print_effects(calls, prices)
     on = [call.name for call in calls if call.state == "on" and call.name in resolved.effects.named]
     unpriced = [name for name in on if name not in (prices or {})]
@@ -261,7 +262,7 @@ def effects(
                 "--ablation", "the scenario names no effect", "name one, e.g. --set effects.rain.rate_mm_h=20"
             )
         with Screen() as screen:
-            changes = study.ablation(resolved, folder, jobs=jobs, progress=screen.progress)
+            changes = ablations.ablation(resolved, folder, jobs=jobs, progress=screen.progress)
         effect_tables.print_ablation(changes)
 
 

@@ -10,7 +10,8 @@ from rich.table import Table
 from pipeline.cli.terminal import NARROW, console
 
 if TYPE_CHECKING:
-    from pipeline.studies.effects import Call, Change, Price
+    from pipeline.studies.ablation import Change
+    from pipeline.studies.effect_overview import Call, Price
 
 
 def print_effects(calls: Sequence[Call], prices: Mapping[str, Price] | None = None) -> None:

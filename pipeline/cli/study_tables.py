@@ -12,10 +12,12 @@ from rich.table import Table
 from pipeline.cli.terminal import WIDE, console
 
 if TYPE_CHECKING:
-    from pipeline.studies.accuracy import Row, Seeds, Study
+    from pipeline.studies.accuracy import AccuracyStudy
+    from pipeline.studies.comparison import Row
+    from pipeline.studies.seeds import Seeds
 
 
-def print_study(study: Study, command: str) -> None:
+def print_study(study: AccuracyStudy, command: str) -> None:
     """What the study found: two tables, what was left out, the recommendation (``command`` and what it takes)."""
     out = console(WIDE)
     is_wide = out.width >= WIDE - 10
@@ -43,7 +45,7 @@ def print_study(study: Study, command: str) -> None:
         out.print(str(path), markup=False)
 
 
-def _reference(study: Study) -> str:
+def _reference(study: AccuracyStudy) -> str:
     """What the settings are compared with."""
     for row in study.rows:
         if row.kind == "reference":
@@ -95,7 +97,7 @@ def _print_seeds(out: Console, seeds: Seeds) -> None:
     out.print(f"90 % intervals hold the score of all runs together in {seeds.covered:.1%} of cases")
 
 
-def _recommendation(study: Study, command: str) -> str:
+def _recommendation(study: AccuracyStudy, command: str) -> str:
     if study.empty:
         return (
             "every score is 0, so that there is nothing to choose by: "

@@ -11,8 +11,8 @@ from pipeline.artefacts import schemas
 from pipeline.artefacts.run_record import STAGES
 from pipeline.core import files, source
 from pipeline.core.cost import Cost, measured
-from pipeline.core.version import __version__
 from pipeline.effects import registry
+from pipeline.scenario.models import Scenario
 from pipeline.stages.base import StageInputs, Workspace
 
 RANKING = STAGES[:-1]
@@ -97,7 +97,7 @@ def artefacts_of(stage: str) -> tuple[str, ...]:
 def inputs(stage: str, work: Workspace) -> Inputs:
     """Everything that a stage's artefacts depend on; ``work`` holds those of the stages before."""
     read: StageInputs = module_of(stage).inputs(work)
-    about = {"egvs": __version__, "stage": stage, "inputs": read.to_json(), "program": _program(stage, read, work)}
+    about = {"stage": stage, "inputs": read.to_json(), "program": program(stage, work.scenario, read.code)}
     return Inputs(files.hash_of(about), dict(read.files), read)
 
 
@@ -125,11 +125,11 @@ def _companions(module: ModuleType, out: Path) -> dict[str, tuple[int, int, int]
     return found
 
 
-def _program(stage: str, read: StageInputs, work: Workspace) -> dict[str, Any]:
+def program(stage: str, scenario: Scenario, acting: tuple[type, ...] = ()) -> dict[str, Any]:
     """What a stage's artefacts depend on beside its inputs: its source, that of the effects that act in it (and, since
     its summary names them, of those that turn out to change nothing), its schemas and templates, and the libraries."""
-    named = registry.named(work.scenario, *_ASKS.get(stage, (stage,)))
-    effects = sorted({*read.code, *(type(effect) for effect in named)}, key=lambda effect: effect.__module__)
+    named = registry.named(scenario, *_ASKS.get(stage, (stage,)))
+    effects = sorted({*acting, *(type(effect) for effect in named)}, key=lambda effect: effect.__module__)
     own, theirs = source.of(module_of(stage).__name__), [source.of_object(effect) for effect in effects]
     libraries = own.libraries.union(*(effect.libraries for effect in theirs))
     return {

@@ -43,7 +43,9 @@ def _kept(work: Workspace, only: Collection[str] | None) -> Iterator[SiteBeams]:
                 columns = {name: table.column(name).to_numpy() for name in wanted}
                 ends = np.column_stack([columns[name] for name in ("dx_m", "dy_m", "dz_m")])
                 sensor = scene_of(work).sensor(site.sensor, f"site {site.name}")
-                yield SiteBeams(site, Beams(site.pose, sensor, ends, columns.get("weight"), f"{SCANS}: site {site.name}"))
+                yield SiteBeams(
+                    site, Beams(site.pose, sensor, ends, columns.get("weight"), f"{SCANS}: site {site.name}")
+                )
 
 
 def _cast(work: Workspace, only: Collection[str] | None) -> Iterator[SiteBeams]:

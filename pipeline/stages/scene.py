@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from pipeline.core import files
 from pipeline.effects import registry, scenes
 from pipeline.effects.base import Effect
+from pipeline.scenario.models import Scenario
 from pipeline.sensing.scene import Scene
+from pipeline.sensing.sites import Site
 from pipeline.stages.base import StageInputs, Workspace
 from pipeline.stages.world import STATICS, world_of
 
@@ -30,10 +34,16 @@ def scan_inputs(work: Workspace) -> StageInputs:
     }
     if live:
         settings["effects"] = registry.settings(live)
-    hashes = work.digests(STATICS)
+    hashes = work.digests(STATICS) | site_digests(scenario, scene.sites)
+    return StageInputs(settings, hashes, code=tuple(type(effect) for effect in live))
+
+
+def site_digests(scenario: Scenario, sites: Iterable[Site]) -> dict[str, str]:
+    """The files that say where sites are, and what was measured there, by sha256."""
+    hashes = {}
     if scenario.sites.file is not None:
         hashes[scenario.sites.file] = files.sha256_of(scenario.find(scenario.sites.file, "sites.file"))
-    for site in scene.sites:
+    for site in sites:
         if site.points is not None:
             hashes[site.points] = files.sha256_of(scenario.find(site.points, f"site {site.name}: points"))
-    return StageInputs(settings, hashes, code=tuple(type(effect) for effect in live))
+    return hashes

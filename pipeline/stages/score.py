@@ -7,6 +7,7 @@ voxel size or TPOG needs this stage alone.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -69,7 +70,7 @@ def inputs(work: Workspace) -> StageInputs:
 
 
 def run(
-    work: Workspace, inputs: StageInputs, audit: bool = False, left_out: list[list[float]] | None = None
+    work: Workspace, inputs: StageInputs, audit: bool = False, observe: Callable[[ScoredSite], None] | None = None
 ) -> Summary:
     """Score and rank all sites; write ``scores.parquet``, and ``visibility.parquet`` where sites are to be kept.
 
@@ -77,9 +78,8 @@ def run(
     ----------
     audit
         Check for every beam that the chords of its voxels add up to the clipped segment and that no voxel comes twice.
-    left_out
-        Where standard errors are asked for, filled with :meth:`pipeline.scoring.uncertainty.LeaveOut.scores` of each
-        site.
+    observe
+        Called with each site as it is scored, in order.
 
     Returns
     -------
@@ -101,8 +101,8 @@ def run(
     for scored in in_order(score, scans(work), work.threads):
         done.append(scored)
         work.progress("sites", len(done), 0)
-    if left_out is not None:
-        left_out += (d.score.left_out.tolist() for d in done if d.score.left_out is not None)
+        if observe is not None:
+            observe(scored)
     sites = [d.site.to_json() for d in done]
     about = work.metadata(inputs, gamma=wanted.gamma, grid=tpog.grid.to_json(), frames=tpog.frames, sites=sites)
     _write_visibility(work, done, about)

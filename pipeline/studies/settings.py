@@ -1,4 +1,4 @@
-r"""Which settings does the accuracy study try?
+r"""The settings that the accuracy study tries.
 
 One knob at a time around the scenario's own setting, and a small full grid of those that cost most. Two kinds, which
 are never mixed: a setting that *approximates* the scenario's number more or less well (how long and how finely traffic
@@ -18,14 +18,17 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from pydantic import ValidationError
+
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Grid
-from pipeline.effects import registry as effects
+from pipeline.effects import registry
+from pipeline.effects.built_scene import build_scene
+from pipeline.effects.on_traffic import SELF_ACTING
 from pipeline.scenario.models import Scenario
 from pipeline.scenario.traffic import TrafficModel
 from pipeline.sensing import sites
 from pipeline.sensing.sensors import Sensor, resolve
-from pipeline.stages import statics
 
 APPROXIMATES, MEASURES, REFERENCE, SCENARIO = "approximates", "measures", "reference", "scenario"
 WITHOUT, WITH = "without ", "with "
@@ -75,6 +78,10 @@ class Setting:
     steps: float = 0.0
 
 
+OWN = Setting(SCENARIO, SCENARIO, "")
+"""The scenario as it is."""
+
+
 def reference(scenario: Scenario, times: int) -> Setting:
     """The scenario with its traffic watched for ``times`` as long."""
     frames = scenario.traffic.frames * times
@@ -91,7 +98,7 @@ def is_default(scenario: Scenario, own: Scenario) -> bool:
 
 def settings(scenario: Scenario) -> list[Setting]:
     """All settings but the reference, the scenario's own first; the cheap and telling ones before the others."""
-    found = [Setting(SCENARIO, SCENARIO, "")]
+    found = [OWN]
     watched = sorted(_watched(scenario), key=lambda setting: setting.steps)
     for setting in (*_measures(scenario), *_quality(scenario), *_thinned(scenario), *watched):
         if setting.overrides not in [other.overrides for other in found if other.without == setting.without]:
@@ -194,7 +201,7 @@ def _sensor(scenario: Scenario, sensor: Sensor, factor: int, rings: range | list
         values["channels"] = len(rings)
     if own is None:
         values["range_m"] = sensor.range_m
-    if own is None and scenario.effects:
+    if own is None and scenario.effects.named:
         optics = {
             name: getattr(sensor, name)
             for name in ("wavelength_nm", "divergence_mrad", "rated_range_m", "rated_reflectivity")
@@ -218,7 +225,7 @@ def _measures(scenario: Scenario) -> Iterator[Setting]:
     for cap in GAMMAS:
         if cap != gamma:
             yield Setting(f"gamma {cap:g}", MEASURES, "gamma", (f"score.gamma={cap}",))
-    for name in scenario.effects:
+    for name in scenario.effects.named:
         yield Setting(f"{WITHOUT}{name}", MEASURES, "effect", (), without=name)
     for name in _others(scenario):
         yield Setting(f"{WITH}{name}", MEASURES, "effect", (f"effects.{name}={{}}",))
@@ -226,13 +233,14 @@ def _measures(scenario: Scenario) -> Iterator[Setting]:
 
 def _others(scenario: Scenario) -> Iterator[str]:
     """Effects that are not named, need no parameter, and would act."""
-    place, scene = f"{scenario.file}: effects", None
-    for name in effects.KINDS:
-        if name in scenario.effects or name in effects.SELF_ACTING or effects.needs(name):
+    scene = None
+    for name in registry.names():
+        if name in scenario.effects.named or name in SELF_ACTING or registry.needs(name):
             continue
-        scene = scene or effects.Scene(scenario, statics.build(scenario)[0], sites.of(scenario))
-        effect = effects.make(name, {}, place)
-        if effect.idle(scene) is None and effect.lacks(scene) is None:
+        scene = scene or build_scene(scenario)
+        kind = registry.effect_class(name)
+        effect = kind(kind.Model())
+        if effect.why_idle(scene) is None and effect.refusal(scene) is None:
             yield name
 
 
@@ -246,8 +254,8 @@ def _fits(scenario: Scenario, voxel_m: float) -> bool:
 
 def _takes(name: str, parameters: dict[str, object]) -> bool:
     try:
-        effects.make(name, parameters, "")
-    except InputError:
+        registry.effect_class(name).Model.of(parameters)
+    except ValidationError:
         return False
     return True
 
@@ -255,8 +263,8 @@ def _takes(name: str, parameters: dict[str, object]) -> bool:
 def _quality(scenario: Scenario) -> Iterator[Setting]:
     """Each named effect's own knobs, which its class lists from cheap to fine as ``QUALITY``: a value for each
     parameter."""
-    for name, parameters in scenario.effects.items():
-        effect = effects.make(name, dict(parameters), f"{scenario.file}: effects")
+    for name, named in scenario.effects.named.items():
+        effect, parameters = registry.make(name, named), named.model_dump(mode="json", exclude_unset=True)
         for key, values in effect.QUALITY.items():
             own = getattr(effect.parameters, key)
             if not _takes(name, {**parameters, key: values[0]}):  # a knob of another method

@@ -510,7 +510,9 @@ def test_only_the_score_runs_again(mini: Path, tmp_path: Path) -> None:
     def states(*settings: str) -> dict[str, str]:
         seen: dict[str, str] = {}
         workflow.run(
-            pipeline.load(mini, settings), tmp_path / "out", listener=lambda stage, state, _: seen.__setitem__(stage, state)
+            pipeline.load(mini, settings),
+            tmp_path / "out",
+            listener=lambda stage, state, _: seen.__setitem__(stage, state),
         )
         return seen
 

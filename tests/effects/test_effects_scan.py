@@ -302,9 +302,7 @@ def test_the_densest_leaves_give_the_plain_scan(mini: Path, tmp_path: Path) -> N
 def _world(*polygons: tuple[list[tuple[float, float]], float, float]) -> World:
     builder = building._Builder()
     for number, (ring, base, top) in enumerate(polygons):
-        footprint = Footprint(
-            str(number), "tree_crown", shapely.orient_polygons(shapely.Polygon(ring)), base, top
-        )
+        footprint = Footprint(str(number), "tree_crown", shapely.orient_polygons(shapely.Polygon(ring)), base, top)
         builder.add(*building._extrude(footprint), footprint.name, footprint.kind)
     return builder.world()
 

@@ -33,7 +33,8 @@ def package(tmp_path: Path) -> Path:
     kernels.mkdir(parents=True)
     (tmp_path / "pipeline" / "__init__.py").write_text("")
     shutil.copytree(PACKAGE / "core", tmp_path / "pipeline" / "core", ignore=shutil.ignore_patterns("__pycache__"))
-    shutil.copy(CORE.parent / "kernels" / "__init__.py", kernels)
+    shutil.copy(PACKAGE / "kernels" / "__init__.py", kernels)
+    shutil.copy(PACKAGE / "kernels" / "compile_cache.py", kernels)
     (kernels / "inner.py").write_text(INNER.format(1))
     (kernels / "outer.py").write_text(OUTER)
     return tmp_path

@@ -32,7 +32,7 @@ from pipeline.scoring import visibility
 from pipeline.scoring.egvs import EntropyField
 from pipeline.stages import scan, score
 from pipeline.stages.base import metadata
-from pipeline.studies import accuracy
+from pipeline.studies import accuracy, comparison
 from pipeline.studies import settings as study_settings
 from pipeline.world.mesh import World, write_ply
 from tests.stages import inputs_of, run_stage
@@ -492,7 +492,7 @@ def test_the_accuracy_study_is_shown_where_there_is_one(mini, tmp_path, egvs, mo
     monkeypatch.setattr(study_settings, "VOXELS_M", (1.0,))
     monkeypatch.setattr(study_settings, "GAMMAS", (2.0,))
     monkeypatch.setattr(accuracy, "REPEATS", 1)
-    own = accuracy._judged
+    own = comparison.judge
 
     def thinned(rows, tolerance):
         """The clock decides which of two fast settings is the cheapest: here it is always the same."""
@@ -500,7 +500,7 @@ def test_the_accuracy_study_is_shown_where_there_is_one(mini, tmp_path, egvs, mo
             [replace(r, seconds=0.5 if r.setting == "every 2nd azimuth" else 1.0, judged=0.0) for r in rows], tolerance
         )
 
-    monkeypatch.setattr(accuracy, "_judged", thinned)
+    monkeypatch.setattr(comparison, "judge", thinned)
     out = tmp_path / "out"
 
     def shown():
@@ -542,7 +542,7 @@ def test_a_study_that_was_replaced_is_named_by_verify(mini, tmp_path, egvs):
     (out / "accuracy.png").write_bytes((out / "accuracy.png").read_bytes() + b"x")
     code, printed, _ = egvs("verify", out)
     assert code == 1
-    assert "shows an accuracy study that was replaced since" in printed
+    assert "report.html shows accuracy.png, which was replaced since" in printed
 
 
 def test_a_damaged_study_is_named(mini, tmp_path, egvs):

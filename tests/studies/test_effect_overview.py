@@ -1,4 +1,4 @@
-"""Does ``egvs effects`` tell which effects a scene calls for, and what each changes?"""
+"""``egvs effects`` tells which effects a scene calls for, and what each changes."""
 
 from __future__ import annotations
 
@@ -10,18 +10,19 @@ import pipeline
 from pipeline.artefacts import readers as results
 from pipeline.core import files
 from pipeline.effects import registry as effects
-from pipeline.studies import effects as callings
-from pipeline.studies import trials
+from pipeline.studies import effect_overview
+from pipeline.studies.ablation import ablation
+from pipeline.studies.measuring import inputs_of
 
 
 def states(mini: Path, *overrides: str) -> dict[str, tuple[str, str]]:
-    return {call.name: (call.state, call.why) for call in callings.called(pipeline.load(mini, overrides))}
+    return {call.name: (call.state, call.why) for call in effect_overview.called(pipeline.load(mini, overrides))}
 
 
 def test_every_effect_is_listed_with_its_source(egvs) -> None:
     code, printed, _ = egvs("effects")
     assert code == 0
-    for call in callings.catalogue():
+    for call in effect_overview.catalogue():
         assert call.name in printed
         assert call.source
         assert call.why.endswith((".", "?"))  # the sentence that its module opens with
@@ -60,7 +61,7 @@ def test_ablation_runs_each_effect_alone_and_all_together(mini: Path, tmp_path: 
     code, printed, said = egvs("effects", mini, *named, "--ablation", "--out", tmp_path)
     assert code == 0, said
     assert "rain" in printed and "dropout" in printed and "all" in printed
-    changes = callings.ablation(pipeline.load(mini, named[1::2]), tmp_path)
+    changes = ablation(pipeline.load(mini, named[1::2]), tmp_path)
     scores = {change.effect: dict(zip(change.sites, change.scores, strict=True)) for change in changes}
     assert list(scores) == ["none", "rain", "dropout", "all"]
     alone = tmp_path / "alone"
@@ -109,9 +110,9 @@ def test_what_an_effect_costs_is_with_less_without(mini: Path, tmp_path: Path, m
         {"setting": name, "seconds": seconds, "error": 0.1, "tau": 0.9, "regret": 0.0}
         for name, seconds in (("scenario", 5.0), ("without rain", 4.0), ("with divergence", 12.0), ("gamma 2", 5.0))
     ]
-    about = {"inputs": files.hash_of(trials.inputs_of(scenario))}
-    monkeypatch.setattr(callings, "read_accuracy", lambda _: (rows, about))
-    found = callings.prices(scenario, tmp_path)
+    about = {"inputs": files.hash_of(inputs_of(scenario))}
+    monkeypatch.setattr(effect_overview, "read_accuracy", lambda _: (rows, about))
+    found = effect_overview.prices(scenario, tmp_path)
     assert found is not None
     assert {name: price.seconds for name, price in found.items()} == {"rain": 1.0, "divergence": 7.0}
 

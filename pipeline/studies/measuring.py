@@ -1,0 +1,340 @@
+"""One setting of a study is run: what it scores, and what each of its stages costs.
+
+Stages run in the order of the program, in a folder of their own. What a stage wrote is in the store
+(:mod:`pipeline.runs.store`), so that settings that share traffic, static world or scans share the work, with each other
+and with every other run. Times are the study's own: a stage can be run again, to time it once more; it must then write
+the same bytes. A stage that was fetched counts with what it cost whoever made it, until it is timed here.
+
+    out/accuracy/<hash of the setting>.json     its scores, so that a study goes on where it was interrupted
+    out/accuracy/times/<stage>-<key>.json       seconds of each repeat, memory, hashes of what it wrote
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from pipeline.artefacts import tables
+from pipeline.artefacts.readers import Tpog, read_tpog
+from pipeline.core import files
+from pipeline.core.cost import Cost, let_go
+from pipeline.core.errors import InputError, RunError
+from pipeline.core.progress import Progress
+from pipeline.runs import stages
+from pipeline.runs.stages import RANKING, Inputs, Made
+from pipeline.runs.store import Store
+from pipeline.runs.workflow import fetch_or_make
+from pipeline.scenario.loading import load
+from pipeline.scenario.models import Scenario, SiteGrid
+from pipeline.scoring.egvs import EntropyField
+from pipeline.scoring.scorer import Scorer
+from pipeline.scoring.uncertainty import Estimate, LeaveOut, order
+from pipeline.sensing import sites
+from pipeline.stages.base import Workspace
+from pipeline.stages.scan_source import scans
+from pipeline.stages.scene import scene_of, site_digests
+from pipeline.stages.score import ScoredSite
+from pipeline.studies.settings import Setting
+
+SettingListener = Callable[[str, str, dict[str, Any]], None]
+"""Called with (setting, "done" | "kept" | "skipped", its seconds, or why it was skipped) as a study goes on."""
+
+
+@dataclass(frozen=True)
+class SettingScores:
+    """One setting's scores.
+
+    Attributes
+    ----------
+    sites
+        Names, in the order of the sites.
+    shares
+        Scores as shares of ``egvs_limit`` (of the TPOG's entropy where gamma is infinite), (n,) float64.
+    share_ses
+        Their standard errors, (n,); not a number where the TPOG has one block.
+    frames
+        T.
+    scores, ses, biases
+        In bits, (n,); the last two not a number where the TPOG has one block.
+    quantile
+        How many standard errors an interval reaches to each side.
+    neighbours
+        For each site but the last, best first: its name, the next one's, the chance that it truly scores higher, and
+        the frames that would tell the two apart.
+    stages
+        Stage -> hash of its inputs.
+    """
+
+    sites: list[str]
+    shares: list[float]
+    share_ses: list[float]
+    frames: int
+    scores: list[float]
+    ses: list[float]
+    biases: list[float]
+    quantile: float
+    neighbours: list[tuple[str, str, float, float]]
+    stages: dict[str, str]
+
+
+@dataclass(frozen=True)
+class StageTimes:
+    """What one stage cost so far.
+
+    Attributes
+    ----------
+    seconds, busy_s
+        Of each repeat: of the clock, and of all processors.
+    peak_mb
+        Peak of memory above what the program held before.
+    bytes
+        Of the stage's artefacts.
+    repeats
+        How many of the times were measured by the study; 0 where the only one is of the run that made the stage.
+    """
+
+    seconds: tuple[float, ...]
+    busy_s: tuple[float, ...]
+    peak_mb: float
+    bytes: int
+    repeats: int
+
+
+class SettingRunner:
+    """Runs settings of one scenario, each stage once for equal inputs."""
+
+    def __init__(self, path: Path, sets: Sequence[str], out: Path, jobs: int | None, progress: Progress) -> None:
+        self._path, self._sets, self._jobs, self._progress = path, tuple(sets), jobs, progress
+        self._kept, self._store = out / "accuracy", Store.default()
+        try:
+            (self._kept / "times").mkdir(parents=True, exist_ok=True)
+            for left in self._kept.glob(".work-*"):  # of a study that was killed
+                shutil.rmtree(left)
+        except OSError as error:
+            raise InputError(self._kept, f"is no folder to work in ({error.strerror})", "remove it") from None
+        self._results: dict[Setting, Path] = {}
+
+    def scenario(self, setting: Setting) -> Scenario:
+        """The scenario as this setting has it."""
+        scenario = load(self._path, [*self._sets, *setting.overrides])
+        if setting.without is None:
+            return scenario
+        return scenario.with_effects(scenario.effects.without(setting.without))
+
+    def known(self, setting: Setting) -> SettingScores | None:
+        """A kept result; None where there is none, or where a stage's times were removed."""
+        path = self._result(setting)
+        if not path.is_file():
+            return None
+        with _as_kept(path):
+            scores = _sound(SettingScores(**_read(path)["scores"]))
+            return scores if all(self._times(name, key).is_file() for name, key in scores.stages.items()) else None
+
+    def run(self, setting: Setting) -> SettingScores:
+        """Bring every stage that is not known yet, and score."""
+        if (known := self.known(setting)) is not None:
+            return known
+        scored: list[ScoredSite] = []
+        with self._workshop(self.scenario(setting)) as work:
+            keys = {name: self._bring(name, work, scored.append) for name in RANKING}
+            scores = _scores(work, keys, setting.weight, scored)
+        about = {"setting": setting.name, "overrides": setting.overrides, "scores": scores.__dict__}
+        files.write_text(self._result(setting), json.dumps(about, indent=1) + "\n")
+        return scores
+
+    def again(self, name: str, setting: Setting, scores: SettingScores) -> None:
+        """Run one stage of a known setting once more, for its time; RunError when it writes other bytes."""
+        with self._workshop(self.scenario(setting)) as work:
+            for before in RANKING[: RANKING.index(name)]:
+                self._bring(before, work)
+            made = self._make(name, work, stages.inputs(name, work))
+            self._note_times(name, scores.stages[name], work, made, measured=True)
+
+    def warm_up(self, setting: Setting) -> None:
+        """Run all stages once, with a single site, and forget it: what is compiled or loaded first is compiled and
+        loaded then."""
+        with self._workshop(_with_one_site(self.scenario(setting))) as work:
+            for name in RANKING:
+                stages.make(name, work, stages.inputs(name, work))
+
+    def times(self, name: str, key: str) -> StageTimes:
+        """What one stage cost so far."""
+        path = self._times(name, key)
+        with _as_kept(path):
+            kept = _read(path)
+            costs = [Cost(**cost) for cost in kept["measured"] or [kept["made"]]]
+            seconds, busy_s = tuple(float(c.seconds) for c in costs), tuple(float(c.busy_s) for c in costs)
+            peak_mb = max(round(cost.peak_mb - cost.held_mb, 1) for cost in costs)
+            return StageTimes(seconds, busy_s, peak_mb, int(kept["bytes"]), len(kept["measured"]))
+
+    def medians(self, scores: SettingScores) -> dict[str, float]:
+        """Seconds of each stage."""
+        return {name: median(self.times(name, scores.stages[name]).seconds) for name in RANKING}
+
+    def tpog(self, setting: Setting) -> Tpog:
+        """The TPOG of a setting."""
+        with self._workshop(self.scenario(setting)) as work:
+            for name in RANKING[: RANKING.index("tpog") + 1]:
+                self._bring(name, work)
+            return read_tpog(work.path("tpog.parquet"))
+
+    def scores_against(self, setting: Setting, tpog: Tpog) -> list[float]:
+        """What the scans of a setting score against another TPOG on its grid, in the order of the sites."""
+        with self._workshop(self.scenario(setting)) as work:
+            for name in RANKING:
+                self._bring(name, work)
+            scorer = Scorer(scene_of(work), tpog, work.path("trajectories.parquet"))
+            return [scorer.score(scan.beams).egvs for scan in scans(work)]
+
+    def note(self, name: str) -> dict[str, Any]:
+        """Something else that the study keeps."""
+        path = self._kept / f"{name}.json"
+        with _as_kept(path):
+            return dict(_read(path)) if path.is_file() else {}
+
+    def keep_note(self, name: str, value: dict[str, Any]) -> None:
+        """Keep it."""
+        files.write_text(self._kept / f"{name}.json", json.dumps(value, indent=1) + "\n")
+
+    def _bring(self, name: str, work: Workspace, observe: Callable[[ScoredSite], None] | None = None) -> str:
+        """A stage's artefacts into a workshop that holds those before, from the store where it has them; its key.
+
+        ``observe`` hears of each site where the score stage had to be made."""
+        inputs = stages.inputs(name, work)
+        made, fetched = fetch_or_make(
+            name, work, inputs.key, self._store, lambda: self._make(name, work, inputs, observe), link=True
+        )
+        if not (fetched and self._times(name, inputs.key).is_file()):
+            self._note_times(name, inputs.key, work, made, measured=not fetched)
+        return inputs.key
+
+    def _make(
+        self, name: str, work: Workspace, inputs: Inputs, observe: Callable[[ScoredSite], None] | None = None
+    ) -> Made:
+        let_go()
+        extra = {"observe": observe} if name == "score" and observe is not None else {}
+        return stages.make(name, work, inputs, **extra)
+
+    def _note_times(self, name: str, key: str, work: Workspace, made: Made, *, measured: bool) -> None:
+        """Add what a stage cost: measured here, or by whoever made it."""
+        path = self._times(name, key)
+        size = sum(work.path(artefact).stat().st_size for artefact in made.artefacts)
+        kept: dict[str, Any] = {
+            "made": asdict(made.cost), "measured": [], "bytes": size, "sha256": made.artefacts
+        }  # fmt: skip
+        with _as_kept(path):
+            kept = _read(path) if path.is_file() else kept
+            if kept["sha256"] != made.artefacts:
+                raise RunError(f"{name}: a repeat wrote other bytes than the first run; see {path}")
+            if measured:
+                kept["measured"].append(asdict(made.cost))
+        files.write_text(path, json.dumps(kept) + "\n")
+
+    def _result(self, setting: Setting) -> Path:
+        """Where a setting's result is kept; its files are read once."""
+        if setting not in self._results:
+            read = {**inputs_of(self.scenario(setting)), "weight": setting.weight}
+            self._results[setting] = self._kept / f"{files.hash_of(read)[:16]}.json"
+        return self._results[setting]
+
+    def _times(self, name: str, key: str) -> Path:
+        return self._kept / "times" / f"{name}-{key[:16]}.json"
+
+    @contextmanager
+    def _workshop(self, scenario: Scenario) -> Iterator[Workspace]:
+        with tempfile.TemporaryDirectory(prefix=".work-", dir=self._kept) as folder:
+            yield Workspace(scenario, Path(folder), jobs=self._jobs, progress=self._progress)
+
+
+@contextmanager
+def _as_kept(path: Path) -> Iterator[None]:
+    """What is read from ``path`` is as the study wrote it; else InputError."""
+    try:
+        yield
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(
+            path, f"is not as the study wrote it ({error})", "remove it, and run the study again"
+        ) from None
+
+
+def _read(path: Path) -> Any:
+    with _as_kept(path):
+        return json.loads(path.read_text(encoding="utf-8"))
+
+
+def _sound(scores: SettingScores) -> SettingScores:
+    """The scores, if there is a number for each site; else ValueError."""
+    for name in ("shares", "share_ses", "scores", "ses", "biases"):
+        if np.array(getattr(scores, name), dtype=np.float64).shape != (len(scores.sites),):
+            raise ValueError(f"{name} of {len(scores.sites)} sites")
+    return scores
+
+
+def inputs_of(scenario: Scenario) -> dict[str, Any]:
+    """Everything that the scores of a scenario depend on: its settings, its files by hash, and the program."""
+    work = Workspace(scenario, scenario.folder)
+    return {
+        "scenario": scenario.model_dump(mode="json"),
+        "stages": {name: stages.inputs(name, work).key for name in ("statics", "traffic")},
+        "sites": site_digests(scenario, sites.of(scenario)),
+        "program": {name: stages.program(name, scenario) for name in RANKING},
+    }
+
+
+def _with_one_site(scenario: Scenario) -> Scenario:
+    """The scenario with the first of its sites alone."""
+    site = sites.of(scenario)[0]
+    at_m = (site.pose.x_m, site.pose.y_m)
+    here = SiteGrid(low_m=at_m, high_m=at_m, spacing_m=1.0, heights_m=(max(site.pose.z_m, 0.1),))
+    alone = {"file": None, "along": (), "points": None, "grid": here, "sensor": site.sensor}
+    nothing_kept = scenario.score.model_copy(update={"keep_visibility": ()})
+    return scenario.model_copy(update={"sites": scenario.sites.model_copy(update=alone), "score": nothing_kept})
+
+
+def _scores(work: Workspace, keys: dict[str, str], weight: float, scored: list[ScoredSite]) -> SettingScores:
+    """What came of all stages in a workspace; ``scored`` are the sites as the score stage scored them, none where it
+    was fetched."""
+    table = tables.read(work.path("scores.parquet"), "scores")[0].to_pydict()
+    tpog, gamma = read_tpog(work.path("tpog.parquet")), work.scenario.score.gamma
+    names, scores = table["site"], np.array(table["egvs"])
+    unit = 1.0 / weight if math.isinf(gamma) else gamma  # a finite gamma is divided by the weight already
+    most = EntropyField.of(tpog.counts, tpog.frames, tpog.grid).limit(unit)
+    shares = scores / most if most > 0 else np.zeros(len(scores))
+    leave_out = LeaveOut.of(work.path("tpog.parquet"), tpog)
+    if leave_out is None:
+        unknown = [math.nan] * len(names)
+        return SettingScores(
+            names, shares.tolist(), unknown, tpog.frames, scores.tolist(), unknown, unknown, math.nan, [], keys
+        )
+    worths = [site.score for site in scored]
+    if not worths or worths[0].left_out is None:  # fetched, or the scenario wants no errors
+        scorer = Scorer(scene_of(work), tpog, work.path("trajectories.parquet"), leave_out)
+        worths = [scorer.score(scan.beams) for scan in scans(work)]
+    left_out = np.array([worth.left_out for worth in worths], dtype=np.float64)
+    limits = leave_out.limits(unit)
+    raw = Estimate.of(left_out, leave_out.frames)
+    normal = Estimate.of(left_out / np.where(limits > 0, limits, 1.0), leave_out.frames)
+    return SettingScores(
+        names, shares.tolist(), normal.se.tolist(), tpog.frames, scores.tolist(), raw.se.tolist(), raw.bias.tolist(),
+        raw.quantile(), _neighbours(raw, names, tpog.frames), keys,
+    )  # fmt: skip
+
+
+def _neighbours(estimate: Estimate, names: list[str], frames: int) -> list[tuple[str, str, float, float]]:
+    ranked = order(estimate.scores)
+    chances = estimate.beats(ranked[:-1], ranked[1:])
+    found = []
+    for (a, b), chance in zip(pairwise(ranked.tolist()), chances.tolist(), strict=True):
+        found.append((names[a], names[b], chance, frames * estimate.times_needed(a, b)))
+    return found
