@@ -89,6 +89,7 @@ def rational_pairs(draw):
     return centre, axes, half
 
 
+@pytest.mark.slow
 @settings(often, max_examples=400)
 @given(rational_pairs())
 def test_a_pair_like_exact_separating_axes(pair):

@@ -211,6 +211,7 @@ def segments(draw):
     return o, tuple(b - a for a, b in zip(o, end, strict=True)), voxel_m
 
 
+@pytest.mark.slow
 @often
 @given(segments())
 @example(((-3.0, -3.0, -3.0), (16.0, 16.0, 16.0), 0.25))
@@ -222,6 +223,7 @@ def test_any_segment_like_rational_arithmetic(segment):
     assert wrong <= oracle.doubtful(o, d, SHAPE, voxel_m)
 
 
+@pytest.mark.slow
 @often
 @given(
     st.tuples(*[st.floats(allow_nan=False, allow_infinity=False)] * 3),
@@ -238,6 +240,7 @@ def test_any_finite_numbers_end(o, d, near):
     assert walked(near, d, SHAPE, 0.25) ^ oracle.crossed(near, d, SHAPE, 0.25) <= oracle.doubtful(near, d, SHAPE, 0.25)
 
 
+@pytest.mark.slow
 @often
 @given(segments())
 def test_turning_round_changes_nothing(segment):
@@ -259,6 +262,7 @@ def test_a_segment_without_length_crosses_nothing(o, d, voxel_m):
 moves = st.tuples(*[st.one_of(st.sampled_from([-1.0, 0.0, 1.0]), st.floats(-1, 1))] * 3)
 
 
+@pytest.mark.slow
 @often
 @given(segments(), moves, moves)
 def test_moving_the_ends_by_a_nanometre_changes_nothing_but_what_is_fragile(segment, by_start, by_end):

@@ -80,12 +80,14 @@ where = st.one_of(
 corner = st.tuples(where, where, where)
 
 
+@pytest.mark.slow
 @often
 @given(corner, corner, corner)
 def test_any_triangle_like_clipping_in_rationals(a, b, c):
     event(f"within 1e-9 m of the bound: {check_triangle((a, b, c)) > 0}")
 
 
+@pytest.mark.slow
 @often
 @given(corner, corner, st.floats(0, 1), st.sampled_from([0.0, 1e-3, 1e-5, 1e-7]), st.tuples(*[st.floats(-1, 1)] * 3))
 def test_slivers_and_degenerate_triangles(a, b, share, width, aside):
@@ -249,6 +251,7 @@ def test_a_box_between_voxel_centres(inward):
         assert np.array_equal(filled_by(box(low, high, inward=inward)), expected)
 
 
+@pytest.mark.slow
 @settings(often, max_examples=60)
 @given(
     st.floats(-4, 4),
@@ -399,6 +402,7 @@ def test_points_like_solid_angles(name):
     assert tried > 250
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(SHAPES))
 def test_points_exactly_and_nearly_above_edges_and_vertices(name):
     """Below, above and inside, on the vertical through every corner and through points of every edge, and a few ulps
