@@ -18,6 +18,7 @@ import pipeline
 from pipeline.artefacts import tables
 from pipeline.core import files
 from pipeline.core.errors import InputError, RunError
+from pipeline.report.ranking import ScoredSite
 from pipeline.runs import workflow
 from pipeline.runs.locking import alone
 from pipeline.runs.stages import STAGES
@@ -243,16 +244,16 @@ def test_a_ranking_fits_the_terminal(mini: Path, tmp_path: Path, width: int) -> 
     """No number is cut, on the narrowest terminal too."""
     from rich.console import Console
 
-    from pipeline.cli import screen as show
+    from pipeline.cli import ranking_table
 
     pipeline.run(pipeline.load(mini), tmp_path)
-    rows = pipeline.read_scores(tmp_path / "scores.parquet").to_pylist()
+    table = pipeline.read_scores(tmp_path / "scores.parquet")
     console = Console(width=width, record=True, file=io.StringIO())
-    console.print(show.ranking(rows, width))
+    console.print(ranking_table.ranking_table(ScoredSite.all_of(table), width))
     text = console.export_text()
     assert "…" not in text
     assert all(len(line) <= width for line in text.splitlines())
-    assert all(f"{row['egvs']:.1f}" in text for row in rows)
+    assert all(f"{egvs:.1f}" in text for egvs in table["egvs"].to_pylist())
 
 
 @pytest.mark.parametrize("words", [("run",), ("accuracy", "--budget", "20s")])

@@ -3,6 +3,7 @@ dropped?"""
 
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +14,6 @@ from pipeline.effects import scenes
 from pipeline.scenario import loading
 from pipeline.scenario.loading import from_values
 from pipeline.sensing.scanner import Scanner
-from pipeline.stages import statics
 from pipeline.world import building
 from pipeline.world.mesh import World, read_ply, write_ply
 from tests.conftest import collection, feature
@@ -398,5 +398,5 @@ def test_shipped_statics_are_closed_and_clean():
         assert (world.signs[world.closed] == 1).all()
         assert not counts.mended
         assert not counts.left_out
-        features = json.loads((statics.Path("scenarios") / name / "statics.geojson").read_text())["features"]
+        features = json.loads((Path("scenarios") / name / "statics.geojson").read_text())["features"]
         assert sum(counts.built.values()) >= len(features)
