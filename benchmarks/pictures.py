@@ -17,15 +17,20 @@ import numpy as np
 
 import pipeline
 from pipeline.artefacts.readers import read_scores, read_tpog, read_trajectories
-from pipeline.effects import registry as effects
+from pipeline.effects import registry
+from pipeline.effects.on_traffic import SELF_ACTING
 from pipeline.report.maps import SiteView, site_view
 from pipeline.report.outlines import outlines_of
 from pipeline.report.plan import extent, standalone
 from pipeline.report.ranking import ScoredSite
 from pipeline.runs import workflow
+from pipeline.scenario.effects import EffectsModel
 from pipeline.scenario.models import Scenario
 from pipeline.scoring.egvs import EntropyField
-from pipeline.scoring.visibility import hits_of
+from pipeline.scoring.scorer import Scorer
+from pipeline.stages.base import Workspace
+from pipeline.stages.scan_source import scans
+from pipeline.stages.scene import scene_of
 from pipeline.world.mesh import read_ply
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -59,7 +64,9 @@ def seen(scenario: Scenario, out: Path, site: str) -> tuple[np.ndarray, np.ndarr
     if not site:
         return tpog.p.sum(axis=2), np.ones(tpog.grid.shape, dtype=np.bool_)
     field = EntropyField.of(tpog.counts, tpog.frames, tpog.grid)
-    _, hits = next(hits_of(scenario, out, tpog.grid, [site]))
+    work = Workspace(scenario, out)
+    scan = next(scans(work, [site]))
+    hits = Scorer(scene_of(work), tpog, out / "trajectories.parquet").hits(scan.beams)
     worth = field.per_cell_bit * np.minimum(hits.ravel()[field.cells], scenario.score.gamma)
     nx, ny, nz = tpog.grid.shape
     return np.bincount(field.cells // nz, weights=worth, minlength=nx * ny).reshape(nx, ny), hits > 0
@@ -69,11 +76,12 @@ def before_and_after(name: str, folder: Path) -> Iterator[tuple[str, str]]:
     """File names and figures of one effect."""
     where, parameters, site = SHOWN[name]
     base = pipeline.load(ROOT / "scenarios" / where)
-    own = dict(base.effects.get(name, {})) | parameters
+    given = base.effects.named.get(name)
+    own = ({} if given is None else given.model_dump(mode="json", exclude_unset=True)) | parameters
     found = []
     for word, named in (("before", {}), ("after", {name: own})):
         scenario, out = (
-            base.with_effects(named),
+            base.with_effects(EffectsModel.of(named)),
             folder / where / (word if named else "plain") / (name if named else ""),
         )
         workflow.run(scenario, out)
@@ -115,9 +123,7 @@ def side_view(out: Path, pitched: bool) -> str:
 
 def main() -> None:
     """Draw the picture of the README and those of the effects."""
-    assert set(SHOWN) == set(effects.KINDS) - set(
-        effects.SELF_ACTING
-    )  # the slope cannot be left out where there is one
+    assert set(SHOWN) == set(registry.names()) - set(SELF_ACTING)  # the slope cannot be left out where there is one
     (IMAGES / "effects").mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)

@@ -29,10 +29,10 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from pipeline.runs.record import StageRecord
 from pyarrow import csv
 
 import pipeline
+from pipeline.artefacts.run_record import StageRecord
 from pipeline.core.cost import let_go
 from pipeline.runs import workflow
 

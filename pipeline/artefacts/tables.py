@@ -1,7 +1,7 @@
 """Writes artefacts whole and reads them back; all Parquet goes through here.
 
-Files appear under their names only when they are whole (:mod:`pipeline.core.files`). Metadata is one JSON object under the
-Parquet key ``egvs``. Nothing in a file depends on the clock, the machine, the number of threads or the path.
+Files appear under their names only when they are whole (:mod:`pipeline.core.files`). Metadata is one JSON object under
+the Parquet key ``egvs``. Nothing in a file depends on the clock, the machine, the number of threads or the path.
 """
 
 from __future__ import annotations

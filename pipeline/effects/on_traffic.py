@@ -1,4 +1,4 @@
-"""Finds the effects that act on traffic and ground: those that a scenario names, and those that switch themselves on."""
+"""Finds the effects that act on traffic and ground: those that are named, and those that switch themselves on."""
 
 from __future__ import annotations
 

@@ -91,7 +91,7 @@ class MovingOcclusionParameters(EffectParameters):
     )
     frames: Annotated[int, Field(ge=0, strict=True), BeforeValidator(_all_is_0)] = Field(
         500,
-        description='Recorded frames that are replayed, evenly spaced; 0 or "all" (or more than there are): all of them',
+        description='Recorded frames that are replayed, evenly spaced; 0, "all", or more than there are: all of them',
     )
 
     @field_validator("frames")

@@ -50,7 +50,8 @@ class SensorModel(StrictModel):
         listed = len(self.elevations_deg)
         if self.channels not in (None, listed) and listed != 2:
             raise ValueError(
-                f"channels = {self.channels} needs elevations_deg with 2 values (uniform) or {self.channels}, found {listed}"
+                f"channels = {self.channels} needs elevations_deg with 2 values (uniform) or {self.channels},"
+                f" found {listed}"
             )
         rings = self.channels or listed
         if rings * 360.0 / self.azimuth_step_deg > _MOST_BEAMS:
@@ -59,7 +60,8 @@ class SensorModel(StrictModel):
             )
         if self.azimuth_offsets_deg and len(self.azimuth_offsets_deg) != rings:
             raise ValueError(
-                f"azimuth_offsets_deg has {len(self.azimuth_offsets_deg)} values, one for each of {rings} rings is needed"
+                f"azimuth_offsets_deg has {len(self.azimuth_offsets_deg)} values,"
+                f" one for each of {rings} rings is needed"
             )
         turns = 360.0 / self.azimuth_step_deg
         if abs(turns - round(turns)) > 1e-9 * turns:

@@ -527,6 +527,7 @@ def test_bytes_do_not_depend_on_threads(done: tuple[Path, Path], settings: list[
     assert len({scored(done, settings, jobs)[1] for jobs in (1, 2, 3)}) == 1
 
 
+MODULES = ("pipeline.effects.scan", "pipeline.effects.score", "pipeline.effects.traffic")
 IMPORTED = """
 import sys
 import pipeline
@@ -534,7 +535,7 @@ from pipeline.stages import score
 from tests.stages import run_stage
 pipeline.load({folder!r}, {settings!r})
 run_stage(score, pipeline.load({folder!r}, {settings!r}), __import__("pathlib").Path({out!r}), jobs=1)
-print(sorted(name for name in sys.modules if name.startswith(("pipeline.effects.scan", "pipeline.effects.score", "pipeline.effects.traffic"))))
+print(sorted(name for name in sys.modules if name.startswith({MODULES})))
 """
 
 
@@ -548,7 +549,7 @@ def test_what_is_not_named_is_not_imported(
     done: tuple[Path, Path], tmp_path: Path, settings: list[str], expected: list[str]
 ) -> None:
     out = shutil.copytree(done[1], tmp_path / "out")
-    program = IMPORTED.format(folder=str(done[0]), settings=settings, out=str(out))
+    program = IMPORTED.format(MODULES=MODULES, folder=str(done[0]), settings=settings, out=str(out))
     run = subprocess.run([sys.executable, "-W", "error", "-c", program], capture_output=True, text=True, check=False)
     assert (run.returncode, run.stderr) == (0, "")
     assert run.stdout.strip() == repr(expected)
@@ -560,7 +561,7 @@ def test_a_whole_plain_run_imports_no_effect(mini: Path, tmp_path: Path) -> None
 import sys
 import pipeline
 pipeline.run(pipeline.load({str(mini)!r}), {str(tmp_path / "out")!r}, jobs=1)
-print([name for name in sys.modules if name.startswith(("pipeline.effects.scan", "pipeline.effects.score", "pipeline.effects.traffic"))])
+print([name for name in sys.modules if name.startswith({MODULES})])
 """
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "[]"

@@ -19,6 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.artefacts import tables
+from pipeline.artefacts.boxes import COLUMNS
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Grid, Roi
 from pipeline.effects import scenes
@@ -559,7 +560,7 @@ def test_people_never_lower_a_voxels_count(climbed):
     for kinds in ([], ["bicycle"], ["bicycle", "pedestrian"]):
         r = climbed[1]
         kept = ~np.isin(r["kind"], ["bicycle", "pedestrian"]) | np.isin(r["kind"], kinds)
-        values = np.column_stack([r[name][kept] for name in tpog._BOX])
+        values = np.column_stack([r[name][kept] for name in COLUMNS])
         values[:, :3] = grid.to_grid_m(values[:, :3])
         counts.append(tpog.count(tpog.Boxes(r["frame"][kept].astype(np.int64), values), grid, 240))
     assert all(np.all(more >= less) and more.sum() > less.sum() for less, more in itertools.pairwise(counts))

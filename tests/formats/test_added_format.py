@@ -37,6 +37,8 @@ from pathlib import Path
 import numpy as np
 from pipeline.core.errors import InputError
 from pipeline.formats.point_clouds import read_points, write_points
+
+pytestmark = pytest.mark.system
 path = Path(sys.argv[1])
 write_points(path, np.array([[0.1, 2.0, 3.0], [4.0, np.nan, 6.0]]))
 points, dropped = read_points(path, "")

@@ -28,10 +28,12 @@ from pipeline.report.plan import MapSite
 from pipeline.report.ranking import Ranking
 from pipeline.report.record import RunRecord
 from pipeline.scenario.loading import from_values
-from pipeline.scoring import visibility
 from pipeline.scoring.egvs import EntropyField
+from pipeline.scoring.scorer import Scorer
 from pipeline.stages import scan, score
-from pipeline.stages.base import metadata
+from pipeline.stages.base import Workspace
+from pipeline.stages.scan_source import scans
+from pipeline.stages.scene import scene_of
 from pipeline.studies import accuracy, comparison
 from pipeline.studies import settings as study_settings
 from pipeline.world.mesh import World, write_ply
@@ -96,7 +98,7 @@ def finished(folder, sites=SITES, counts=lane, record=True, **keys):
     index = dict(zip(("ix", "iy", "iz"), (a.astype(np.int32) for a in np.unravel_index(flat, grid.shape)), strict=True))
     columns = {"block": np.zeros(len(flat), dtype=np.uint16), **index, "count": counted.ravel()[flat].astype(np.uint32)}
     more = {"grid": grid.to_json(), "frames": FRAMES, "block_frames": FRAMES}
-    tables.write(out / "tpog.parquet", "tpog", columns, metadata(about, {}, **more))
+    tables.write(out / "tpog.parquet", "tpog", columns, {"schema": 1, **more})
     write_ply(out / "statics.ply", world(), {})
     run_stage(scan, about, out, jobs=1)
     run_stage(score, about, out, jobs=1)
@@ -113,12 +115,17 @@ def a_record(seconds=1.25):
     }  # fmt: skip
     stage = {
         "inputs": "",
+        "files": {},
         "artefacts": {"tpog.parquet": "ab" * 32},
         "summary": {},
         "cost": {"seconds": seconds, "peak_mb": 512.0},
     }
     statics = {"triangles": 36, "built": {"tree_crown": 1}, "mended": {}, "left_out": {"lines": 4}}
     return {
+        "egvs": "0.1.0",
+        "seed": 0,
+        "scenario": {},
+        "scenario_folder": ".",
         "stages": {
             "traffic": stage | {"summary": traffic, "artefacts": {}},
             "statics": stage | {"summary": statics, "artefacts": {}},
@@ -247,7 +254,7 @@ def test_whatever_is_shown_is_an_input(made, tmp_path):
     (tmp_path / "out" / "run.json").write_text(json.dumps(changed))
     assert inputs_of(report, about, tmp_path / "out") != before
     assert inputs_of(report, scenario(tmp_path, SITES, seed=3), out) != before
-    json.dumps(before, allow_nan=False)
+    json.dumps(before.to_json(), allow_nan=False)
 
 
 def test_what_is_not_shown_is_no_input(made, tmp_path):
@@ -257,10 +264,9 @@ def test_what_is_not_shown_is_no_input(made, tmp_path):
     audited = a_record()
     audited["stages"]["score"] = audited["stages"]["tpog"] | {"summary": {"audit": {"misplaced_chords": 0}}}
     (tmp_path / "out" / "run.json").write_text(json.dumps(audited))
-    audited_costs = report.inputs(about, tmp_path / "out").pop("costs")
-    assert audited_costs["score"] == [1.25, 512.0]
-    for key in ("files", "settings", "summaries"):
-        assert report.inputs(about, tmp_path / "out")[key] == report.inputs(about, out)[key]
+    other, own = inputs_of(report, about, tmp_path / "out"), inputs_of(report, about, out)
+    assert other.more["costs"]["score"] == [1.25, 512.0]
+    assert (other.files, other.settings, other.more["summaries"]) == (own.files, own.settings, own.more["summaries"])
 
 
 def test_it_is_the_same_without_kept_scans(tmp_path):
@@ -294,8 +300,10 @@ def test_what_sites_see_agrees_with_their_scores(made):
     tpog = read_tpog(out / "tpog.parquet")
     field = EntropyField.of(tpog.counts, tpog.frames, tpog.grid)
     rows = {row["site"]: row for row in read_scores(out / "scores.parquet").to_pylist()}
-    for name, hits in visibility.hits_of(about, out, tpog.grid, ["north", "west"]):
-        crossed = hits.ravel()[field.cells] > 0
+    work = Workspace(about, out)
+    scorer = Scorer(scene_of(work), tpog)
+    for found in scans(work, ["north", "west"]):
+        name, crossed = found.site.name, scorer.hits(found.beams).ravel()[field.cells] > 0
         assert field.per_cell_bit[crossed].sum() / field.per_cell_bit.sum() == pytest.approx(rows[name]["entropy_seen"])
         if rows[name]["rank"] in (1, 4):
             assert f"sees {crossed.sum():,} of {len(crossed):,} uncertain voxels" in text
@@ -361,7 +369,7 @@ def test_no_cap(tmp_path):
     about, out = finished(tmp_path, score={"gamma": float("inf")})
     text = Reader(page(about, out)).text
     assert "∞" in text and "inf" not in text.split() and "any site could reach" not in text
-    json.dumps(inputs_of(report, about, out), allow_nan=False)
+    json.dumps(inputs_of(report, about, out).to_json(), allow_nan=False)
 
 
 def test_no_record_no_costs(tmp_path):

@@ -121,7 +121,9 @@ def test_sites_stand_along_a_line_and_round_its_corner(mini: Path) -> None:
         ("a04", 25, 10, 4),
         ("a05", 25, 20, 4),
     ]
-    assert {(site.yaw_deg, site.pitch_deg, site.sensor, site.points) for site in found} == {(15, 0, "small", None)}
+    assert {(site.pose.yaw_deg, site.pose.pitch_deg, site.sensor, site.points) for site in found} == {
+        (15, 0, "small", None)
+    }
 
 
 def test_each_place_has_all_heights_and_names_go_on_from_line_to_line(mini: Path) -> None:
@@ -136,7 +138,7 @@ def test_each_place_has_all_heights_and_names_go_on_from_line_to_line(mini: Path
 def test_the_end_of_a_line_has_a_site_though_tenths_do_not_add_up(mini: Path) -> None:
     found = of_lines(mini, {"line": [[0, 0], [0.3, 0], [0.7, 0]], "spacing": 0.1, "heights": [3]})
     assert len(found) == 8
-    assert found[-1].x_m == pytest.approx(0.7, abs=1e-12)
+    assert found[-1].pose.x_m == pytest.approx(0.7, abs=1e-12)
 
 
 def test_many_sites_have_names_of_one_length(mini: Path) -> None:

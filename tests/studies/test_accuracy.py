@@ -20,7 +20,7 @@ from rich.console import Console
 
 import pipeline
 from pipeline.artefacts import tables
-from pipeline.cli import screen as show
+from pipeline.cli import study_tables
 from pipeline.core.errors import RunError
 from pipeline.runs import stages
 from pipeline.runs.locking import alone
@@ -457,11 +457,9 @@ def test_tables_fit_the_terminal(mini: Path, tmp_path: Path, few: None, width: i
     study = study_of(mini, [], tmp_path / "out")
     rows = [replace(row, front=row.kind != "measures", recommended=row.kind == "scenario") for row in study.rows]
     study = replace(study, rows=rows)  # the same marks whatever the seconds
-    monkeypatch.setattr(show, "WIDE", width)
     if width < 190:
-        monkeypatch.setattr(show, "Console", lambda **k: Console(**(k | {"width": width, "soft_wrap": False})))
-        monkeypatch.setattr(show, "WIDE", 190)
-    show.accuracy(study, "egvs run mini")
+        monkeypatch.setattr(study_tables, "console", lambda _: Console(width=width, highlight=False))
+    study_tables.print_study(study, "egvs run mini")
     table = capsys.readouterr().out.partition("reference: ")[0]
     assert "…" not in table
     assert all(len(line) <= width for line in table.splitlines())

@@ -9,7 +9,8 @@ import pytest
 import pipeline
 from pipeline.artefacts import readers as results
 from pipeline.core import files
-from pipeline.effects import registry as effects
+from pipeline.effects import registry
+from pipeline.scenario.effects import RainParameters
 from pipeline.studies import effect_overview
 from pipeline.studies.ablation import ablation
 from pipeline.studies.measuring import inputs_of
@@ -30,7 +31,7 @@ def test_every_effect_is_listed_with_its_source(egvs) -> None:
 
 def test_a_plain_scene_calls_for_none(mini: Path) -> None:
     found = states(mini)
-    assert set(found) == set(effects.KINDS)
+    assert set(found) == set(registry.names())
     assert {state for state, _ in found.values()} == {"off"}
     assert found["rain"] == ("off", "not named")
     assert "flat" in found["slope"][1] or "no network" in found["slope"][1] or "relief" in found["slope"][1]
@@ -86,12 +87,8 @@ def test_a_scenario_may_extend_another(mini: Path, tmp_path: Path, egvs) -> None
     wet.mkdir()
     (wet / "scenario.toml").write_text('extends = "../mini"\n\n[effects.rain]\nrate_mm_h = 20\n\n[score]\ngamma = 3\n')
     scenario = pipeline.load(wet)
-    assert (scenario.name, scenario.score.gamma, scenario.roi.voxel_m, scenario.effects) == (
-        "wet",
-        3,
-        0.5,
-        {"rain": {"rate_mm_h": 20}},
-    )
+    assert (scenario.name, scenario.score.gamma, scenario.roi.voxel_m) == ("wet", 3, 0.5)
+    assert scenario.effects.named == {"rain": RainParameters(rate_mm_h=20)}
     out = tmp_path / "out"
     assert egvs("run", wet, "--out", out)[0] == 0
     assert egvs("verify", out)[0] == 0

@@ -1,4 +1,4 @@
-"""Does whatever keeps to the protocol of extensions take part in the traffic, known to nobody by name?"""
+"""Whatever keeps to the protocol of extensions takes part in the traffic, known to nobody by name."""
 
 from dataclasses import replace
 
@@ -7,7 +7,8 @@ import pytest
 from pipeline.artefacts import tables
 from pipeline.core.errors import InputError
 from pipeline.core.progress import silent
-from pipeline.effects.registry import Parameters, Traffic
+from pipeline.effects.base import Traffic
+from pipeline.scenario.effects import EffectParameters
 from pipeline.stages import traffic
 from pipeline.traffic import recording, trajectories
 from pipeline.traffic.boxes import Size
@@ -67,7 +68,7 @@ def recorded(scene, out, *acting):
 
 def test_an_extension_adds_traffic_that_does_not_count_and_changes_boxes(town, tmp_path):
     scene = scenario(town, network="net.xml", **SMALL)
-    written, summary = recorded(scene, tmp_path, Guests(Parameters()))
+    written, summary = recorded(scene, tmp_path, Guests(EffectParameters()))
     plain = run_stage(traffic, scene, tmp_path / "plain")
     assert (written.counts.fewest, written.counts.most) == (12, 12)
     assert set(written.counts.uncounted) == {"tram"} and written.counts.uncounted["tram"].most == 1
@@ -84,7 +85,7 @@ def test_two_extensions_have_a_route_file_each_and_change_boxes_one_after_anothe
             return TrafficPlan("<routes/>", 0)
 
     scene = scenario(town, network="net.xml", **SMALL)
-    written, summary = recorded(scene, tmp_path, Guests(Parameters()), Others(Parameters()))
+    written, summary = recorded(scene, tmp_path, Guests(EffectParameters()), Others(EffectParameters()))
     flags = " ".join(summary.flags)
     assert "trips.rou.xml,others.rou.xml,others1.rou.xml" in flags and "--max-num-vehicles 13" in flags
     assert written.counts.most == 12
@@ -94,9 +95,9 @@ def test_two_extensions_have_a_route_file_each_and_change_boxes_one_after_anothe
 
 def test_what_an_extension_refuses_is_raised_before_anything_is_laid_out(town, tmp_path):
     class Choosy(Guests):
-        def refusal(self, scenario):
+        def refuses(self, scenario):
             return InputError("guests", "this is no place for guests", "another place")
 
     with pytest.raises(InputError, match="no place for guests"):
-        recorded(scenario(town, network="net.xml", **SMALL), tmp_path, Choosy(Parameters()))
+        recorded(scenario(town, network="net.xml", **SMALL), tmp_path, Choosy(EffectParameters()))
     assert not (tmp_path / "sumo").exists()

@@ -50,7 +50,7 @@ BAD = {
         write("m.osm.pbf", "OSMHeader"),
         {"network": "m.osm.pbf"},
         InputError,
-        r"m\.osm\.pbf: is in the PBF format",
+        r"m\.osm\.pbf: cannot be read as OpenStreetMap data",
     ),
     "no routes": (
         nothing,

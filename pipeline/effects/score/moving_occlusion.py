@@ -57,7 +57,6 @@ from pipeline.sensing.scene import Scene
 
 _BOX = ("x_m", "y_m", "z_m", "yaw_rad", "pitch_rad", "length_m", "width_m", "height_m")
 _SMALLEST_M = 10 * box_kernels.SHRINK_M
-_SENSORS_KEPT = 16
 
 Count = Annotated[int, Field(ge=0, strict=True), BeforeValidator(lambda given: 0 if given == "all" else given)]
 
@@ -81,7 +80,6 @@ class Replay:
     values: NDArray[np.float64]
     low: NDArray[np.float64]
     high: NDArray[np.float64]
-    _between: dict[tuple[Grid, bytes], Replay] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, frames: int, frame: NDArray[np.int64], values: NDArray[np.float64]) -> Replay:
@@ -89,20 +87,6 @@ class Replay:
         low, high = np.empty((len(values), 3)), np.empty((len(values), 3))
         kernels.bounds(values, low, high)
         return cls(frames, frame, values, low, high)
-
-    def between(self, sensor_m: NDArray[np.float64], grid: Grid) -> Replay:
-        """Without the boxes that lie wholly outside the upright box round the region of interest and a sensor, (3,) in
-        the grid's frame: those hide nothing from it. What was asked for last is kept, since beams come in pieces."""
-        key = (grid, sensor_m.tobytes())
-        kept = self._between.get(key)
-        if kept is None:
-            corners = np.array([np.zeros(3), grid.roi.size_m, sensor_m])
-            near = ((self.high >= corners.min(axis=0)) & (self.low <= corners.max(axis=0))).all(axis=1)
-            kept = Replay(self.frames, self.frame[near], self.values[near], self.low[near], self.high[near])
-            if len(self._between) >= _SENSORS_KEPT:
-                self._between.clear()
-            self._between[key] = kept
-        return kept
 
     def holding(self, sensor_m: NDArray[np.float64]) -> int:
         """How many boxes (one a frame each) hold a sensor, given in the grid's frame (3,); they are ignored for it."""
@@ -115,7 +99,6 @@ class Replay:
 
     def blocked(self, crossings: Crossings) -> NDArray[np.int64]:
         """Frames in which the beam does not get as far as each crossing, (k,) int64."""
-        between = self.between(crossings.sensor_m, crossings.grid)
         row = np.flatnonzero(np.diff(crossings.first))
         ends = crossings.ends_m[row]
         run = np.hypot(ends[:, 0], ends[:, 1])
@@ -128,7 +111,7 @@ class Replay:
         blocked = np.zeros(len(crossings.cells), dtype=np.int64)
         kernels.count_blocked(
             crossings.sensor_m, directions, azimuth[order], slope, row, crossings.first, crossings.enter_m,
-            between.frame, between.values, between.low, between.high, blocked,
+            self.frame, self.values, self.low, self.high, blocked,
         )  # fmt: skip
         return blocked
 
