@@ -12,6 +12,8 @@ import pytest
 
 import pipeline
 
+pytestmark = pytest.mark.system
+
 PACKAGE = Path(pipeline.__file__).parent
 INNER = "import numba\n\n\n@numba.njit(cache=True)\ndef inner(x):\n    return x + {}\n"
 OUTER = (
@@ -20,8 +22,6 @@ OUTER = (
 )
 CALL = """
 from pipeline.kernels.outer import outer
-
-pytestmark = pytest.mark.system
 print(outer(1), "compiled" if outer.stats.cache_misses else "kept")
 """
 

@@ -26,7 +26,8 @@ from pipeline.report.figures import Figures
 from pipeline.report.outlines import outlines_of
 from pipeline.report.plan import MapSite
 from pipeline.report.ranking import Ranking
-from pipeline.report.record import RunRecord
+from pipeline.report.record import ShownRun
+from pipeline.scenario.effects import EffectsModel
 from pipeline.scenario.loading import from_values
 from pipeline.scoring.egvs import EntropyField
 from pipeline.scoring.scorer import Scorer
@@ -329,9 +330,9 @@ def test_the_record_is_shown(made):
 def test_effects_are_named_and_no_longer_left_out(made):
     about, out, text = made
     assert "Effects none" in Reader(text).text and "fog" in text
-    foggy = about.with_effects({"fog": {"visibility_m": 100}, "moving_occlusion": {}})
+    foggy = about.with_effects(EffectsModel.of({"fog": {"visibility_m": 100}, "moving_occlusion": {}}))
     ranking, tpog = Ranking.read(out / "scores.parquet"), read_tpog(out / "tpog.parquet")
-    shown = report.page(foggy, ranking, tpog, Figures("", "", (), "", ()), RunRecord.read(out), None)
+    shown = report.page(foggy, ranking, tpog, Figures("", "", (), "", ()), ShownRun.read(out), None)
     assert "this run models fog, moving occlusion. Left out are rain, " in Reader(shown).text
 
 
@@ -376,7 +377,7 @@ def test_no_record_no_costs(tmp_path):
     about, out = finished(tmp_path, record=False)
     read = Reader(page(about, out))
     assert any(row.strip("|").startswith("traffic|–|") for row in read.rows)
-    (out / "run.json").write_text(json.dumps({"stages": {"scan": {"artefacts": {}, "summary": {}}}}))
+    (out / "run.json").write_text(json.dumps(a_record() | {"stages": {"scan": {"artefacts": {}, "summary": {}}}}))
     assert Reader(page(about, out)).text == read.text
 
 

@@ -25,7 +25,10 @@ from pipeline.core.errors import RunError
 from pipeline.runs import stages
 from pipeline.runs.locking import alone
 from pipeline.runs.store import Store
-from pipeline.scoring.visibility import Visibility
+from pipeline.scoring.scorer import Scorer
+from pipeline.stages.base import Workspace
+from pipeline.stages.scan_source import scans
+from pipeline.stages.scene import scene_of
 from pipeline.studies import accuracy, comparison, measuring
 from pipeline.studies import settings as study_settings
 from pipeline.studies.accuracy import AccuracyStudy
@@ -292,9 +295,10 @@ def test_thinned_beams_score_as_if_each_counted_twice(mini: Path, tmp_path: Path
     p = tpog.p.ravel()
     with np.errstate(divide="ignore", invalid="ignore"):
         entropy = np.nan_to_num(-(p * np.log2(p) + (1 - p) * np.log2(1 - p)))
-    visibility = Visibility(scenario, tmp_path / "out", tpog.grid)
-    for share, beams in zip(found, visibility.beams(), strict=True):
-        twice = np.minimum(4.0, 2.0 * visibility.hits(beams))
+    work = Workspace(scenario, tmp_path / "out")
+    scorer = Scorer(scene_of(work), tpog)
+    for share, scan in zip(found, scans(work), strict=True):
+        twice = np.minimum(4.0, 2.0 * scorer.hits(scan.beams).ravel())
         assert share == pytest.approx((entropy * twice).sum() / (4.0 * entropy.sum()), rel=1e-12)
 
 
@@ -346,7 +350,7 @@ def test_effects_that_are_not_named_are_tried_where_they_act(mini: Path) -> None
     )  # its range is rated, the scenario's own sensor's is not
     assert "with range_limit" in {s.name for s in rated}
     assert all(
-        pipeline.load(mini, s.overrides).effects.keys() == {s.name.removeprefix(study_settings.WITH)}
+        pipeline.load(mini, s.overrides).effects.named.keys() == {s.name.removeprefix(study_settings.WITH)}
         for s in with_.values()
     )
     named = {s.name for s in study_settings.settings(pipeline.load(mini, ["effects.divergence={}"]))}
