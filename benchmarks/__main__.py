@@ -2,7 +2,8 @@
 
 ``make bench`` runs everything here on the shipped junction and prints ratios from this one run: machines differ and are
 noisy, ratios less so. Kernels are compiled before anything is timed; repeats of what is compared are interleaved;
-medians are shown."""
+medians are shown.
+"""
 
 from __future__ import annotations
 

@@ -3,7 +3,8 @@
 For all sites of a shipped scenario, in interleaved runs: Embree alone on the bare triangles; Embree on the triangles
 with their rims and fins; placing the hits in float64 (``settle``); searching the doubtful beams (``search``); and the
 whole cast, with the choice of the beams that can meet the region of interest. Ratios are medians over the rounds, each
-against Embree alone in the same round."""
+against Embree alone in the same round.
+"""
 
 from __future__ import annotations
 

@@ -2,7 +2,8 @@
 
 ``python -m benchmarks.occlusion SCENARIO RUN`` compares, on the artefacts of a finished run, the score of each site
 without moving occlusion, with recorded frames replayed, and with voxels taken as independent. Other effects that the
-scenario names stay on."""
+scenario names stay on.
+"""
 
 from __future__ import annotations
 

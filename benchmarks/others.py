@@ -10,7 +10,8 @@ papers and packages do instead:
 
 Ours is the reference: that it is right is shown by ``make numerics``. Wrong are beams (frames, for occupancy) that a
 voxel misses or has too many; where one voxel gains what it loses, both cancel, so these are lower bounds. Repeats are
-interleaved; processor seconds are medians, as multiples of ours; of the sites' errors the worst is shown."""
+interleaved; processor seconds are medians, as multiples of ours; of the sites' errors the worst is shown.
+"""
 
 from __future__ import annotations
 

@@ -2,7 +2,8 @@
 
 ``make pictures`` runs the shipped scenarios and draws: the map of the README, taken from the report, and for each
 effect what the score (or, where an effect changes traffic, the occupancy) looks like from above before and after, on
-one colour scale."""
+one colour scale.
+"""
 
 from __future__ import annotations
 

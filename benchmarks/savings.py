@@ -1,7 +1,8 @@
 """What does leaving out what no beam can meet save?
 
 The static world of the shipped junction, and a city of nine of them, held whole and held only as far as a beam can meet
-it; and no static geometry at all. All ways are timed in turn, and the bytes of their scans are compared."""
+it; and no static geometry at all. All ways are timed in turn, and the bytes of their scans are compared.
+"""
 
 from __future__ import annotations
 

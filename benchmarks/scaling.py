@@ -9,7 +9,8 @@ the process held before.
 
 A slope is fitted on log-log axes by least squares over the larger half of the sizes (three at least), where what every
 run costs no longer hides it; 1 is linear. Written are ``docs/images/scaling.png`` and the tables of
-``docs/scaling.md``."""
+``docs/scaling.md``.
+"""
 
 from __future__ import annotations
 

@@ -3,7 +3,8 @@
 ``python -m benchmarks.steps [SEEDS]`` runs the shipped junction with as many seeds (16) for each step, 5000 frames 1 s
 apart, and compares the means of each site's share of the limit with those at 0.25 s. Independent runs: t is the
 difference over its standard error. Seconds are of the traffic stage, as shares of those at 0.25 s. About ten minutes on
-two cores."""
+two cores.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """Are there any mismatches?
 
 ``python -m benchmarks.numerics`` hunts at full length (``--scale 1e-3`` is a smoke test), prints one table, and ends
-with 1 when a decision came out other than exact arithmetic has it."""
+with 1 when a decision came out other than exact arithmetic has it.
+"""
 
 from __future__ import annotations
 

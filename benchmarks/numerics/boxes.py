@@ -3,7 +3,8 @@
 Each box is counted by itself and its voxels are compared with the depth of overlap, computed in float64 from the
 fifteen axes of the separating-axis theorem (the flat path of the kernel cuts polygons instead and shares nothing with
 it; the pitched one decides by the same theorem, but not by depth). Where a depth lies within 1e-8 m of the 0.1 mm
-bound, the pair goes to 50-digit arithmetic. So every answer is certain, and only the doubtful ones are slow."""
+bound, the pair goes to 50-digit arithmetic. So every answer is certain, and only the doubtful ones are slow.
+"""
 
 from __future__ import annotations
 

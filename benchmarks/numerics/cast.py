@@ -1,7 +1,8 @@
 """Does a beam ever leak, or end on another surface than the one that it truly meets first?
 
 Scenes with known answers, hostile ones against a float64 brute force over all triangles, and every beam of every site
-of the shipped scenarios."""
+of the shipped scenarios.
+"""
 
 from __future__ import annotations
 

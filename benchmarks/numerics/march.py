@@ -3,7 +3,8 @@
 Most segments are settled by sorted cuts in float64, a scheme that shares nothing with the march but the formula of a
 crossing: all crossings of all planes, sorted; between two of them the middle decides which voxel it is. Wherever a
 piece is within 2e-8 m of the 1 micrometre bound, or its middle closer to a plane than rounding could move it, the
-segment goes to the rational oracle instead. So every answer is certain, and only the doubtful ones are slow."""
+segment goes to the rational oracle instead. So every answer is certain, and only the doubtful ones are slow.
+"""
 
 from __future__ import annotations
 

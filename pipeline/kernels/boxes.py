@@ -1,9 +1,9 @@
 r"""Counts which voxels a vehicle's box occupies, and in how many frames.
 
-Frame: the grid's own, in metres (the world's axes, zero at the grid's origin).
-A box occupies a voxel when the box, made ``SHRINK_M`` (0.1 mm) smaller on each of its six sides, and the voxel share
-positive volume. So a car whose side lies on a voxel face, as lane centres make them, does not touch what is behind it,
-and the last bit of a sine decides nothing.
+Frame: the grid's own, in metres (the world's axes, zero at the grid's origin). A box occupies a voxel when the box,
+made ``SHRINK_M`` (0.1 mm) smaller on each of its six sides, and the voxel share positive volume. So a car whose side
+lies on a voxel face, as lane centres make them, does not touch what is behind it, and the last bit of a sine decides
+nothing.
 
 - A flat box (pitch 0) is a rectangle times an interval of layers. The rectangle is convex, so what it covers of a
   column of cells :math:`x \in [i, i+1)` is one interval of :math:`y`, found by cutting its four sides to the column.
@@ -17,7 +17,8 @@ km.
 
 Two boxes in a voxel in a frame count once. Counting works on intervals of layers: a column notes the last frame in
 which it was occupied and the layers that were; the counts are differences along z, summed up by :func:`sum_layers` at
-the end."""
+the end.
+"""
 
 from __future__ import annotations
 

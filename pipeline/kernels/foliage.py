@@ -11,7 +11,8 @@ pair, and an edge that is met twice adds a stretch without length; cut what is i
 at its mean depth.
 
 Shares are whole multiples of 2**-32, as hits are, so the parts of a beam add up to exactly that beam; depths of ends
-are rounded to 1 nanometre. So last-bit differences of exp between machines do not travel on."""
+are rounded to 1 nanometre. So last-bit differences of exp between machines do not travel on.
+"""
 
 from __future__ import annotations
 

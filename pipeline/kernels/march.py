@@ -8,15 +8,12 @@ Steps, after Amanatides and Woo (1987), "A Fast Voxel Traversal Algorithm for Ra
 make the outcome independent of rounding:
 
 1. The crossing of plane :math:`k` is computed by itself, :math:`t_k = (k - o) / d`, with a true division, for all
-   planes of an
-   axis in one go (which vectorises), then the three lists are merged. Accumulating :math:`t \mathrel{+}= \Delta t`
-   would add up an error with each step.
+   planes of an axis in one go (which vectorises), then the three lists are merged. Accumulating :math:`t \mathrel{+}=
+   \Delta t` would add up an error with each step.
 2. Crossings that are equal are stepped one after the other without moving on, so a segment through an edge or a corner
-   goes
-   on diagonally: what it passes in between has a chord of length 0.
+   goes on diagonally: what it passes in between has a chord of length 0.
 3. A voxel counts by the length of its chord, so the order of crossings that differ by rounding alone does not matter:
-   what
-   lies between them is far shorter than ``CHORD_M``.
+   what lies between them is far shorter than ``CHORD_M``.
 
 A component that is exactly 0 (or -0) never crosses a plane: the segment belongs to the voxel whose half-open side holds
 it. The number of steps is bounded by the number of planes between both ends.
@@ -25,7 +22,8 @@ How far that carries: :math:`k - o` and the division are each off by at most :ma
 end of a chord by :math:`2 u R` and its length by :math:`4 u R` and less than a hundredth more, with R the distance from
 the segment's start to that end. For R up to 1e7 m that is 4.5e-9 m: right wherever the chord differs from ``CHORD_M``
 by more than 1e-8 m. The segment may end anywhere, up to the largest float64. Any other finite input is walked in as
-many steps, with :math:`4 u R` in place of 1e-8 m."""
+many steps, with :math:`4 u R` in place of 1e-8 m.
+"""
 
 from __future__ import annotations
 

@@ -14,7 +14,8 @@ Steps of :func:`count_blocked`: the beams come sorted by azimuth. A box asks onl
 elevations, seen from the sensor; those bounds are taken round the *unshrunk* box, so rounding loses no beam. In a frame
 each beam keeps the nearest box; when the frame is over, one is added at the first crossing that lies behind it. Sums
 along each beam then give the frames in which a crossing was not reached. Memory holds a number a beam and a number a
-crossing, however many frames there are."""
+crossing, however many frames there are.
+"""
 
 from __future__ import annotations
 

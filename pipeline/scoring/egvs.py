@@ -5,7 +5,8 @@ r"""The published score: how uncertain a voxel is, and what a site makes of that
 
 (arXiv 2504.06772, Eq. 2 and 4), with :math:`p = c / T` from integers. Voxels with equal counts share one entropy, so
 hits are first added up for each count - whole numbers, no rounding - and the sum over counts is taken in exact integer
-arithmetic and rounded once. The score is therefore the same for any order of voxels, beams, threads and sites."""
+arithmetic and rounded once. The score is therefore the same for any order of voxels, beams, threads and sites.
+"""
 
 from __future__ import annotations
 

@@ -3,7 +3,8 @@ r"""Scores empty scans against a Traffic Probabilistic Occupancy Grid.
 .. math:: EGVS(site) = \sum_v H(p(v)) \, \min(\gamma, hits(v))
 
 (arXiv 2504.06772, Eq. 4): ``hits`` are the beams of the empty scan that cross voxel v, p comes from the TPOG. The sum
-is that of :mod:`pipeline.scoring.egvs`, hits are those of :mod:`pipeline.scoring.visibility`."""
+is that of :mod:`pipeline.scoring.egvs`, hits are those of :mod:`pipeline.scoring.visibility`.
+"""
 
 from __future__ import annotations
 

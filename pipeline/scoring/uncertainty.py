@@ -22,7 +22,8 @@ still alike, a note says so.
 Voxels that have equal counts in every group share one class (0.5 million occupied voxels of a real junction make 50,000
 classes), so a site costs one pass over the voxels and one over the classes. Nothing is random; the outcome does not
 depend on threads or on other sites. Hits are taken as they are: where an effect lets traffic hide voxels, its part in
-the error is left out."""
+the error is left out.
+"""
 
 from __future__ import annotations
 

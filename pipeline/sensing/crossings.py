@@ -1,7 +1,8 @@
 """Lists which voxels each beam of a scan crosses, and at which range.
 
 Where effects weight beams, counting is not enough: every crossing is listed with its range, a few thousand pieces at a
-time."""
+time.
+"""
 
 from __future__ import annotations
 

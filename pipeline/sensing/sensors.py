@@ -11,7 +11,8 @@ it: first roll about x, then pitch (nose up positive), then yaw (counter-clockwi
 
 Angles stay in degrees until their sine and cosine are taken by functions that are exact at multiples of 90; an azimuth
 is rounded to 1e-6 degree first. So a beam at 180 degrees has exactly no y, and does not leave the plane that it lies
-in."""
+in.
+"""
 
 from __future__ import annotations
 

@@ -2,7 +2,8 @@
 
 Steps: read ``trajectories.parquet`` a few hundred frames at a time; count occupancy block by block
 (:mod:`pipeline.scoring.occupancy`); leave out the voxels that static geometry fills; write the sparse counts. Blocks
-are consecutive and of equal length; counts of several TPOGs on one grid add up."""
+are consecutive and of equal length; counts of several TPOGs on one grid add up.
+"""
 
 from __future__ import annotations
 

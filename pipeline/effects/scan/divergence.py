@@ -15,7 +15,8 @@ Calls for it: poles, signs and edges at ranges where the beam is as wide as they
 between nodes, so a single beam's share comes in steps (7: twelfths, and half for the middle); a target in a voxel
 counts by the share that gets there, not by what a detector makes of it; angles are taken as their tangents (exact to
 1e-5 below 10 mrad). Angles are those of 1/e^2; a full width at half maximum (as Ouster states it) is 1.70 times as wide
-there. Where a maker does not say which it means, 1/e^2 is taken."""
+there. Where a maker does not say which it means, 1/e^2 is taken.
+"""
 
 from __future__ import annotations
 

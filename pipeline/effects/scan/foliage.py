@@ -21,7 +21,8 @@ the sunlight bare and about 80 % in leaf. Densities of 0.5 and 2 as thin and den
 
 Calls for it: trees between a site and the road. Limits: no clumping (real crowns let more through); leaves stand still;
 no partial echo is too weak to be noticed; trunks stay opaque, and so do crowns whose surface is not closed. The TPOG
-still leaves out the voxels that crowns fill, and a measured scan is taken as it is."""
+still leaves out the voxels that crowns fill, and a measured scan is taken as it is.
+"""
 
 from __future__ import annotations
 

@@ -11,7 +11,8 @@ Stegun 1964, 25.4.46; closed forms up to n = 4), which has all moments of the Ga
 Calls for it: slender poles, cantilever arms, bridges. Limits: the sensor turns but does not move (1 degree on a pole of
 5 m would move it by 9 cm); no torsion about the pole; within one turn of the sensor the pole is taken to stand still.
 The Gaussian is an assumption, and no amplitude is taken from the literature: ``tilt_deg`` is the user's to measure or
-to guess."""
+to guess.
+"""
 
 from __future__ import annotations
 

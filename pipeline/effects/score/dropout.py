@@ -6,7 +6,8 @@ a die, as the LiDAR of CARLA does under ``dropoff_general_rate`` (Dosovitskiy et
 Calls for it: losses that are known as one number (a sensor's own statistics, a dirty window, packets lost on the way),
 and a margin of safety: gamma caps the hits, so a site with beams to spare loses less than the share. Limits: real
 losses depend on range, incidence and material (Manivasagam et al. 2020, CVPR, learn them); a loss that belongs to range
-or weather is better named as such."""
+or weather is better named as such.
+"""
 
 from __future__ import annotations
 

@@ -22,7 +22,8 @@ airports report the meteorological optical range, which is at 5 % (-ln 0.05 = 3.
 
 Calls for it: a site that must work in fog, mist or haze. Limits: the share of the pulse that comes back stands for the
 chance that it is noticed; a sensor with power in reserve loses less, and one whose detector is blinded by the fog's own
-return loses more. Homogeneous fog; single scattering; wavelengths from 400 to 1550 nm."""
+return loses more. Homogeneous fog; single scattering; wavelengths from 400 to 1550 nm.
+"""
 
 from __future__ import annotations
 

@@ -31,7 +31,8 @@ and Rus, "On mutual information-based control of range sensing robots for mappin
 
 Calls for it: dense traffic, long vehicles, low sensors. Limits: boxes are opaque and whole (no windows, no gap under
 the body); gamma caps the mean over frames, not each frame; the TPOG and the replay share their traffic, so an unlucky
-recording is unlucky in both."""
+recording is unlucky in both.
+"""
 
 from __future__ import annotations
 

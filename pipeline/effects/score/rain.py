@@ -24,7 +24,8 @@ simulators that use it.
 
 Calls for it: a site that must work in rain. Limits: the share of the pulse that comes back stands for the chance that
 it is noticed; a sensor with power in reserve loses less than that. No returns from drops, no spray behind vehicles, no
-wet surfaces or windows."""
+wet surfaces or windows.
+"""
 
 from __future__ import annotations
 

@@ -22,7 +22,8 @@ Calls for it: dark vehicles, long ranges, sensors near their limit: wherever the
 rated range at 10 %. Limits: one reflectivity and one incidence for all targets (a car's side at a glancing angle
 returns less, a number plate far more); pulses that saturate or are range-gated do not follow the power law; thin
 targets return less than r^-2. Beyond the sensor's maximum range there are no beams, whatever the target. With weather,
-chances are multiplied: the joint loss of power is not put to one threshold."""
+chances are multiplied: the joint loss of power is not put to one threshold.
+"""
 
 from __future__ import annotations
 
