@@ -215,7 +215,7 @@ def test_notebook_lines_of_the_readme_run(mini: Path, tmp_path: Path, monkeypatc
     shutil.copytree(ROOT / "scenarios", tmp_path / "scenarios")
     names: dict[str, object] = {}
     exec(code.group(1), names)  # the README's own words
-    assert names["p"].max() <= 1.0  # type: ignore[attr-defined]
+    assert names["tpog"].p.max() <= 1.0  # type: ignore[attr-defined]
 
 
 def test_editor_schema_is_not_stale() -> None:
