@@ -1,1 +1,1 @@
-"""The files that a run leaves: Parquet by the schemas in ``data_schemas``, ``run.json``, and their readers."""
+"""The files that a run leaves, Parquet and JSON, and their readers."""

@@ -1,1 +1,1 @@
-"""What every other package builds on: errors, files, grids, parallel work, progress; nothing of LiDARs or traffic."""
+"""What every other package builds on: errors, files, grids, parallel work, progress."""

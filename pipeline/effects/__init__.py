@@ -1,1 +1,1 @@
-"""What goes beyond the plain scene; each effect is a module, found by its entry point, imported when named."""
+"""What goes beyond the plain scene: each effect a module, imported only when named."""

@@ -1,4 +1,4 @@
-"""Numba kernels: they take and fill arrays and know no paths, no configuration, no logging."""
+"""Numba kernels: they fill arrays and know no paths, configuration or logging."""
 
 from pathlib import Path
 

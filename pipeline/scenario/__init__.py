@@ -1,1 +1,1 @@
-"""What a scenario may say: the models with every key, limit and default, and how a file is read and checked."""
+"""What a scenario may say: every key, its limit and its default; reading and checking."""
