@@ -28,25 +28,22 @@ import numpy as np
 
 from pipeline.core.errors import InputError
 from pipeline.scenario.effects import EffectParameters
+from pipeline.sensing.scene import BeamCutter, BeamExpander
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from pipeline.artefacts.readers import Tpog
-    from pipeline.core.grid import Roi
     from pipeline.scenario.models import Scenario
     from pipeline.sensing.crossings import Crossings
     from pipeline.sensing.scene import Scene
     from pipeline.sensing.sensors import Sensor
-    from pipeline.sensing.sites import Pose
     from pipeline.traffic.boxes import Size
     from pipeline.traffic.extensions import BoxChange, TrafficPlan
     from pipeline.traffic.network import Network
-    from pipeline.world.casting import EmptyScan
-    from pipeline.world.mesh import World
     from pipeline.world.terrain import Surface
 
 P = TypeVar("P", bound=EffectParameters)
@@ -94,37 +91,18 @@ class Effect(Generic[P]):
         return ()
 
 
-class Expand(Effect[P]):
+class Expand(Effect[P], BeamExpander):
     """One beam into weighted sub-beams."""
 
     STAGE: ClassVar[str] = "scan"
     KIND: ClassVar[str] = "expand"
 
-    @property
-    def copies(self) -> int:
-        """How many sub-beams a beam has."""
-        raise NotImplementedError
 
-    def expand(
-        self, directions: NDArray[np.float64], sensor: Sensor, pose: Pose
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
-        """See :meth:`pipeline.sensing.scene.BeamExpander.expand`."""
-        raise NotImplementedError
-
-
-class TransmitScan(Effect[P]):
+class TransmitScan(Effect[P], BeamCutter):
     """What gets beyond static surfaces."""
 
     STAGE: ClassVar[str] = "scan"
     KIND: ClassVar[str] = "transmit"
-
-    def opaque(self, world: World) -> World:
-        """The world without what this effect lets beams through."""
-        raise NotImplementedError
-
-    def cutter(self, world: World, roi: Roi) -> Callable[[EmptyScan, Pose], EmptyScan]:
-        """See :meth:`pipeline.sensing.scene.BeamCutter.cutter`."""
-        raise NotImplementedError
 
 
 class TransmitScore(Effect[P]):
