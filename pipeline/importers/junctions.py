@@ -1,7 +1,7 @@
 """A junction is chosen here, the region of interest laid round it, and places for poles are found along its kerbs.
 
-Steps: read lanes, junctions and the projection from a SUMO network -> :class:`Streets`; :func:`choose_junction`;
-:func:`region_round` it; :func:`kerb_places` along the carriageway's rim.
+Steps: a SUMO network's lanes and junctions -> :class:`Streets`; :func:`choose_junction`; :func:`region_round` it;
+:func:`kerb_places` along the carriageway's rim.
 
 World frame: the network's own x, y in metres. Longitude and latitude become x, y by the network's ``<location>``, as
 netconvert did:
@@ -11,20 +11,21 @@ netconvert did:
 
 from __future__ import annotations
 
+import html
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from xml.etree.ElementTree import Element
 
+import numpy as np
 import shapely
 from shapely.geometry import LineString, Point, Polygon, box
 from shapely.geometry.base import BaseGeometry
 
-from pipeline.core.errors import InputError
-from pipeline.formats import safe_xml
-
-XY = tuple[float, float]
+from pipeline.importers.shapes import XY
+from pipeline.traffic.network import LANE_WIDTH_M, Edge, Location
+from pipeline.traffic.network import Junction as Node
+from pipeline.traffic.network import read as read_network
 
 ROI_LEAST_M, ROI_MOST_M, ROI_STEP_M, ROI_HEIGHT_M = 60.0, 120.0, 10.0, 5.0
 APPROACH_M = 20.0
@@ -37,8 +38,6 @@ CLEARANCE_M = 1.0
 BEYOND_ROI_M = 5.0
 HEIGHTS_M = (3.0, 4.5)
 MOST_PLACES = 12
-LANE_WIDTH_M = 3.2
-"""SUMO's default."""
 
 _HAIR_M = 0.01
 _ISLAND_M2 = 100.0
@@ -87,8 +86,7 @@ class Streets:
     inside: tuple[BaseGeometry, ...]
     nodes_m: dict[str, XY]
     junctions: tuple[Junction, ...]
-    projection: str
-    offset_m: XY
+    location: Location
 
     @property
     def lane_areas(self) -> list[BaseGeometry]:
@@ -104,8 +102,9 @@ class Streets:
         """World-frame x, y in metres of positions in degrees."""
         from pyproj import Proj
 
-        xs, ys = Proj(self.projection)(list(lons_deg), list(lats_deg))
-        return [(x + self.offset_m[0], y + self.offset_m[1]) for x, y in zip(xs, ys, strict=True)]
+        xs, ys = Proj(self.location.projection)(list(lons_deg), list(lats_deg))
+        east_m, north_m = self.location.offset_m
+        return [(x + east_m, y + north_m) for x, y in zip(xs, ys, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -132,49 +131,42 @@ class KerbPlace:
 
 
 def read(path: Path) -> Streets:
-    """Read a network that netconvert wrote from OpenStreetMap."""
-    streets: list[Street] = []
-    inside: list[BaseGeometry] = []
-    nodes: list[Element] = []
-    projection, offset_m = "", (0.0, 0.0)
-    for element in safe_xml.children(path, "net"):
-        function = element.get("function", "")
-        if element.tag == "location":
-            projection, offset_m = element.attrib["projParameter"], _points(element.attrib["netOffset"])[0]
-        elif element.tag == "edge" and function == "internal":
-            inside.append(_area(_lanes(element)))
-        elif element.tag == "edge" and not function:
-            ends = element.attrib["from"], element.attrib["to"]
-            length_m = math.fsum(float(lane.attrib["length"]) for lane in element.iter("lane"))
-            streets.append(Street(ends, _area(_lanes(element)), element.get("name", ""), length_m))
-        elif element.tag == "junction" and element.get("type") != "internal":
-            nodes.append(element)
-    nodes_m = {e.attrib["id"]: (float(e.attrib["x"]), float(e.attrib["y"])) for e in nodes}
-    junctions = tuple(
-        _junction(
-            e.attrib["id"], e.attrib["type"], nodes_m[e.attrib["id"]], _points(e.get("shape", "")),
-            len(e.get("incLanes", "").split()), streets,
-        )
-        for e in nodes
-        if e.get("type") != "dead_end" and e.get("incLanes")
-    )  # fmt: skip
-    return Streets(tuple(streets), tuple(inside), nodes_m, junctions, projection, offset_m)
-
-
-def _lanes(edge: Element) -> list[tuple[list[XY], float]]:
-    """Middle line and width of each lane; pavements are none."""
-    return [
-        (_points(lane.attrib["shape"]), float(lane.get("width", LANE_WIDTH_M)))
-        for lane in edge.iter("lane")
-        if lane.get("allow") != "pedestrian"
+    """Read a network that netconvert wrote from OpenStreetMap; InputError when it has no road."""
+    network = read_network(path)
+    assert network.location is not None, "netconvert writes where OpenStreetMap's streets lie"
+    streets = [
+        # netconvert escapes names twice.
+        Street((e.from_node, e.to_node), _area(e), html.unescape(e.name), math.fsum(lane.length_m for lane in e.lanes))
+        for e in network.edges
     ]
+    nodes = [node for node in network.junctions if node.type != "internal"]
+    return Streets(
+        streets=tuple(streets),
+        inside=tuple(_area(edge) for edge in network.all_edges if edge.function == "internal"),
+        nodes_m={node.id: node.at_m for node in nodes},
+        junctions=tuple(_junction(n, streets) for n in nodes if n.type != "dead_end" and n.incoming_lanes),
+        location=network.location,
+    )
 
 
-def _points(text: str) -> list[XY]:
-    try:
-        return [(float(x), float(y)) for x, y, *_ in (pair.split(",") for pair in text.split())]
-    except ValueError:
-        raise InputError("network", f"a shape holds no coordinates ({text[:40]!r})", "what netconvert writes") from None
+def _area(edge: Edge) -> BaseGeometry:
+    """An edge's lanes at their full width; pavements are none."""
+    return shapely.union_all([
+        LineString(lane.shape_m[:, :2]).buffer((lane.width_m or LANE_WIDTH_M) / 2, cap_style="flat")
+        for lane in edge.lanes
+        if lane.permission.allow != {"pedestrian"} and len(np.unique(lane.shape_m, axis=0)) > 1
+    ])  # fmt: skip
+
+
+def _junction(node: Node, streets: Sequence[Street]) -> Junction:
+    """A node of the network, with what meets there."""
+    corners_m = node.shape_m[:, :2]
+    area = shapely.make_valid(Polygon(corners_m)) if len(corners_m) >= 3 else Point(node.at_m).buffer(1.0)
+    meeting = [street for street in streets if node.id in street.ends]
+    arms = {end for street in meeting for end in street.ends} - {node.id}
+    names = tuple(sorted({street.name for street in meeting if street.name}))
+    signalised = node.type.startswith("traffic_light")
+    return Junction(node.id, node.at_m, area, len(node.incoming_lanes), len(arms), signalised, names)
 
 
 def choose_junction(streets: Streets, at_m: XY | None) -> Junction | None:
@@ -272,20 +264,3 @@ def _without_islands(area: BaseGeometry) -> BaseGeometry:
 def _lines(rim: BaseGeometry) -> list[LineString]:
     merged = shapely.line_merge(rim) if rim.geom_type == "MultiLineString" else rim
     return [line for line in shapely.get_parts(shapely.normalize(merged)) if isinstance(line, LineString)]
-
-
-def _junction(
-    name: str, kind: str, at_m: XY, corners_m: Sequence[XY], lanes_in: int, streets: Sequence[Street]
-) -> Junction:
-    area = shapely.make_valid(Polygon(corners_m)) if len(corners_m) >= 3 else Point(at_m).buffer(1.0)
-    meeting = [s for s in streets if name in s.ends]
-    arms = {end for s in meeting for end in s.ends} - {name}
-    names = tuple(sorted({s.name for s in meeting if s.name}))
-    return Junction(name, at_m, area, lanes_in, len(arms), kind.startswith("traffic_light"), names)
-
-
-def _area(lanes: Sequence[tuple[Sequence[XY], float]]) -> BaseGeometry:
-    """Lanes at their full width."""
-    return shapely.union_all([
-        LineString(points).buffer(width_m / 2, cap_style="flat") for points, width_m in lanes if len(set(points)) > 1
-    ])  # fmt: skip

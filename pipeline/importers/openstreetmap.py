@@ -182,13 +182,11 @@ def _network(extract: Extract, osm: Path, lefthand: bool) -> tuple[str, Streets]
         flags = [*NETCONVERT, *_boundary(extract), *(["--lefthand"] if lefthand else [])]
         try:
             sumo.run("netconvert", ["--osm-files", "streets.osm.xml", *flags, "-o", NETWORK], work)
-        except RunError as error:
-            if re.search(r"No (nodes|edges) loaded", str(error)):
+            streets = junctions.read(work / NETWORK)
+        except (RunError, InputError) as error:
+            if re.search(r"No (nodes|edges) loaded|has no road", str(error)):
                 raise missing from None
             raise
-        streets = junctions.read(work / NETWORK)
-        if not streets.streets:
-            raise missing
         return _without_header((work / NETWORK).read_text(encoding="utf-8")), streets
 
 

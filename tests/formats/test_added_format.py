@@ -7,10 +7,13 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from pipeline.core import plugins
 from pipeline.formats.point_clouds import GROUP, read_points
 from tests.core.test_plugins import install
+
+pytestmark = pytest.mark.system
 
 FOO = """
 import numpy as np
@@ -37,8 +40,6 @@ from pathlib import Path
 import numpy as np
 from pipeline.core.errors import InputError
 from pipeline.formats.point_clouds import read_points, write_points
-
-pytestmark = pytest.mark.system
 path = Path(sys.argv[1])
 write_points(path, np.array([[0.1, 2.0, 3.0], [4.0, np.nan, 6.0]]))
 points, dropped = read_points(path, "")

@@ -237,9 +237,9 @@ def test_the_junction_is_named_and_the_source_attributed(made: Made) -> None:
 
 
 def test_a_name_of_odd_characters_is_kept_and_comments_say_what_is_what(tmp_path: Path) -> None:
-    named = edited(tmp_path, ('v="East Street"', 'v="East A\\\\B = #1 Straße"'))
+    named = edited(tmp_path, ('v="East Street"', 'v="East A\\\\B = #1 &quot;Straße&quot; &amp; more"'))
     title = osm.new(tmp_path / "named", named).junction.title
-    assert title == "signalised junction of East A\\B = #1 Straße and North Street"
+    assert title == 'signalised junction of East A\\B = #1 "Straße" & more and North Street'
     assert loading.load(tmp_path / "named").description == f"S{title[1:]}"
     text = (tmp_path / "named" / "scenario.toml").read_text(encoding="utf-8")
     assert re.search(r"^vehicles = 6 +# in the whole network, in every frame \(1\.5 km of lanes\)$", text, re.MULTILINE)
