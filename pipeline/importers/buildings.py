@@ -5,7 +5,8 @@ Heights: the top as in :mod:`pipeline.importers.mapped_solids`;
     base = min_height     or building:min_level * 3 m      or 0
 
 Multipolygons are assembled here: osmium gives no area to a ring that crosses itself (here: repaired, and counted), nor
-to tags on the outer way alone."""
+to tags on the outer way alone.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +18,7 @@ from shapely.geometry.base import BaseGeometry
 
 from pipeline.formats.osm import Extract, Relation, Tags, length_m, number
 from pipeline.importers.mapped_solids import LEVEL_M, ImportCounts, MappedSolid, tag_value, top_of
-from pipeline.importers.shapes import GRID_M, XY, area_within, is_large_enough, pieces_of
+from pipeline.importers.shapes import XY, area_within, large_pieces_of
 
 BUILDING_M = 9.0
 ROOF_M, ROOF_THICKNESS_M = 5.0, 0.5
@@ -35,9 +36,8 @@ def buildings(extract: Extract, xy: dict[int, XY], counts: ImportCounts) -> Iter
         is_outline = _is_outline(tags)
         over = [parts[i][2] for i in tree.query(area, predicate="intersects")] if is_outline else []
         rest = area.difference(shapely.union_all(over)) if over else area
-        whole = pieces_of(shapely.set_precision(rest, GRID_M))
-        pieces = [piece for piece in whole if is_large_enough(piece)]
-        counts.slivers += len(whole) - len(pieces)
+        pieces, slivers = large_pieces_of(rest)
+        counts.slivers += slivers
         if not pieces:
             counts.drop("building", "covered_by_parts" if over else "degenerate")
             continue
@@ -54,7 +54,7 @@ def _is_building(tags: Tags) -> bool:
 
 
 def _is_underground(tags: Tags, counts: ImportCounts) -> bool:
-    under = tags.get("location") == "underground" or tags.get("building") == "underground"
+    under = "underground" in (tags.get("location"), tags.get("building"))
     if under:
         counts.drop("building", "underground")
     return under

@@ -154,7 +154,7 @@ def _area(edge: Edge) -> BaseGeometry:
     return shapely.union_all([
         LineString(lane.shape_m[:, :2]).buffer((lane.width_m or LANE_WIDTH_M) / 2, cap_style="flat")
         for lane in edge.lanes
-        if lane.permission.allow != {"pedestrian"} and len(np.unique(lane.shape_m, axis=0)) > 1
+        if lane.permission.allow != frozenset({"pedestrian"}) and len(np.unique(lane.shape_m, axis=0)) > 1
     ])  # fmt: skip
 
 

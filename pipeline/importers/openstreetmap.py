@@ -127,7 +127,7 @@ def new(folder: Path, osm: Path, at: tuple[float, float] | None = None, lefthand
     _check_at(extract, at)
     network, streets = _network(extract, osm, lefthand)
     junction, roi = _junction(streets, osm, at)
-    mapped, counts = solids.collect(extract, streets.to_xy, streets.lane_areas)
+    mapped, counts = solids.collect(extract, streets)
     places = junctions.kerb_places(streets, junction, roi, [solid.area for solid in mapped])
     if not places:
         problem = f"no place for a pole is free along the kerbs of the {junction.title}"
