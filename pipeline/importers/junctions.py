@@ -23,7 +23,7 @@ from shapely.geometry import LineString, Point, Polygon, box
 from shapely.geometry.base import BaseGeometry
 
 from pipeline.importers.shapes import XY
-from pipeline.traffic.network import LANE_WIDTH_M, Edge, Location
+from pipeline.traffic.network import LANE_WIDTH_M, Edge, Network
 from pipeline.traffic.network import Junction as Node
 from pipeline.traffic.network import read as read_network
 
@@ -66,44 +66,35 @@ class Junction:
 
 
 @dataclass(frozen=True)
-class Street:
-    """A road in one direction: the nodes that it joins, and its lanes at their full width."""
-
-    ends: tuple[str, str]
-    area: BaseGeometry
-    name: str
-    lane_length_m: float
-
-
-@dataclass(frozen=True)
 class Streets:
     """What is needed of a network: where vehicles drive, its junctions, its projection.
 
-    ``inside`` are the lanes within junctions; ``nodes_m`` places each node, also those that are no junction.
+    ``road_areas`` are those of the network's roads in their order, ``inside`` are the lanes within junctions.
     """
 
-    streets: tuple[Street, ...]
+    network: Network
+    road_areas: tuple[BaseGeometry, ...]
     inside: tuple[BaseGeometry, ...]
-    nodes_m: dict[str, XY]
     junctions: tuple[Junction, ...]
-    location: Location
 
     @property
     def lane_areas(self) -> list[BaseGeometry]:
         """The carriageway in pieces: all lanes, also those inside junctions, at their full width."""
-        return [*(s.area for s in self.streets), *self.inside]
+        return [*self.road_areas, *self.inside]
 
     @property
     def lane_length_m(self) -> float:
         """All lanes outside junctions, one after another."""
-        return math.fsum(s.lane_length_m for s in self.streets)
+        return math.fsum(lane.length_m for road in self.network.edges for lane in road.lanes)
 
     def to_xy(self, lons_deg: Sequence[float], lats_deg: Sequence[float]) -> list[XY]:
         """World-frame x, y in metres of positions in degrees."""
         from pyproj import Proj
 
-        xs, ys = Proj(self.location.projection)(list(lons_deg), list(lats_deg))
-        east_m, north_m = self.location.offset_m
+        location = self.network.location
+        assert location is not None, "netconvert writes it"
+        xs, ys = Proj(location.projection)(list(lons_deg), list(lats_deg))
+        east_m, north_m = location.offset_m
         return [(x + east_m, y + north_m) for x, y in zip(xs, ys, strict=True)]
 
 
@@ -133,19 +124,15 @@ class KerbPlace:
 def read(path: Path) -> Streets:
     """Read a network that netconvert wrote from OpenStreetMap; InputError when it has no road."""
     network = read_network(path)
-    assert network.location is not None, "netconvert writes where OpenStreetMap's streets lie"
-    streets = [
-        # netconvert escapes names twice.
-        Street((e.from_node, e.to_node), _area(e), html.unescape(e.name), math.fsum(lane.length_m for lane in e.lanes))
-        for e in network.edges
-    ]
-    nodes = [node for node in network.junctions if node.type != "internal"]
     return Streets(
-        streets=tuple(streets),
-        inside=tuple(_area(edge) for edge in network.all_edges if edge.function == "internal"),
-        nodes_m={node.id: node.at_m for node in nodes},
-        junctions=tuple(_junction(n, streets) for n in nodes if n.type != "dead_end" and n.incoming_lanes),
-        location=network.location,
+        network,
+        tuple(_area(edge) for edge in network.edges),
+        tuple(_area(edge) for edge in network.all_edges if edge.function == "internal"),
+        tuple(
+            _junction(node, network.edges)
+            for node in network.junctions
+            if node.type not in ("internal", "dead_end") and node.incoming_lanes
+        ),
     )
 
 
@@ -158,31 +145,31 @@ def _area(edge: Edge) -> BaseGeometry:
     ])  # fmt: skip
 
 
-def _junction(node: Node, streets: Sequence[Street]) -> Junction:
+def _junction(node: Node, roads: Sequence[Edge]) -> Junction:
     """A node of the network, with what meets there."""
     corners_m = node.shape_m[:, :2]
     area = shapely.make_valid(Polygon(corners_m)) if len(corners_m) >= 3 else Point(node.at_m).buffer(1.0)
-    meeting = [street for street in streets if node.id in street.ends]
-    arms = {end for street in meeting for end in street.ends} - {node.id}
-    names = tuple(sorted({street.name for street in meeting if street.name}))
+    meeting = [road for road in roads if node.id in _ends(road)]
+    arms = {end for road in meeting for end in _ends(road)} - {node.id}
+    names = sorted({html.unescape(road.name) for road in meeting if road.name})  # netconvert escapes names twice
     signalised = node.type.startswith("traffic_light")
-    return Junction(node.id, node.at_m, area, len(node.incoming_lanes), len(arms), signalised, names)
+    return Junction(node.id, node.at_m, area, len(node.incoming_lanes), len(arms), signalised, tuple(names))
+
+
+def _ends(road: Edge) -> tuple[str, str]:
+    return road.from_node, road.to_node
 
 
 def choose_junction(streets: Streets, at_m: XY | None) -> Junction | None:
     """The signalised junction nearest to ``at_m``, or the largest; one without signals only where there is no other.
 
     A junction is where at least three streets meet, so that the signals of a mere crossing for pedestrians do not
-    count, unless nothing else is there."""
+    count, unless nothing else is there.
+    """
     met = [j for j in streets.junctions if j.arms >= 3]
-    groups = (
-        [j for j in met if j.signalised],
-        [j for j in streets.junctions if j.signalised],
-        met,
-        streets.junctions,
-    )
-    among = next((group for group in groups if group), None)
-    if among is None:
+    signalised = [j for j in streets.junctions if j.signalised]
+    among = [j for j in met if j.signalised] or signalised or met or streets.junctions
+    if not among:
         return None
     if at_m is None:
         return min(among, key=lambda j: (-j.lanes_in, -j.area.area, j.id))
@@ -203,7 +190,8 @@ def kerb_places(streets: Streets, junction: Junction, roi: Region, objects: Sequ
     They stand ``KERB_M`` outside the carriageway (rounded to 0.1 m, never nearer than ``KERB_LEAST_M``),
     ``CLEARANCE_M`` from every object, about ``SPACING_M`` apart along the kerb and never nearer to each other than half
     of it. Islands smaller than 100 m2 count as carriageway. Of more than ``MOST_PLACES`` places, the nearest to the
-    junction are taken."""
+    junction are taken.
+    """
     window = box(*roi.area.buffer(BEYOND_ROI_M, join_style="mitre").bounds)
     near = window.buffer(50.0)
     everything = [*streets.lane_areas, *(j.area for j in streets.junctions)]
@@ -231,13 +219,14 @@ def _nearest(places: Sequence[XY], center: XY) -> list[XY]:
 
 def _approaches(streets: Streets, junction: Junction, window: BaseGeometry) -> list[BaseGeometry]:
     """The streets that one reaches from the junction without leaving the window, in either direction."""
-    inside = {node for node, at_m in streets.nodes_m.items() if window.covers(Point(at_m))}
+    roads = [(_ends(road), area) for road, area in zip(streets.network.edges, streets.road_areas, strict=True)]
+    inside = {node.id for node in streets.network.junctions if window.covers(Point(node.at_m))}
     reached, grown = {junction.id}, True
     while grown:
-        ends = {end for s in streets.streets if reached & inside & set(s.ends) for end in s.ends}
-        grown = not ends <= reached
-        reached |= ends
-    return [s.area for s in streets.streets if (reached & inside | {junction.id}) & set(s.ends)]
+        met = {end for ends, _ in roads if reached & inside & set(ends) for end in ends}
+        grown = not met <= reached
+        reached |= met
+    return [area for ends, area in roads if (reached & inside | {junction.id}) & set(ends)]
 
 
 def _along(line: LineString, forbidden: BaseGeometry, window: BaseGeometry) -> list[XY]:
