@@ -7,7 +7,8 @@ guessed.
 A format is an entry point of the group ``egvs.point_clouds``: its name is the suffix without the dot, its object has
 ``read`` and perhaps ``write`` (:class:`PointFormat`). Here, each is a module of its own; other packages may add theirs.
 
-Frame: the world's (right-handed, x east, y north, z up), metres, float64."""
+Frame: the world's (right-handed, x east, y north, z up), metres, float64.
+"""
 
 from __future__ import annotations
 
@@ -72,15 +73,13 @@ def read_points(path: Path, place: str) -> tuple[NDArray[np.float64], int]:
     try:
         points = point_format.read(path, place)
     except OSError as error:
-        raise InputError(
-            place, f"cannot be read ({error.strerror or error})", "a file that is there and may be read"
-        ) from None
+        problem = f"cannot be read ({error.strerror or error})"
+        raise InputError(place, problem, "a file that is there and may be read") from None
     finite = np.isfinite(points).all(axis=1)
     dropped = len(points) - int(np.count_nonzero(finite))
     if dropped == len(points):
-        raise InputError(
-            place, f"holds no finite point (of {len(points)})", "at least one return with finite x, y and z"
-        )
+        right = "at least one return with finite x, y and z"
+        raise InputError(place, f"holds no finite point (of {len(points)})", right)
     return (points[finite] if dropped else points), dropped
 
 

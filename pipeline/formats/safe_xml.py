@@ -47,27 +47,22 @@ def children(path: Path, root: str, name: Path | None = None) -> Iterator[Elemen
         is damaged.
     """
     from defusedxml.common import DefusedXmlException
+    from defusedxml.ElementTree import iterparse
 
     with opened(path, name) as file:
         path = name or path
+        events: Iterator[tuple[str, Any]] = iterparse(file, events=("start", "end"))
         try:
-            yield from _children(file, path, root)
+            _, top = next(events)
+            if root and top.tag != root:
+                raise InputError(path, f"its root is <{top.tag}>", f"a file whose root is <{root}>")
+            depth = 0
+            for event, element in events:
+                depth += 1 if event == "start" else -1
+                if event == "end" and depth == 0:
+                    yield element
+                    top.clear()
         except ParseError as error:
             raise InputError(path, f"is not well-formed XML: {error}", "a whole XML file") from None
         except DefusedXmlException:
             raise InputError(path, "declares XML entities, which are refused", "a file without them") from None
-
-
-def _children(file: IO[bytes], path: Path, root: str) -> Iterator[Element]:
-    from defusedxml.ElementTree import iterparse
-
-    events: Iterator[tuple[str, Any]] = iterparse(file, events=("start", "end"))
-    _, top = next(events)
-    if root and top.tag != root:
-        raise InputError(path, f"its root is <{top.tag}>", f"a file whose root is <{root}>")
-    depth = 0
-    for event, element in events:
-        depth += 1 if event == "start" else -1
-        if event == "end" and depth == 0:
-            yield element
-            top.clear()
