@@ -67,9 +67,7 @@ def read_points(path: Path, place: str) -> tuple[NDArray[np.float64], int]:
         When the file is missing, of an unknown kind, damaged, or without one finite point.
     """
     place = place if path.name in place else ": ".join(filter(None, (place, str(path))))
-    if (kind := _kind(path)) not in plugins.names(GROUP):
-        raise _unknown(place, path, plugins.names(GROUP))
-    point_format: PointFormat = plugins.load(GROUP, kind)
+    point_format: PointFormat = plugins.load(GROUP, _kind(place, path, plugins.names(GROUP)))
     try:
         points = point_format.read(path, place)
     except OSError as error:
@@ -102,18 +100,16 @@ def write_points(path: Path, points_m: NDArray[np.float64]) -> None:
     writable: dict[str, WritableFormat] = {
         name: loaded for name in plugins.names(GROUP) if hasattr(loaded := plugins.load(GROUP, name), "write")
     }
-    if (kind := _kind(path)) not in writable:
-        raise _unknown(path, path, list(writable))
+    kind = _kind(path, path, list(writable))
     if points_m.ndim != 2 or points_m.shape[1] != 3:
         raise ValueError(f"points_m has the shape {points_m.shape}, not (n, 3)")
     with aside(path) as partial:
         writable[kind].write(partial, points_m)
 
 
-def _kind(path: Path) -> str:
-    return path.suffix.lower().removeprefix(".")
-
-
-def _unknown(place: object, path: Path, kinds: list[str]) -> InputError:
+def _kind(place: object, path: Path, kinds: list[str]) -> str:
+    """Which of the kinds the suffix names."""
+    if (kind := path.suffix.lower().removeprefix(".")) in kinds:
+        return kind
     problem = f"is of the unknown kind {path.suffix!r}" if path.suffix else "has no suffix that tells its kind"
-    return InputError(place, problem, f"one of {', '.join(f'.{kind}' for kind in kinds)}")
+    raise InputError(place, problem, f"one of {', '.join(f'.{kind}' for kind in kinds)}")

@@ -10,8 +10,9 @@ guessed.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import accumulate
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,14 +31,12 @@ class RecordLayout:
     n: int
     values: int
     size: int
-    columns: tuple[int, ...] = field(repr=False)
-    offsets: tuple[int, ...] = field(repr=False)
-    formats: tuple[str, ...] = field(repr=False)
+    columns: tuple[int, ...]
+    offsets: tuple[int, ...]
+    formats: tuple[str, ...]
 
     @classmethod
-    def of(
-        cls, place: str, n: int, names: Sequence[str], formats: Sequence[str], counts: Sequence[int]
-    ) -> RecordLayout:
+    def of(cls, place: str, n: int, names: Sequence[str], formats: Sequence[str], counts: Sequence[int]) -> Self:
         """From the fields in their order; ``formats`` are numpy's, with byte order."""
         if n == 0:
             raise InputError(place, "holds no points, says its header", "at least one return")

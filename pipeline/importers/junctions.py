@@ -67,20 +67,14 @@ class Junction:
 
 @dataclass(frozen=True)
 class Streets:
-    """What is needed of a network: where vehicles drive, its junctions, its projection.
+    """A network, its junctions, and where vehicles drive.
 
-    ``road_areas`` are those of the network's roads in their order, ``inside`` are the lanes within junctions.
+    ``areas`` is the carriageway in pieces: the lanes of each edge, also of those inside junctions, at their full width.
     """
 
     network: Network
-    road_areas: tuple[BaseGeometry, ...]
-    inside: tuple[BaseGeometry, ...]
+    areas: dict[str, BaseGeometry]
     junctions: tuple[Junction, ...]
-
-    @property
-    def lane_areas(self) -> list[BaseGeometry]:
-        """The carriageway in pieces: all lanes, also those inside junctions, at their full width."""
-        return [*self.road_areas, *self.inside]
 
     @property
     def lane_length_m(self) -> float:
@@ -124,16 +118,10 @@ class KerbPlace:
 def read(path: Path) -> Streets:
     """Read a network that netconvert wrote from OpenStreetMap; InputError when it has no road."""
     network = read_network(path)
-    return Streets(
-        network,
-        tuple(_area(edge) for edge in network.edges),
-        tuple(_area(edge) for edge in network.all_edges if edge.function == "internal"),
-        tuple(
-            _junction(node, network.edges)
-            for node in network.junctions
-            if node.type not in ("internal", "dead_end") and node.incoming_lanes
-        ),
-    )
+    inside = [edge for edge in network.all_edges if edge.function == "internal"]
+    areas = {edge.id: _area(edge) for edge in (*network.edges, *inside)}
+    nodes = [n for n in network.junctions if n.type not in ("internal", "dead_end") and n.incoming_lanes]
+    return Streets(network, areas, tuple(_junction(node, network.edges) for node in nodes))
 
 
 def _area(edge: Edge) -> BaseGeometry:
@@ -194,7 +182,7 @@ def kerb_places(streets: Streets, junction: Junction, roi: Region, objects: Sequ
     """
     window = box(*roi.area.buffer(BEYOND_ROI_M, join_style="mitre").bounds)
     near = window.buffer(50.0)
-    everything = [*streets.lane_areas, *(j.area for j in streets.junctions)]
+    everything = [*streets.areas.values(), *(j.area for j in streets.junctions)]
     road = shapely.union_all([area for area in everything if area.intersects(near)])
     own = shapely.union_all([junction.area, *_approaches(streets, junction, window)]).buffer(1.5 * KERB_M)
     rim = shapely.intersection(_without_islands(road).buffer(KERB_M).boundary, window.intersection(own))
@@ -219,7 +207,7 @@ def _nearest(places: Sequence[XY], center: XY) -> list[XY]:
 
 def _approaches(streets: Streets, junction: Junction, window: BaseGeometry) -> list[BaseGeometry]:
     """The streets that one reaches from the junction without leaving the window, in either direction."""
-    roads = [(_ends(road), area) for road, area in zip(streets.network.edges, streets.road_areas, strict=True)]
+    roads = [(_ends(road), streets.areas[road.id]) for road in streets.network.edges]
     inside = {node.id for node in streets.network.junctions if window.covers(Point(node.at_m))}
     reached, grown = {junction.id}, True
     while grown:

@@ -11,7 +11,6 @@ used.
 from __future__ import annotations
 
 import dataclasses
-import itertools
 
 import shapely
 from shapely.geometry import Point
@@ -36,11 +35,9 @@ def collect(extract: Extract, streets: Streets) -> tuple[list[MappedSolid], Impo
     lats, lons = zip(*extract.nodes.values(), strict=True)
     xy = dict(zip(extract.nodes, streets.to_xy(lons, lats), strict=True))
     counts = ImportCounts()
-    lanes = shapely.STRtree(streets.lane_areas)
+    lanes = shapely.STRtree(list(streets.areas.values()))
     solids: list[MappedSolid] = []
-    for solid in itertools.chain(
-        buildings(extract, xy, counts), barriers(extract, xy, counts), poles(extract, xy, counts)
-    ):
+    for solid in (*buildings(extract, xy, counts), *barriers(extract, xy, counts), *poles(extract, xy, counts)):
         solids += _beside_carriageway(solid, lanes, counts)
     for trunk, crown in trees(extract, xy, counts):
         if _lanes_under(trunk, lanes):

@@ -187,12 +187,12 @@ def test_buildings_lie_where_the_network_says(made: Made, footprints: dict[str, 
     assert net.convertLonLat2XY(lon_deg, lat_deg) == pytest.approx(net.getNode("1").getCoord(), abs=0.01)
 
 
-def check_sites(folder: Path, spots: int) -> None:
+def check_sites(folder: Path, poles: int) -> None:
     """Sites stand beside the carriageway, clear of everything, in or near the region, at two heights each."""
     rows = sites_of(folder)
     places = [(float(row["x_m"]), float(row["y_m"])) for row in rows]
     assert [row["site"] for row in rows] == [f"k{i:02d}" for i in range(1, len(rows) + 1)]
-    assert len(rows) == 2 * spots and len(set(places)) == spots
+    assert len(rows) == 2 * poles and len(set(places)) == poles
     assert all(places.count(p) == 2 for p in places) and {row["z_m"] for row in rows} == {"3.0", "4.5"}
     lanes = lanes_of(folder)
     features = json.loads((folder / "statics.geojson").read_text(encoding="utf-8"))["features"]
