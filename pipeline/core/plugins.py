@@ -1,11 +1,11 @@
-"""Parts that other packages may add (effects, file formats) are found by their entry points and loaded only when asked
-for.
+"""Parts that other packages may add (effects, file formats) are found by their entry points, loaded when asked for.
 
 A group, e.g. ``egvs.point_clouds``, is a table of entry points: name -> ``module:object``. What this program brings
 itself is declared the same way, in its own ``pyproject.toml``. Where two packages declare one name, this program's own
 comes first, then the packages in the order of their names; so what is installed beside it cannot replace a part.
 
-https://packaging.python.org/en/latest/specifications/entry-points/"""
+https://packaging.python.org/en/latest/specifications/entry-points/
+"""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ def load(group: str, name: str) -> Any:
 
 @cache
 def _declared(group: str) -> dict[str, EntryPoint]:
-    found = sorted(entry_points(group=group), key=lambda entry: (_package(entry) != _OWN, _package(entry), entry.value))
-    return {entry.name: entry for entry in reversed(found)}
+    entries = sorted(entry_points(group=group), key=lambda e: (_package(e) != _OWN, _package(e), e.value))
+    return {entry.name: entry for entry in reversed(entries)}
 
 
 def _package(entry: EntryPoint) -> str:

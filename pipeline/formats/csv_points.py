@@ -1,5 +1,6 @@
 """CSV files of points are read: a header row with ``x_m, y_m, z_m`` in any order, then one return a row; further
-columns are ignored. Frame: the world's, metres."""
+columns are ignored. Frame: the world's, metres.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """LAS and LAZ files are read through laspy (``pip install egvs[las]``): the scaled coordinates, as the file gives them.
 
-Frame: a file in a map projection is in the world frame only when the scenario is in the same projection."""
+Frame: a file in a map projection is in the world frame only when the scenario is in the same projection.
+"""
 
 from __future__ import annotations
 

@@ -2,12 +2,13 @@
 they are called.
 
 Steps of :func:`read`: check what osmium would let pass (XML only); let osmium read the objects; keep what is needed:
-positions of nodes, tagged nodes, ways, relations, the extract's bounds. :func:`streets_xml` writes the streets alone,
-for netconvert: so SUMO sees only what was checked here. :func:`write_xml` writes all of a PBF file as XML.
+positions of nodes, tagged nodes, ways, relations, the extract's bounds. :func:`write_streets` writes the streets
+alone, for netconvert: so SUMO sees only what was checked here. :func:`write_xml` writes all of a PBF file as XML.
 
 Frame: latitude and longitude in degrees (WGS 84), whole numbers of 1e-7 degree (1 cm), as OpenStreetMap keeps them.
 Objects are sorted by their identifiers, so that the order in the file changes nothing. The meaning of tags:
-https://wiki.openstreetmap.org/wiki/Map_features."""
+https://wiki.openstreetmap.org/wiki/Map_features.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +19,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
-from xml.sax.saxutils import quoteattr
 
 from pipeline.core.errors import InputError
 from pipeline.formats import safe_xml
@@ -79,8 +79,7 @@ class Bounds:
 
 @dataclass(frozen=True)
 class Extract:
-    """An OpenStreetMap file, read. ``declared`` is false where it names no bounds (then ``bounds`` are those of its
-    nodes)."""
+    """An OpenStreetMap file, read; ``bounds`` are those that it has ``declared``, else those of its nodes."""
 
     nodes: dict[int, tuple[float, float]]
     node_tags: dict[int, Tags]
@@ -151,27 +150,25 @@ def write_xml(path: Path, xml: Path) -> None:
                     writer.add(o)
 
 
-def streets_xml(extract: Extract) -> str:
-    """The extract's streets (ways with ``highway``), their nodes, and the turn restrictions, as an OpenStreetMap
-    file."""
+def write_streets(extract: Extract, xml: Path) -> None:
+    """Write the streets (ways with ``highway``), their nodes, and the turn restrictions as an OpenStreetMap file."""
+    import osmium
+    from osmium.osm import mutable
+
     streets = [way for way in extract.ways.values() if "highway" in way.tags]
-    lines = ['<?xml version="1.0" encoding="UTF-8"?>', '<osm version="0.6">']
-    for node in sorted({n for way in streets for n in way.nodes if n in extract.nodes}):
-        lat_deg, lon_deg = extract.nodes[node]
-        lines.append(f'<node id="{node}" lat="{lat_deg!r}" lon="{lon_deg!r}">')
-        lines += [*_tag_lines(extract.node_tags.get(node, {})), "</node>"]
-    for way in streets:
-        lines += [f'<way id="{way.id}">', *(f'<nd ref="{n}"/>' for n in way.nodes if n in extract.nodes)]
-        lines += [*_tag_lines(way.tags), "</way>"]
-    for relation in extract.relations:
-        if relation.tags.get("type") == "restriction":
-            lines.append(f'<relation id="{relation.id}">')
-            lines += [
-                f'<member type={quoteattr(kind)} ref="{ref}" role={quoteattr(role)}/>'
-                for kind, ref, role in relation.members
-            ]
-            lines += [*_tag_lines(relation.tags), "</relation>"]
-    return "\n".join([*lines, "</osm>", ""])
+    with osmium.SimpleWriter(osmium.io.File(xml, "osm")) as writer:
+        for node in sorted({n for way in streets for n in way.nodes if n in extract.nodes}):
+            lat_deg, lon_deg = extract.nodes[node]
+            tags = sorted(extract.node_tags.get(node, {}).items())
+            writer.add_node(mutable.Node(id=node, location=(lon_deg, lat_deg), tags=tags))
+        for way in streets:
+            nodes = [n for n in way.nodes if n in extract.nodes]
+            writer.add_way(mutable.Way(id=way.id, nodes=nodes, tags=sorted(way.tags.items())))
+        for relation in extract.relations:
+            if relation.tags.get("type") == "restriction":
+                members = [(kind[0], ref, role) for kind, ref, role in relation.members]
+                tags = sorted(relation.tags.items())
+                writer.add_relation(mutable.Relation(id=relation.id, members=members, tags=tags))
 
 
 def length_m(text: str) -> float | None:
@@ -204,9 +201,8 @@ def _opened(path: Path) -> Iterator[osmium.FileProcessor]:
     try:
         yield osmium.FileProcessor(osmium.io.File(path, kind))
     except (RuntimeError, ValueError, osmium.InvalidLocationError) as error:
-        raise InputError(
-            path, f"cannot be read as OpenStreetMap data ({error})", "a whole file; fetch it again"
-        ) from None
+        problem = f"cannot be read as OpenStreetMap data ({error})"
+        raise InputError(path, problem, "a whole file; fetch it again") from None
 
 
 def _bounds(box: osmium.osm.Box, nodes: dict[int, tuple[float, float]]) -> Bounds:
@@ -218,8 +214,10 @@ def _bounds(box: osmium.osm.Box, nodes: dict[int, tuple[float, float]]) -> Bound
 
 
 def _check_xml(path: Path) -> frozenset[tuple[str, int]]:
-    """Refuse what osmium would take for 0, or complain of without naming the object; find what an editor has marked as
-    deleted, which osmium does not see: (first letter of its type, identifier)."""
+    """Refuse what osmium would take for 0, or complain of without naming the object.
+
+    Returns what an editor has marked as deleted, which osmium does not see: (first letter of its type, identifier).
+    """
     deleted = set()
     for element in safe_xml.children(path, "osm"):
         name = element.get("id", "")
@@ -253,7 +251,3 @@ def _degrees(path: Path, key: str, text: str | None, limit: float) -> None:
         value = math.nan
     if not abs(value) <= limit:
         raise InputError(f"{path}: {key}", repr(text), f"degrees from {-limit:g} to {limit:g}")
-
-
-def _tag_lines(tags: Tags) -> list[str]:
-    return [f"<tag k={quoteattr(key)} v={quoteattr(value)}/>" for key, value in sorted(tags.items())]

@@ -95,13 +95,11 @@ def _layout(place: str, header: dict[str, list[str]]) -> RecordLayout:
     formats = []
     for name, kind, size in zip(names, words["TYPE"], words["SIZE"], strict=True):
         if whole_number(place, f"the SIZE of {name}", [size]) not in _SIZES.get(kind, ()):
-            raise InputError(
-                place, f"field {name!r} has TYPE {kind} and SIZE {size}", "F of 4 or 8, I or U of 1, 2, 4 or 8"
-            )
+            problem = f"field {name!r} has TYPE {kind} and SIZE {size}"
+            raise InputError(place, problem, "F of 4 or 8, I or U of 1, 2, 4 or 8")
         formats.append(f"<{kind.lower()}{size}")
-    counts = [
-        whole_number(place, f"the COUNT of {name}", [count]) for name, count in zip(names, words["COUNT"], strict=True)
-    ]
+    named_counts = zip(names, words["COUNT"], strict=True)
+    counts = [whole_number(place, f"the COUNT of {name}", [count]) for name, count in named_counts]
     return RecordLayout.of(place, _count(place, header), names, formats, counts)
 
 
@@ -137,9 +135,8 @@ def _to_world(points: NDArray[np.float64], viewpoint: tuple[float, ...]) -> NDAr
     )
     px, py, pz = points.T
     with np.errstate(invalid="ignore", over="ignore"):  # what is not finite stays so, and is dropped
-        return np.stack(
-            [a * px + b * py + c * pz + t for (a, b, c), t in zip(rotation, (tx, ty, tz), strict=True)], axis=1
-        )
+        rows = [a * px + b * py + c * pz + t for (a, b, c), t in zip(rotation, (tx, ty, tz), strict=True)]
+    return np.stack(rows, axis=1)
 
 
 def _unpacked(place: str, body: bytes, need: int) -> bytes:
@@ -162,7 +159,8 @@ def _lzf(packed: bytes, size: int) -> bytes | None:
 
     A control byte c below 32 is followed by c + 1 plain bytes. Any other copies from what is already there: its upper
     three bits are the length less 2 (7: another byte adds to it), its lower five and one byte more the distance back,
-    less 1."""
+    less 1.
+    """
     out, at, end = bytearray(), 0, len(packed)
     try:
         while at < end:

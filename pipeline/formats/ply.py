@@ -2,7 +2,8 @@
 vertices' x, y and z is ignored, faces included.
 
 Frame: the world's, metres. Read by hand, because plyfile narrows text to the header's float, takes a file with more
-points than its header says, and reads all faces only to have them thrown away."""
+points than its header says, and reads all faces only to have them thrown away.
+"""
 
 from __future__ import annotations
 

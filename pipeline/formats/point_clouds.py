@@ -7,7 +7,8 @@ guessed.
 A format is an entry point of the group ``egvs.point_clouds``: its name is the suffix without the dot, its object has
 ``read`` and perhaps ``write`` (:class:`PointFormat`). Here, each is a module of its own; other packages may add theirs.
 
-Frame: the world's (right-handed, x east, y north, z up), metres, float64."""
+Frame: the world's (right-handed, x east, y north, z up), metres, float64.
+"""
 
 from __future__ import annotations
 
@@ -66,21 +67,17 @@ def read_points(path: Path, place: str) -> tuple[NDArray[np.float64], int]:
         When the file is missing, of an unknown kind, damaged, or without one finite point.
     """
     place = place if path.name in place else ": ".join(filter(None, (place, str(path))))
-    if (kind := _kind(path)) not in plugins.names(GROUP):
-        raise _unknown(place, path, plugins.names(GROUP))
-    point_format: PointFormat = plugins.load(GROUP, kind)
+    point_format: PointFormat = plugins.load(GROUP, _kind(place, path, plugins.names(GROUP)))
     try:
         points = point_format.read(path, place)
     except OSError as error:
-        raise InputError(
-            place, f"cannot be read ({error.strerror or error})", "a file that is there and may be read"
-        ) from None
+        problem = f"cannot be read ({error.strerror or error})"
+        raise InputError(place, problem, "a file that is there and may be read") from None
     finite = np.isfinite(points).all(axis=1)
     dropped = len(points) - int(np.count_nonzero(finite))
     if dropped == len(points):
-        raise InputError(
-            place, f"holds no finite point (of {len(points)})", "at least one return with finite x, y and z"
-        )
+        right = "at least one return with finite x, y and z"
+        raise InputError(place, f"holds no finite point (of {len(points)})", right)
     return (points[finite] if dropped else points), dropped
 
 
@@ -103,18 +100,16 @@ def write_points(path: Path, points_m: NDArray[np.float64]) -> None:
     writable: dict[str, WritableFormat] = {
         name: loaded for name in plugins.names(GROUP) if hasattr(loaded := plugins.load(GROUP, name), "write")
     }
-    if (kind := _kind(path)) not in writable:
-        raise _unknown(path, path, list(writable))
+    kind = _kind(path, path, list(writable))
     if points_m.ndim != 2 or points_m.shape[1] != 3:
         raise ValueError(f"points_m has the shape {points_m.shape}, not (n, 3)")
     with aside(path) as partial:
         writable[kind].write(partial, points_m)
 
 
-def _kind(path: Path) -> str:
-    return path.suffix.lower().removeprefix(".")
-
-
-def _unknown(place: object, path: Path, kinds: list[str]) -> InputError:
+def _kind(place: object, path: Path, kinds: list[str]) -> str:
+    """Which of the kinds the suffix names."""
+    if (kind := path.suffix.lower().removeprefix(".")) in kinds:
+        return kind
     problem = f"is of the unknown kind {path.suffix!r}" if path.suffix else "has no suffix that tells its kind"
-    return InputError(place, problem, f"one of {', '.join(f'.{kind}' for kind in kinds)}")
+    raise InputError(place, problem, f"one of {', '.join(f'.{kind}' for kind in kinds)}")

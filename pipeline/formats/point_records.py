@@ -4,13 +4,15 @@ records, or from blocks of one field each.
 Steps: the header's fields give a :class:`RecordLayout`; it checks that x, y and z are there once and that the data are
 as long as the header says; its three readers return the points as float64, (n, 3), in the file's order and frame. A
 text file's numbers are taken at float64 even where its header says float. What is not whole is refused; nothing is
-guessed."""
+guessed.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import accumulate
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,22 +31,19 @@ class RecordLayout:
     n: int
     values: int
     size: int
-    columns: tuple[int, ...] = field(repr=False)
-    offsets: tuple[int, ...] = field(repr=False)
-    formats: tuple[str, ...] = field(repr=False)
+    columns: tuple[int, ...]
+    offsets: tuple[int, ...]
+    formats: tuple[str, ...]
 
     @classmethod
-    def of(
-        cls, place: str, n: int, names: Sequence[str], formats: Sequence[str], counts: Sequence[int]
-    ) -> RecordLayout:
+    def of(cls, place: str, n: int, names: Sequence[str], formats: Sequence[str], counts: Sequence[int]) -> Self:
         """From the fields in their order; ``formats`` are numpy's, with byte order."""
         if n == 0:
             raise InputError(place, "holds no points, says its header", "at least one return")
         for axis in AXES:
             if names.count(axis) != 1 or counts[names.index(axis)] != 1:
-                raise InputError(
-                    place, f"has no single field {axis!r} (its fields: {' '.join(names) or 'none'})", "x, y and z"
-                )
+                problem = f"has no single field {axis!r} (its fields: {' '.join(names) or 'none'})"
+                raise InputError(place, problem, "x, y and z")
         first_columns = (0, *accumulate(counts))
         first_bytes = (0, *accumulate(np.dtype(f).itemsize * count for f, count in zip(formats, counts, strict=True)))
         at = [names.index(axis) for axis in AXES]
@@ -55,9 +54,8 @@ class RecordLayout:
         """Points from lines of text, the first of which is the file's line ``line``; ``skip`` records come before."""
         rows = [(number, row) for number, row in enumerate(text.splitlines(), line) if row.strip()][skip:]
         if len(rows) < self.n or (last and len(rows) > self.n):
-            raise InputError(
-                self.place, f"holds {len(rows)} lines of points", f"{self.n}, as its header says; a whole file"
-            )
+            right = f"{self.n}, as its header says; a whole file"
+            raise InputError(self.place, f"holds {len(rows)} lines of points", right)
         rows = rows[: self.n]
         try:
             table = np.loadtxt([row for _, row in rows], comments=None, encoding="latin-1", ndmin=2)
@@ -84,14 +82,12 @@ class RecordLayout:
 
     def _fault(self, rows: list[tuple[int, bytes]], error: str) -> InputError:
         for line, row in rows:
-            words = row.decode("latin-1").split()
+            words, place = row.decode("latin-1").split(), f"{self.place}: line {line}"
             if len(words) != self.values:
-                return InputError(
-                    f"{self.place}: line {line}", f"holds {len(words)} values", f"{self.values} in each line"
-                )
+                return InputError(place, f"holds {len(words)} values", f"{self.values} in each line")
             for word in words:
                 if number(word) is None:
-                    return InputError(f"{self.place}: line {line}", f"{word!r} is no number", A_NUMBER)
+                    return InputError(place, f"{word!r} is no number", A_NUMBER)
         return InputError(self.place, f"cannot be read as text ({error})", "numbers apart by spaces")
 
 

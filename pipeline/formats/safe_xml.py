@@ -2,7 +2,8 @@
 
 Steps: undo gzip where the first two bytes say so; parse with defusedxml, which refuses entities; hand out one child of
 the root at a time and forget it. Whatever is wrong with the file becomes an :class:`InputError` that names it (for a
-copy: that names what the user named)."""
+copy: that names what the user named).
+"""
 
 from __future__ import annotations
 
@@ -32,9 +33,8 @@ def opened(path: Path, name: Path | None = None) -> Iterator[IO[bytes]]:
         with gzip.open(path) if is_gzip(path) else path.open("rb") as file:
             yield cast(IO[bytes], file)
     except (EOFError, gzip.BadGzipFile, zlib.error) as error:
-        raise InputError(
-            name or path, f"is a damaged gzip file ({error})", "a whole file; fetch or make it again"
-        ) from None
+        problem = f"is a damaged gzip file ({error})"
+        raise InputError(name or path, problem, "a whole file; fetch or make it again") from None
 
 
 def children(path: Path, root: str, name: Path | None = None) -> Iterator[Element]:
@@ -47,32 +47,22 @@ def children(path: Path, root: str, name: Path | None = None) -> Iterator[Elemen
         is damaged.
     """
     from defusedxml.common import DefusedXmlException
+    from defusedxml.ElementTree import iterparse
 
     with opened(path, name) as file:
         path = name or path
+        events: Iterator[tuple[str, Any]] = iterparse(file, events=("start", "end"))
         try:
-            yield from _children(file, path, root)
+            _, top = next(events)
+            if root and top.tag != root:
+                raise InputError(path, f"its root is <{top.tag}>", f"a file whose root is <{root}>")
+            depth = 0
+            for event, element in events:
+                depth += 1 if event == "start" else -1
+                if event == "end" and depth == 0:
+                    yield element
+                    top.clear()
         except ParseError as error:
             raise InputError(path, f"is not well-formed XML: {error}", "a whole XML file") from None
         except DefusedXmlException:
             raise InputError(path, "declares XML entities, which are refused", "a file without them") from None
-
-
-def _children(file: IO[bytes], path: Path, root: str) -> Iterator[Element]:
-    from defusedxml.ElementTree import iterparse
-
-    depth, top = 0, None
-    events: Iterator[tuple[str, Any]] = iterparse(file, events=("start", "end"))
-    for event, element in events:
-        if event == "start":
-            depth += 1
-            if top is None:
-                top = element
-                if root and top.tag != root:
-                    raise InputError(path, f"its root is <{top.tag}>", f"a file whose root is <{root}>")
-        else:
-            depth -= 1
-            if depth == 1:
-                yield element
-                assert top is not None
-                top.clear()

@@ -5,7 +5,8 @@ Heights: the top as in :mod:`pipeline.importers.mapped_solids`;
     base = min_height     or building:min_level * 3 m      or 0
 
 Multipolygons are assembled here: osmium gives no area to a ring that crosses itself (here: repaired, and counted), nor
-to tags on the outer way alone."""
+to tags on the outer way alone.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +18,7 @@ from shapely.geometry.base import BaseGeometry
 
 from pipeline.formats.osm import Extract, Relation, Tags, length_m, number
 from pipeline.importers.mapped_solids import LEVEL_M, ImportCounts, MappedSolid, tag_value, top_of
-from pipeline.importers.shapes import GRID_M, XY, area_within, is_large_enough, pieces_of
+from pipeline.importers.shapes import XY, area_within, large_pieces_of
 
 BUILDING_M = 9.0
 ROOF_M, ROOF_THICKNESS_M = 5.0, 0.5
@@ -28,16 +29,15 @@ _TOWERS = {"tower", "chimney", "silo", "storage_tank", "water_tower", "gasometer
 
 def buildings(extract: Extract, xy: dict[int, XY], counts: ImportCounts) -> Iterator[MappedSolid]:
     """Outlines and parts; an outline stands only where none of its parts does."""
-    shapes = [*_multipolygons(extract, xy, counts), *_rings(extract, xy, counts)]
+    shapes = list(_shapes(extract, xy, counts))
     parts = [shape for shape in shapes if not _is_outline(shape[1])]
     tree = shapely.STRtree([area for _, _, area in parts])
     for name, tags, area in shapes:
         is_outline = _is_outline(tags)
         over = [parts[i][2] for i in tree.query(area, predicate="intersects")] if is_outline else []
         rest = area.difference(shapely.union_all(over)) if over else area
-        whole = pieces_of(shapely.set_precision(rest, GRID_M))
-        pieces = [piece for piece in whole if is_large_enough(piece)]
-        counts.slivers += len(whole) - len(pieces)
+        pieces, slivers = large_pieces_of(rest)
+        counts.slivers += slivers
         if not pieces:
             counts.drop("building", "covered_by_parts" if over else "degenerate")
             continue
@@ -54,7 +54,7 @@ def _is_building(tags: Tags) -> bool:
 
 
 def _is_underground(tags: Tags, counts: ImportCounts) -> bool:
-    under = tags.get("location") == "underground" or tags.get("building") == "underground"
+    under = "underground" in (tags.get("location"), tags.get("building"))
     if under:
         counts.drop("building", "underground")
     return under
@@ -77,12 +77,15 @@ def _building_height(tags: Tags, counts: ImportCounts) -> tuple[float, float, st
     return height_m, max(0.0, low_m), source, kind
 
 
-def _multipolygons(
-    extract: Extract, xy: dict[int, XY], counts: ImportCounts
-) -> Iterator[tuple[str, Tags, BaseGeometry]]:
+def _shapes(extract: Extract, xy: dict[int, XY], counts: ImportCounts) -> Iterator[tuple[str, Tags, BaseGeometry]]:
+    """Multipolygons, then closed ways that are not outer ways of these: name, tags, area."""
+    outer_ways = set[int]()
     for relation in extract.relations:
         tags = _relation_tags(relation, extract)
-        if tags is None or _is_underground(tags, counts):
+        if tags is None:
+            continue
+        outer_ways.update(relation.ways("outer", ""))
+        if _is_underground(tags, counts):
             continue
         outer = _assembled(relation.ways("outer", ""), extract, xy, counts)
         inner = _assembled(relation.ways("inner"), extract, xy, counts)
@@ -90,6 +93,13 @@ def _multipolygons(
             counts.drop("building", "incomplete")
         else:
             yield f"relation/{relation.id}", tags, outer.difference(inner)
+    for way in extract.ways.values():
+        if way.id in outer_ways or not _is_building(way.tags) or _is_underground(way.tags, counts):
+            continue
+        if not way.closed or any(n not in xy for n in way.nodes):
+            counts.drop("building", "incomplete")
+        else:
+            yield f"way/{way.id}", way.tags, area_within(way, xy, counts)
 
 
 def _relation_tags(relation: Relation, extract: Extract) -> Tags | None:
@@ -116,20 +126,3 @@ def _assembled(ways: list[int], extract: Extract, xy: dict[int, XY], counts: Imp
             return None
         areas.append(shapely.union_all(rings))
     return shapely.union_all(areas)
-
-
-def _rings(extract: Extract, xy: dict[int, XY], counts: ImportCounts) -> Iterator[tuple[str, Tags, BaseGeometry]]:
-    """Buildings that are single closed ways, but not the outer ways of multipolygons."""
-    outer = {
-        way
-        for relation in extract.relations
-        if _relation_tags(relation, extract) is not None
-        for way in relation.ways("outer", "")
-    }
-    for way in extract.ways.values():
-        if way.id in outer or not _is_building(way.tags) or _is_underground(way.tags, counts):
-            continue
-        if not way.closed or any(n not in xy for n in way.nodes):
-            counts.drop("building", "incomplete")
-        else:
-            yield f"way/{way.id}", way.tags, area_within(way, xy, counts)

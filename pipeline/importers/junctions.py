@@ -1,7 +1,7 @@
 """A junction is chosen here, the region of interest laid round it, and places for poles are found along its kerbs.
 
-Steps: read lanes, junctions and the projection from a SUMO network -> :class:`Streets`; :func:`choose_junction`;
-:func:`region_round` it; :func:`kerb_places` along the carriageway's rim.
+Steps: a SUMO network's lanes and junctions -> :class:`Streets`; :func:`choose_junction`; :func:`region_round` it;
+:func:`kerb_places` along the carriageway's rim.
 
 World frame: the network's own x, y in metres. Longitude and latitude become x, y by the network's ``<location>``, as
 netconvert did:
@@ -11,20 +11,21 @@ netconvert did:
 
 from __future__ import annotations
 
+import html
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from xml.etree.ElementTree import Element
 
+import numpy as np
 import shapely
 from shapely.geometry import LineString, Point, Polygon, box
 from shapely.geometry.base import BaseGeometry
 
-from pipeline.core.errors import InputError
-from pipeline.formats import safe_xml
-
-XY = tuple[float, float]
+from pipeline.importers.shapes import XY
+from pipeline.traffic.network import LANE_WIDTH_M, Edge, Network
+from pipeline.traffic.network import Junction as Node
+from pipeline.traffic.network import read as read_network
 
 ROI_LEAST_M, ROI_MOST_M, ROI_STEP_M, ROI_HEIGHT_M = 60.0, 120.0, 10.0, 5.0
 APPROACH_M = 20.0
@@ -37,8 +38,6 @@ CLEARANCE_M = 1.0
 BEYOND_ROI_M = 5.0
 HEIGHTS_M = (3.0, 4.5)
 MOST_PLACES = 12
-LANE_WIDTH_M = 3.2
-"""SUMO's default."""
 
 _HAIR_M = 0.01
 _ISLAND_M2 = 100.0
@@ -67,45 +66,30 @@ class Junction:
 
 
 @dataclass(frozen=True)
-class Street:
-    """A road in one direction: the nodes that it joins, and its lanes at their full width."""
-
-    ends: tuple[str, str]
-    area: BaseGeometry
-    name: str
-    lane_length_m: float
-
-
-@dataclass(frozen=True)
 class Streets:
-    """What is needed of a network: where vehicles drive, its junctions, its projection.
+    """A network, its junctions, and where vehicles drive.
 
-    ``inside`` are the lanes within junctions; ``nodes_m`` places each node, also those that are no junction.
+    ``areas`` is the carriageway in pieces: the lanes of each edge, also of those inside junctions, at their full width.
     """
 
-    streets: tuple[Street, ...]
-    inside: tuple[BaseGeometry, ...]
-    nodes_m: dict[str, XY]
+    network: Network
+    areas: dict[str, BaseGeometry]
     junctions: tuple[Junction, ...]
-    projection: str
-    offset_m: XY
-
-    @property
-    def lane_areas(self) -> list[BaseGeometry]:
-        """The carriageway in pieces: all lanes, also those inside junctions, at their full width."""
-        return [*(s.area for s in self.streets), *self.inside]
 
     @property
     def lane_length_m(self) -> float:
         """All lanes outside junctions, one after another."""
-        return math.fsum(s.lane_length_m for s in self.streets)
+        return math.fsum(lane.length_m for road in self.network.edges for lane in road.lanes)
 
     def to_xy(self, lons_deg: Sequence[float], lats_deg: Sequence[float]) -> list[XY]:
         """World-frame x, y in metres of positions in degrees."""
         from pyproj import Proj
 
-        xs, ys = Proj(self.projection)(list(lons_deg), list(lats_deg))
-        return [(x + self.offset_m[0], y + self.offset_m[1]) for x, y in zip(xs, ys, strict=True)]
+        location = self.network.location
+        assert location is not None, "netconvert writes it"
+        xs, ys = Proj(location.projection)(list(lons_deg), list(lats_deg))
+        east_m, north_m = location.offset_m
+        return [(x + east_m, y + north_m) for x, y in zip(xs, ys, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -132,65 +116,48 @@ class KerbPlace:
 
 
 def read(path: Path) -> Streets:
-    """Read a network that netconvert wrote from OpenStreetMap."""
-    streets: list[Street] = []
-    inside: list[BaseGeometry] = []
-    nodes: list[Element] = []
-    projection, offset_m = "", (0.0, 0.0)
-    for element in safe_xml.children(path, "net"):
-        function = element.get("function", "")
-        if element.tag == "location":
-            projection, offset_m = element.attrib["projParameter"], _points(element.attrib["netOffset"])[0]
-        elif element.tag == "edge" and function == "internal":
-            inside.append(_area(_lanes(element)))
-        elif element.tag == "edge" and not function:
-            ends = element.attrib["from"], element.attrib["to"]
-            length_m = math.fsum(float(lane.attrib["length"]) for lane in element.iter("lane"))
-            streets.append(Street(ends, _area(_lanes(element)), element.get("name", ""), length_m))
-        elif element.tag == "junction" and element.get("type") != "internal":
-            nodes.append(element)
-    nodes_m = {e.attrib["id"]: (float(e.attrib["x"]), float(e.attrib["y"])) for e in nodes}
-    junctions = tuple(
-        _junction(
-            e.attrib["id"], e.attrib["type"], nodes_m[e.attrib["id"]], _points(e.get("shape", "")),
-            len(e.get("incLanes", "").split()), streets,
-        )
-        for e in nodes
-        if e.get("type") != "dead_end" and e.get("incLanes")
-    )  # fmt: skip
-    return Streets(tuple(streets), tuple(inside), nodes_m, junctions, projection, offset_m)
+    """Read a network that netconvert wrote from OpenStreetMap; InputError when it has no road."""
+    network = read_network(path)
+    inside = [edge for edge in network.all_edges if edge.function == "internal"]
+    areas = {edge.id: _area(edge) for edge in (*network.edges, *inside)}
+    nodes = [n for n in network.junctions if n.type not in ("internal", "dead_end") and n.incoming_lanes]
+    return Streets(network, areas, tuple(_junction(node, network.edges) for node in nodes))
 
 
-def _lanes(edge: Element) -> list[tuple[list[XY], float]]:
-    """Middle line and width of each lane; pavements are none."""
-    return [
-        (_points(lane.attrib["shape"]), float(lane.get("width", LANE_WIDTH_M)))
-        for lane in edge.iter("lane")
-        if lane.get("allow") != "pedestrian"
-    ]
+def _area(edge: Edge) -> BaseGeometry:
+    """An edge's lanes at their full width; pavements are none."""
+    return shapely.union_all([
+        LineString(lane.shape_m[:, :2]).buffer((lane.width_m or LANE_WIDTH_M) / 2, cap_style="flat")
+        for lane in edge.lanes
+        if lane.permission.allow != frozenset({"pedestrian"}) and len(np.unique(lane.shape_m, axis=0)) > 1
+    ])  # fmt: skip
 
 
-def _points(text: str) -> list[XY]:
-    try:
-        return [(float(x), float(y)) for x, y, *_ in (pair.split(",") for pair in text.split())]
-    except ValueError:
-        raise InputError("network", f"a shape holds no coordinates ({text[:40]!r})", "what netconvert writes") from None
+def _junction(node: Node, roads: Sequence[Edge]) -> Junction:
+    """A node of the network, with what meets there."""
+    corners_m = node.shape_m[:, :2]
+    area = shapely.make_valid(Polygon(corners_m)) if len(corners_m) >= 3 else Point(node.at_m).buffer(1.0)
+    meeting = [road for road in roads if node.id in _ends(road)]
+    arms = {end for road in meeting for end in _ends(road)} - {node.id}
+    names = sorted({html.unescape(road.name) for road in meeting if road.name})  # netconvert escapes names twice
+    signalised = node.type.startswith("traffic_light")
+    return Junction(node.id, node.at_m, area, len(node.incoming_lanes), len(arms), signalised, tuple(names))
+
+
+def _ends(road: Edge) -> tuple[str, str]:
+    return road.from_node, road.to_node
 
 
 def choose_junction(streets: Streets, at_m: XY | None) -> Junction | None:
     """The signalised junction nearest to ``at_m``, or the largest; one without signals only where there is no other.
 
     A junction is where at least three streets meet, so that the signals of a mere crossing for pedestrians do not
-    count, unless nothing else is there."""
+    count, unless nothing else is there.
+    """
     met = [j for j in streets.junctions if j.arms >= 3]
-    groups = (
-        [j for j in met if j.signalised],
-        [j for j in streets.junctions if j.signalised],
-        met,
-        streets.junctions,
-    )
-    among = next((group for group in groups if group), None)
-    if among is None:
+    signalised = [j for j in streets.junctions if j.signalised]
+    among = [j for j in met if j.signalised] or signalised or met or streets.junctions
+    if not among:
         return None
     if at_m is None:
         return min(among, key=lambda j: (-j.lanes_in, -j.area.area, j.id))
@@ -211,10 +178,11 @@ def kerb_places(streets: Streets, junction: Junction, roi: Region, objects: Sequ
     They stand ``KERB_M`` outside the carriageway (rounded to 0.1 m, never nearer than ``KERB_LEAST_M``),
     ``CLEARANCE_M`` from every object, about ``SPACING_M`` apart along the kerb and never nearer to each other than half
     of it. Islands smaller than 100 m2 count as carriageway. Of more than ``MOST_PLACES`` places, the nearest to the
-    junction are taken."""
+    junction are taken.
+    """
     window = box(*roi.area.buffer(BEYOND_ROI_M, join_style="mitre").bounds)
     near = window.buffer(50.0)
-    everything = [*streets.lane_areas, *(j.area for j in streets.junctions)]
+    everything = [*streets.areas.values(), *(j.area for j in streets.junctions)]
     road = shapely.union_all([area for area in everything if area.intersects(near)])
     own = shapely.union_all([junction.area, *_approaches(streets, junction, window)]).buffer(1.5 * KERB_M)
     rim = shapely.intersection(_without_islands(road).buffer(KERB_M).boundary, window.intersection(own))
@@ -239,13 +207,14 @@ def _nearest(places: Sequence[XY], center: XY) -> list[XY]:
 
 def _approaches(streets: Streets, junction: Junction, window: BaseGeometry) -> list[BaseGeometry]:
     """The streets that one reaches from the junction without leaving the window, in either direction."""
-    inside = {node for node, at_m in streets.nodes_m.items() if window.covers(Point(at_m))}
+    roads = [(_ends(road), streets.areas[road.id]) for road in streets.network.edges]
+    inside = {node.id for node in streets.network.junctions if window.covers(Point(node.at_m))}
     reached, grown = {junction.id}, True
     while grown:
-        ends = {end for s in streets.streets if reached & inside & set(s.ends) for end in s.ends}
-        grown = not ends <= reached
-        reached |= ends
-    return [s.area for s in streets.streets if (reached & inside | {junction.id}) & set(s.ends)]
+        met = {end for ends, _ in roads if reached & inside & set(ends) for end in ends}
+        grown = not met <= reached
+        reached |= met
+    return [area for ends, area in roads if (reached & inside | {junction.id}) & set(ends)]
 
 
 def _along(line: LineString, forbidden: BaseGeometry, window: BaseGeometry) -> list[XY]:
@@ -272,20 +241,3 @@ def _without_islands(area: BaseGeometry) -> BaseGeometry:
 def _lines(rim: BaseGeometry) -> list[LineString]:
     merged = shapely.line_merge(rim) if rim.geom_type == "MultiLineString" else rim
     return [line for line in shapely.get_parts(shapely.normalize(merged)) if isinstance(line, LineString)]
-
-
-def _junction(
-    name: str, kind: str, at_m: XY, corners_m: Sequence[XY], lanes_in: int, streets: Sequence[Street]
-) -> Junction:
-    area = shapely.make_valid(Polygon(corners_m)) if len(corners_m) >= 3 else Point(at_m).buffer(1.0)
-    meeting = [s for s in streets if name in s.ends]
-    arms = {end for s in meeting for end in s.ends} - {name}
-    names = tuple(sorted({s.name for s in meeting if s.name}))
-    return Junction(name, at_m, area, lanes_in, len(arms), kind.startswith("traffic_light"), names)
-
-
-def _area(lanes: Sequence[tuple[Sequence[XY], float]]) -> BaseGeometry:
-    """Lanes at their full width."""
-    return shapely.union_all([
-        LineString(points).buffer(width_m / 2, cap_style="flat") for points, width_m in lanes if len(set(points)) > 1
-    ])  # fmt: skip

@@ -4,7 +4,8 @@ Heights (Simple 3D Buildings, https://wiki.openstreetmap.org/wiki/Simple_3D_Buil
 
     top  = height         or building:levels * 3 m         or the default of the kind (a building: 9 m)
 
-Frame: the network's x (east), y (north) in metres; heights in metres above the flat ground."""
+Frame: the network's x (east), y (north) in metres; heights in metres above the flat ground.
+"""
 
 from __future__ import annotations
 
@@ -44,21 +45,13 @@ class MappedSolid:
 
     def to_geojson(self) -> dict[str, Any]:
         """A GeoJSON feature in world-frame metres."""
-        properties: dict[str, Any] = {
-            "name": self.name,
-            "kind": self.kind,
-            "height_m": round(self.height_m, 3),
-        }
+        properties = {"name": self.name, "kind": self.kind, "height_m": round(self.height_m, 3)}
         if self.base_m:
             properties["base_m"] = round(self.base_m, 3)
         if self.radius_m is not None:
             properties["radius_m"] = round(self.radius_m, 3)
         properties["height_from"] = self.height_source
-        return {
-            "type": "Feature",
-            "properties": properties,
-            "geometry": shapely.geometry.mapping(self.geometry),
-        }
+        return {"type": "Feature", "properties": properties, "geometry": shapely.geometry.mapping(self.geometry)}
 
 
 @dataclass

@@ -15,8 +15,6 @@ The same extract gives the same bytes: no dates, no paths, objects sorted.
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import re
 import shutil
@@ -31,7 +29,7 @@ import tomlkit
 from pydantic import TypeAdapter, ValidationError
 
 from pipeline.core.errors import InputError, RunError
-from pipeline.formats.osm import Extract, streets_xml
+from pipeline.formats.osm import Extract, write_streets
 from pipeline.formats.osm import read as read_extract
 from pipeline.importers import junctions, solids
 from pipeline.importers.buildings import BUILDING_M
@@ -55,7 +53,8 @@ NETCONVERT = (
 """How streets become a network.
 
 Measured on a town with 19 km of lanes: 50 and 80 vehicles are held for 5000 frames without grid-lock. Without
-turnarounds, or with larger junctions, there are more overlaps, and grid-locks. """
+turnarounds, or with larger junctions, there are more overlaps, and grid-locks.
+"""
 
 LANE_PER_VEHICLE_M = 250.0
 VEHICLES_LEAST, VEHICLES_MOST = 5, 50
@@ -63,8 +62,7 @@ VEHICLES_LEAST, VEHICLES_MOST = 5, 50
 
 @dataclass(frozen=True)
 class NewScenario:
-    """What :func:`new` made, for the user. ``sites`` counts poles times heights, ``notes`` say what to know before
-    trusting the scenario."""
+    """What :func:`new` made; ``sites`` counts poles times heights, ``notes`` say what to know before trusting it."""
 
     folder: Path
     junction: Junction
@@ -77,8 +75,7 @@ class NewScenario:
     @property
     def vehicles(self) -> int:
         """How many the network takes without grid-lock."""
-        fitting = round(self.streets.lane_length_m / LANE_PER_VEHICLE_M)
-        return min(max(fitting, VEHICLES_LEAST), VEHICLES_MOST)
+        return min(max(round(self.streets.lane_length_m / LANE_PER_VEHICLE_M), VEHICLES_LEAST), VEHICLES_MOST)
 
     def to_json(self) -> dict[str, Any]:
         """All of it as plain JSON, in the order of interest."""
@@ -92,7 +89,7 @@ class NewScenario:
             },
             "roi": {"center_m": [*self.roi.center_m, ROI_HEIGHT_M / 2], "size_m": [*self.roi.size_m, ROI_HEIGHT_M]},
             "network": {
-                "edges": len(streets.streets), "lane_length_m": round(streets.lane_length_m),
+                "edges": len(streets.network.edges), "lane_length_m": round(streets.lane_length_m),
                 "signalised_junctions": sum(j.signalised for j in streets.junctions),
             },
             "vehicles": self.vehicles,
@@ -127,19 +124,15 @@ def new(folder: Path, osm: Path, at: tuple[float, float] | None = None, lefthand
     _check_at(extract, at)
     network, streets = _network(extract, osm, lefthand)
     junction, roi = _junction(streets, osm, at)
-    mapped, counts = solids.collect(extract, streets.to_xy, streets.lane_areas)
+    mapped, counts = solids.collect(extract, streets)
     places = junctions.kerb_places(streets, junction, roi, [solid.area for solid in mapped])
     if not places:
         problem = f"no place for a pole is free along the kerbs of the {junction.title}"
         raise InputError(osm, problem, "another junction: --at LAT,LON")
     notes = _notes(junction, roi, counts)
     made = NewScenario(folder, junction, roi, streets, len(places) * len(HEIGHTS_M), counts, notes)
-    _publish(folder, {
-        NETWORK: network,
-        STATICS: _geojson(mapped, counts),
-        SITES: _sites(places),
-        FILE: _toml(name, made),
-    })  # fmt: skip
+    files = {NETWORK: network, STATICS: _geojson(mapped, counts), SITES: _sites(places), FILE: _toml(name, made)}
+    _publish(folder, files)
     return made
 
 
@@ -160,10 +153,8 @@ def _check_folder(folder: Path) -> str:
 def _check_at(extract: Extract, at: tuple[float, float] | None) -> None:
     if at is not None and not extract.bounds.holds(*at):
         b = extract.bounds
-        raise InputError(
-            "--at", f"{at[0]:g},{at[1]:g} lies outside the extract",
-            f"latitude {b.south_deg:g} to {b.north_deg:g}, longitude {b.west_deg:g} to {b.east_deg:g}",
-        )  # fmt: skip
+        right = f"latitude {b.south_deg:g} to {b.north_deg:g}, longitude {b.west_deg:g} to {b.east_deg:g}"
+        raise InputError("--at", f"{at[0]:g},{at[1]:g} lies outside the extract", right)
 
 
 # --- network --------------------------------------------------------------------------------------------------------
@@ -171,24 +162,21 @@ def _check_at(extract: Extract, at: tuple[float, float] | None) -> None:
 
 def _network(extract: Extract, osm: Path, lefthand: bool) -> tuple[str, Streets]:
     """The SUMO network as text, and what is in it."""
-    missing = InputError(
-        osm, "has no drivable streets that meet", "an extract with streets for cars (ways with highway=...)"
-    )
+    right = "an extract with streets for cars (ways with highway=...)"
+    missing = InputError(osm, "has no drivable streets that meet", right)
     if not any("highway" in way.tags for way in extract.ways.values()):
         raise missing
     with tempfile.TemporaryDirectory() as name:
         work = Path(name)
-        (work / "streets.osm.xml").write_text(streets_xml(extract), encoding="utf-8")
+        write_streets(extract, work / "streets.osm.xml")
         flags = [*NETCONVERT, *_boundary(extract), *(["--lefthand"] if lefthand else [])]
         try:
             sumo.run("netconvert", ["--osm-files", "streets.osm.xml", *flags, "-o", NETWORK], work)
-        except RunError as error:
-            if re.search(r"No (nodes|edges) loaded", str(error)):
+            streets = junctions.read(work / NETWORK)
+        except (RunError, InputError) as error:
+            if re.search(r"No (nodes|edges) loaded|has no road", str(error)):
                 raise missing from None
             raise
-        streets = junctions.read(work / NETWORK)
-        if not streets.streets:
-            raise missing
         return _without_header((work / NETWORK).read_text(encoding="utf-8")), streets
 
 
@@ -243,13 +231,9 @@ def _geojson(mapped: Sequence[MappedSolid], counts: ImportCounts) -> str:
 
 
 def _sites(places: Sequence[KerbPlace]) -> str:
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(("site", "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg", "sensor"))
-    rows = [(place, z_m) for place in places for z_m in HEIGHTS_M]
-    for number, (place, z_m) in enumerate(rows, 1):
-        table.writerow((f"k{number:02d}", place.x_m, place.y_m, z_m, place.yaw_deg, 0.0, 0.0, SENSOR))
-    return text.getvalue()
+    header = "site,x_m,y_m,z_m,yaw_deg,pitch_deg,roll_deg,sensor"
+    rows = [f"{p.x_m},{p.y_m},{z_m},{p.yaw_deg},0.0,0.0,{SENSOR}" for p in places for z_m in HEIGHTS_M]
+    return "\n".join([header, *(f"k{number:02d},{row}" for number, row in enumerate(rows, 1)), ""])
 
 
 def _toml(name: str, made: NewScenario) -> str:
@@ -261,7 +245,6 @@ def _toml(name: str, made: NewScenario) -> str:
     title = made.junction.title
     document.update({"name": name} if name else {})
     document.update({"description": title[0].upper() + title[1:], "seed": 1})
-    lanes_km = made.streets.lane_length_m / 1000
     traffic = {key: TrafficModel.model_fields[key].default for key in ("frames", "frame_period_s", "warmup_s")}
     tables: dict[str, tuple[str, dict[str, Any]]] = {
         "roi": ("the box whose visibility counts; its size is a whole number of voxels along each axis", {
@@ -271,14 +254,12 @@ def _toml(name: str, made: NewScenario) -> str:
         "traffic": ("SUMO; trips are drawn between the ends of the network's streets", {
             "network": NETWORK, "vehicles": made.vehicles, **traffic,
         }),
-        "statics": (
-            "buildings, trees, barriers, poles; what was assumed about them is counted in the file's summary",
-            {"footprints": [STATICS]},
-        ),
-        "sites": (
-            f"poles {junctions.KERB_M:g} m behind the kerbs of the junction; add or remove rows at will",
-            {"file": SITES},
-        ),
+        "statics": ("buildings, trees, barriers, poles; what was assumed about them is counted in the file's summary", {
+            "footprints": [STATICS],
+        }),
+        "sites": (f"poles {junctions.KERB_M:g} m behind the kerbs of the junction; add or remove rows at will", {
+            "file": SITES,
+        }),
         "score": ("", {"gamma": ScoreModel.model_fields["gamma"].default}),
     }  # fmt: skip
     for key, (comment, values) in tables.items():
@@ -286,8 +267,8 @@ def _toml(name: str, made: NewScenario) -> str:
         if comment:
             table.comment(comment)
         document.add(tomlkit.nl()).add(key, table)
-    vehicles = document["traffic"]["vehicles"]
-    vehicles.comment(f"in the whole network, in every frame ({lanes_km:.1f} km of lanes)")
+    lanes_km = made.streets.lane_length_m / 1000
+    document["traffic"]["vehicles"].comment(f"in the whole network, in every frame ({lanes_km:.1f} km of lanes)")
     return tomlkit.dumps(document)
 
 

@@ -1,6 +1,7 @@
 """A map's nodes become shapes, which are repaired, cut into pieces, put in order, and freed of slivers.
 
-Frame: the network's x, y in metres, seen from above."""
+Frame: the network's x, y in metres, seen from above. Coordinates are whole millimetres.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +16,7 @@ from pipeline.importers.mapped_solids import ImportCounts
 
 XY = tuple[float, float]
 
-GRID_M = 0.001
-"""Coordinates are whole multiples of it."""
-
+_GRID_M = 0.001
 _SLIVER_M2 = 0.25
 _SHORT_M = 0.1
 
@@ -35,11 +34,11 @@ def pieces_of(geometry: BaseGeometry) -> list[BaseGeometry]:
     return sorted(polygons or lines or parts, key=lambda p: (p.bounds, p.wkb))
 
 
-def is_large_enough(piece: BaseGeometry) -> bool:
-    """Whether a polygon or a line is more than a sliver."""
-    if isinstance(piece, Polygon):
-        return bool(piece.area >= _SLIVER_M2)
-    return bool(piece.length >= _SHORT_M)
+def large_pieces_of(geometry: BaseGeometry) -> tuple[list[BaseGeometry], int]:
+    """Its polygons, else its lines, to the millimetre; and how many more are slivers."""
+    pieces = pieces_of(shapely.set_precision(geometry, _GRID_M))
+    large = [p for p in pieces if (p.area >= _SLIVER_M2 if isinstance(p, Polygon) else p.length >= _SHORT_M)]
+    return large, len(pieces) - len(large)
 
 
 def lines_of(way: Way, xy: dict[int, XY]) -> list[LineString]:
@@ -47,8 +46,8 @@ def lines_of(way: Way, xy: dict[int, XY]) -> list[LineString]:
     runs = []
     for known, nodes in itertools.groupby(way.nodes, lambda n: n in xy):
         points = [xy[n] for n in nodes] if known else []
-        line = shapely.set_precision(LineString(points), GRID_M) if len(points) > 1 else LineString()
-        runs += [piece for piece in pieces_of(line) if is_large_enough(piece)]
+        if len(points) > 1:
+            runs += large_pieces_of(LineString(points))[0]
     return runs
 
 
@@ -57,7 +56,6 @@ def area_within(way: Way, xy: dict[int, XY], counts: ImportCounts) -> BaseGeomet
     polygon = Polygon([xy[n] for n in way.nodes])
     if polygon.is_valid:
         return polygon
-    pieces = pieces_of(shapely.make_valid(polygon))
-    areas = [piece for piece in pieces if isinstance(piece, Polygon)]
+    areas = [piece for piece in pieces_of(shapely.make_valid(polygon)) if isinstance(piece, Polygon)]
     counts.repaired += bool(areas)
     return shapely.union_all(areas)

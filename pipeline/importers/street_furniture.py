@@ -1,7 +1,8 @@
 """Barriers and poles of a map: fences, walls, hedges and guard rails along ways; lamps, signals, masts and bollards.
 
 The default sizes are round figures for towns of no special kind, not measurements; the summary says how often a default
-was used. Frame: the network's x, y in metres."""
+was used. Frame: the network's x, y in metres.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ import shapely
 
 from pipeline.formats.osm import Extract
 from pipeline.importers.mapped_solids import ImportCounts, MappedSolid, top_of
-from pipeline.importers.shapes import GRID_M, XY, area_within, is_large_enough, lines_of, pieces_of, point_at
+from pipeline.importers.shapes import XY, area_within, large_pieces_of, lines_of, point_at
 
 BARRIERS: Mapping[str, tuple[float, float]] = {
     "cable_barrier": (0.75, 0.05),
@@ -41,6 +42,7 @@ POLES: Mapping[tuple[str, str], tuple[float, float]] = {
 
 
 def barriers(extract: Extract, xy: dict[int, XY], counts: ImportCounts) -> Iterator[MappedSolid]:
+    """Lines with a width, or areas; a kind without default sizes is counted as not modelled."""
     for way in extract.ways.values():
         value = way.tags.get("barrier")
         if value is None or value == "no":
@@ -51,9 +53,7 @@ def barriers(extract: Extract, xy: dict[int, XY], counts: ImportCounts) -> Itera
         height_m, source = top_of(way.tags, BARRIERS[value][0], counts)
         radius_m: float | None = BARRIERS[value][1]
         if way.closed and way.tags.get("area") == "yes" and all(n in xy for n in way.nodes):
-            area = area_within(way, xy, counts)
-            pieces = [p for p in pieces_of(shapely.set_precision(area, GRID_M)) if is_large_enough(p)]
-            geometry, radius_m = shapely.MultiPolygon(pieces), None
+            geometry, radius_m = shapely.MultiPolygon(large_pieces_of(area_within(way, xy, counts))[0]), None
         else:
             geometry = shapely.MultiLineString(lines_of(way, xy))
         if geometry.is_empty:
@@ -63,6 +63,7 @@ def barriers(extract: Extract, xy: dict[int, XY], counts: ImportCounts) -> Itera
 
 
 def poles(extract: Extract, xy: dict[int, XY], counts: ImportCounts) -> Iterator[MappedSolid]:
+    """Upright cylinders; what is too wide for one is counted as not modelled."""
     for node, tags in extract.node_tags.items():
         known = next((POLES[item] for item in tags.items() if item in POLES), None)
         if known is not None:

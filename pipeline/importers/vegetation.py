@@ -1,6 +1,7 @@
 """Trees of a map, mapped one by one or as a row: a trunk and a crown each (hedges are barriers).
 
-The default sizes are round figures, not measurements. Frame: the network's x, y in metres."""
+The default sizes are round figures, not measurements. Frame: the network's x, y in metres.
+"""
 
 from __future__ import annotations
 

@@ -271,7 +271,7 @@ def test_las_cut_anywhere_is_refused(tmp_path: Path, name: str) -> None:
 
 @needs_laspy
 @pytest.mark.parametrize(
-    ("at", "value", "found"),
+    ("at", "value", "message"),
     [
         (0, b"X", "no LASF header"),
         (100, b"\xff\xff\xff\xff", "points past the file or into itself"),  # number of variable-length records
@@ -280,12 +280,12 @@ def test_las_cut_anywhere_is_refused(tmp_path: Path, name: str) -> None:
         (247, b"\x2d\x01", "holds|cannot be read"),  # 301 points
     ],
 )
-def test_las_with_a_damaged_header_is_refused(tmp_path: Path, at: int, value: bytes, found: str) -> None:
+def test_las_with_a_damaged_header_is_refused(tmp_path: Path, at: int, value: bytes, message: str) -> None:
     path, _ = las(tmp_path, "a.las")
     data = bytearray(path.read_bytes())
     data[at : at + len(value)] = value
     path.write_bytes(data)
-    with pytest.raises(InputError, match=found):
+    with pytest.raises(InputError, match=message):
         read_points(path, "")
 
 

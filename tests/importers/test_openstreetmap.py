@@ -187,12 +187,12 @@ def test_buildings_lie_where_the_network_says(made: Made, footprints: dict[str, 
     assert net.convertLonLat2XY(lon_deg, lat_deg) == pytest.approx(net.getNode("1").getCoord(), abs=0.01)
 
 
-def check_sites(folder: Path, spots: int) -> None:
+def check_sites(folder: Path, poles: int) -> None:
     """Sites stand beside the carriageway, clear of everything, in or near the region, at two heights each."""
     rows = sites_of(folder)
     places = [(float(row["x_m"]), float(row["y_m"])) for row in rows]
     assert [row["site"] for row in rows] == [f"k{i:02d}" for i in range(1, len(rows) + 1)]
-    assert len(rows) == 2 * spots and len(set(places)) == spots
+    assert len(rows) == 2 * poles and len(set(places)) == poles
     assert all(places.count(p) == 2 for p in places) and {row["z_m"] for row in rows} == {"3.0", "4.5"}
     lanes = lanes_of(folder)
     features = json.loads((folder / "statics.geojson").read_text(encoding="utf-8"))["features"]
@@ -237,9 +237,9 @@ def test_the_junction_is_named_and_the_source_attributed(made: Made) -> None:
 
 
 def test_a_name_of_odd_characters_is_kept_and_comments_say_what_is_what(tmp_path: Path) -> None:
-    named = edited(tmp_path, ('v="East Street"', 'v="East A\\\\B = #1 Straße"'))
+    named = edited(tmp_path, ('v="East Street"', 'v="East A\\\\B = #1 &quot;Straße&quot; &amp; more"'))
     title = osm.new(tmp_path / "named", named).junction.title
-    assert title == "signalised junction of East A\\B = #1 Straße and North Street"
+    assert title == 'signalised junction of East A\\B = #1 "Straße" & more and North Street'
     assert loading.load(tmp_path / "named").description == f"S{title[1:]}"
     text = (tmp_path / "named" / "scenario.toml").read_text(encoding="utf-8")
     assert re.search(r"^vehicles = 6 +# in the whole network, in every frame \(1\.5 km of lanes\)$", text, re.MULTILINE)
