@@ -1,4 +1,4 @@
-"""Numba kernels: they fill arrays and know no paths, configuration or logging."""
+"""Numba kernels: they fill arrays, and import nothing of this program but each other."""
 
 from pathlib import Path
 

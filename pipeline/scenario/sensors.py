@@ -10,8 +10,6 @@ from pipeline.core.models import StrictModel
 from pipeline.scenario.types import NotNegative, Positive
 
 _OPTICS = ("wavelength_nm", "divergence_mrad", "rated_range_m", "rated_reflectivity")
-
-
 _MOST_BEAMS = 10_000_000
 
 
@@ -25,25 +23,24 @@ class SensorModel(StrictModel):
     azimuth_offsets_deg: tuple[float, ...] = Field((), description="One a ring, added to each azimuth; none: all 0")
     azimuth_step_deg: Positive = Field(description="Divides 360")
     range_m: Positive
-    wavelength_nm: Positive | None = Field(None, description="Of the laser; only effects ask")
-    divergence_mrad: tuple[NotNegative, NotNegative] | None = Field(
-        None, description="Full angle of a beam across and along the elevation; only effects ask"
+    wavelength_nm: Positive = Field(905.0, description="Of the laser; only effects ask")
+    divergence_mrad: tuple[NotNegative, NotNegative] = Field(
+        (3.0, 1.5), description="Full angle of a beam across and along the elevation; only effects ask"
     )
     rated_range_m: Positive | None = Field(
         None, description="A target of rated_reflectivity, met squarely, is just noticed here; only effects ask"
     )
-    rated_reflectivity: Positive | None = Field(None, description="See rated_range_m; only effects ask")
+    rated_reflectivity: Positive = Field(0.8, description="See rated_range_m; only effects ask")
 
     @property
     def optics(self) -> dict[str, Any]:
-        """What the user said of the laser and the receiver; :class:`pipeline.sensing.sensors.Sensor` knows the rest."""
-        said = {name: getattr(self, name) for name in _OPTICS}
-        return {name: value for name, value in said.items() if value is not None}
+        """What effects ask of the laser and the receiver."""
+        return {name: getattr(self, name) for name in _OPTICS}
 
     @model_serializer(mode="wrap")
-    def _said(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
+    def _without_defaults(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Without the optics that the user left out: what no effect asks for changes no artefact."""
-        return {name: value for name, value in plain(self).items() if name not in _OPTICS or value is not None}
+        return {name: v for name, v in plain(self).items() if name not in _OPTICS or name in self.model_fields_set}
 
     @model_validator(mode="after")
     def _consistent(self) -> SensorModel:

@@ -28,10 +28,12 @@ from scipy.special import cosdg, sindg
 from pipeline.core.errors import InputError
 from pipeline.scenario.sensors import SensorModel
 
+_DEFAULT = SensorModel.model_fields
+
 
 @dataclass(frozen=True)
 class Sensor:
-    """A spinning LiDAR.
+    """A spinning LiDAR; what is not said of its optics is as in ``[sensors.<name>]``.
 
     Attributes
     ----------
@@ -56,10 +58,10 @@ class Sensor:
     azimuths: int
     range_m: float
     source: str
-    wavelength_nm: float = 905.0
-    divergence_mrad: tuple[float, float] = (3.0, 1.5)
-    rated_range_m: float | None = None
-    rated_reflectivity: float = 0.8
+    wavelength_nm: float = _DEFAULT["wavelength_nm"].default
+    divergence_mrad: tuple[float, float] = _DEFAULT["divergence_mrad"].default
+    rated_range_m: float | None = _DEFAULT["rated_range_m"].default
+    rated_reflectivity: float = _DEFAULT["rated_reflectivity"].default
 
     @property
     def channels(self) -> int:
@@ -124,7 +126,7 @@ def _plain(
 _VELODYNE: dict[str, Any] = {"wavelength_nm": 903.0, "divergence_mrad": (3.0, 1.5), "rated_reflectivity": 0.8}
 
 # Hesai PandarXT-32: 905 nm, 80 m at 10 %, of no stated chance. The outer rings may reach less far, as they do in the
-# PandarXT-16 (user manual: 80 m within 7 degrees of level, 50 m beyond). Its divergence is assumed: Sensor's own.
+# PandarXT-16 (user manual: 80 m within 7 degrees of level, 50 m beyond). Its divergence is assumed: the default.
 _XT_32: dict[str, Any] = {"wavelength_nm": 905.0, "rated_range_m": 80.0, "rated_reflectivity": 0.1}
 
 # Ouster OS1 datasheet, revision 6: 865 nm; at 1024 columns and 10 Hz, 10 % reflectivity and 100 klx, 55 m at a chance
@@ -165,7 +167,9 @@ CATALOGUE: Mapping[str, Sensor] = {
         ),
     )
 }  # fmt: skip
-"""The sensors that need no table of the user's; elevations are the makers' design values."""
+"""The sensors that need no table of the user's; elevations are the makers' design values. A further one is an entry
+here, its number of beams in ``tests/sensing/test_sensors.py``, and a row in ``docs/effects.md`` that says where its
+rated range is from."""
 
 
 def resolve(name: str, own: Mapping[str, SensorModel], place: str) -> Sensor:
