@@ -22,11 +22,12 @@ SMALLEST_M = 10 * SHRINK_M
 
 @dataclass(frozen=True)
 class FrameBoxes:
-    """Vehicle boxes of some whole frames: ``frame`` (n,) int64, ascending; ``values`` (n, 8) float64 as ``COLUMNS``,
-    the centre in the grid's frame."""
+    """Vehicle boxes of some whole frames."""
 
     frame: NDArray[np.int64]
+    """(n,), ascending."""
     values: NDArray[np.float64]
+    """(n, 8), as ``COLUMNS``; the centre in the grid's frame."""
 
 
 def read_boxes(path: Path, grid: Grid, wanted: NDArray[np.int64] | None = None) -> Iterator[FrameBoxes]:
@@ -49,8 +50,7 @@ def read_boxes(path: Path, grid: Grid, wanted: NDArray[np.int64] | None = None) 
             if wanted is not None and not _may_hold(statistics, wanted):
                 continue
             table = tables.read_group(file, group, path, ["frame", *COLUMNS])
-            frame = table.column("frame").to_numpy().astype(np.int64)
-            if len(frame) == 0:
+            if not len(frame := table.column("frame").to_numpy().astype(np.int64)):
                 continue
             if np.any(np.diff(frame) < 0) or frame[0] <= last:
                 raise InputError(path, f"frames are out of order near frame {frame[0]}", "rows sorted by frame")

@@ -1,7 +1,7 @@
 """Artefacts as arrays and tables, for notebooks, stages, and people who want to compute further.
 
-Readers for notebooks, for the stages, and for people who want to compute further. Each checks what it reads and says
-which file is wrong. Tables come as Arrow tables (``.to_pandas()`` where pandas is installed), grids as NumPy arrays.
+Each reader checks what it reads and says which file is wrong. Tables come as Arrow tables (``.to_pandas()`` where
+pandas is installed), grids as NumPy arrays.
 """
 
 from __future__ import annotations

@@ -1,5 +1,4 @@
-"""What is known of a run: ``run.json``, written anew after each stage, so that an interrupted run goes on from the last
-whole one."""
+"""The record of a run, ``run.json``: written anew after each stage, so that an interrupted run goes on from there."""
 
 from __future__ import annotations
 
@@ -15,8 +14,7 @@ from pipeline.core.errors import InputError
 RECORD = "run.json"
 
 STAGES = ("statics", "scan", "traffic", "tpog", "score", "report")
-"""In the order of running. The two branches do not know each other; the quick one comes first, so that a site in a wall
-is told before traffic is simulated."""
+"""In the order of running; the quick branch comes first, so that a site in a wall is told before SUMO runs."""
 
 
 @dataclass(frozen=True)

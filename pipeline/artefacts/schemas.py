@@ -30,29 +30,20 @@ def folder() -> Path:
 
 
 @cache
-def table_schema(artefact: str) -> dict[str, Any]:
-    """The Table Schema of ``trajectories``, ``tpog``, ``scans``, ``visibility`` or ``scores``."""
-    text = (folder() / f"{artefact}.schema.json").read_text(encoding="utf-8")
-    schema: dict[str, Any] = json.loads(text)
-    return schema
+def _fields(artefact: str) -> list[dict[str, Any]]:
+    """The columns that the Table Schema of an artefact declares."""
+    return list(json.loads((folder() / f"{artefact}.schema.json").read_text(encoding="utf-8"))["fields"])
 
 
 @cache
 def arrow_schema(artefact: str, optional: tuple[str, ...] = ()) -> pa.Schema:
-    """The Arrow schema of an artefact with its needed columns and those named in ``optional``. No column may hold
-    nulls."""
+    """The Arrow schema of an artefact: its needed columns, and those named in ``optional``. No column holds nulls."""
     import pyarrow as pa
 
-    types = {"bool": pa.bool_()}
-    fields = [f for f in table_schema(artefact)["fields"] if f["constraints"]["required"] or f["name"] in optional]
-    return pa.schema(
-        [
-            pa.field(f["name"], types.get(f["arrow_type"]) or pa.type_for_alias(f["arrow_type"]), nullable=False)
-            for f in fields
-        ]
-    )
+    fields = [f for f in _fields(artefact) if f["constraints"]["required"] or f["name"] in optional]
+    return pa.schema([pa.field(f["name"], pa.type_for_alias(f["arrow_type"]), nullable=False) for f in fields])
 
 
 def optional_columns(artefact: str) -> tuple[str, ...]:
     """The columns that exist only where an effect calls for them."""
-    return tuple(f["name"] for f in table_schema(artefact)["fields"] if not f["constraints"]["required"])
+    return tuple(f["name"] for f in _fields(artefact) if not f["constraints"]["required"])

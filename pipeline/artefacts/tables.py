@@ -90,8 +90,7 @@ def reader(path: Path, artefact: str) -> Iterator[tuple[pq.ParquetFile, dict[str
         raw = (file.metadata.metadata or {}).get(_KEY)
         if raw is None:
             raise InputError(path, "no metadata under the key 'egvs'", f"a {artefact} file written by egvs")
-        metadata = _metadata(path, artefact, raw)
-        yield file, metadata
+        yield file, _metadata(path, artefact, raw)
 
 
 def read_group(file: pq.ParquetFile, group: int, path: Path, columns: list[str] | None = None) -> pa.Table:
@@ -109,20 +108,16 @@ def read_metadata(path: Path, artefact: str) -> dict[str, Any]:
 
 
 def _check_columns(path: Path, artefact: str, found: pa.Schema) -> None:
-    wanted = schemas.arrow_schema(artefact)
-    for field in wanted:
-        index = found.get_field_index(field.name)
-        if index < 0:
-            raise InputError(path, f"column '{field.name}' is missing", f"the columns {', '.join(wanted.names)}")
-        if found.field(index).type != field.type:
-            raise InputError(path, f"column '{field.name}' is {found.field(index).type}", f"{field.type}")
-    for field in schemas.arrow_schema(artefact, schemas.optional_columns(artefact)):
-        index = found.get_field_index(field.name)
-        if index >= 0 and found.field(index).type != field.type:
-            raise InputError(path, f"column '{field.name}' is {found.field(index).type}", f"{field.type}")
-    extra = sorted(set(found.names) - set(wanted.names) - set(schemas.optional_columns(artefact)))
-    if extra:
-        raise InputError(path, f"unknown columns {', '.join(extra)}", f"the columns {', '.join(wanted.names)}")
+    needed = schemas.arrow_schema(artefact).names
+    known = schemas.arrow_schema(artefact, schemas.optional_columns(artefact))
+    for field in known:
+        if (index := found.get_field_index(field.name)) >= 0:
+            if found.field(index).type != field.type:
+                raise InputError(path, f"column '{field.name}' is {found.field(index).type}", f"{field.type}")
+        elif field.name in needed:
+            raise InputError(path, f"column '{field.name}' is missing", f"the columns {', '.join(needed)}")
+    if extra := sorted(set(found.names) - set(known.names)):
+        raise InputError(path, f"unknown columns {', '.join(extra)}", f"the columns {', '.join(needed)}")
 
 
 _PROMISED: dict[str, tuple[str, ...]] = {
@@ -139,19 +134,18 @@ _SITE = ("site", "x_m", "y_m", "z_m", "sensor")
 
 def _metadata(path: Path, artefact: str, raw: bytes) -> dict[str, Any]:
     """The checked metadata; InputError naming what is wrong with it."""
+    right = "an unaltered file; make it again"
     try:
         metadata = json.loads(raw)
     except (ValueError, RecursionError) as error:
-        raise InputError(path, f"its metadata is no JSON ({error})", "an unaltered file; make it again") from None
+        raise InputError(path, f"its metadata is no JSON ({error})", right) from None
     if not isinstance(metadata, dict):
-        raise InputError(path, f"its metadata is {metadata!r}", "an unaltered file; make it again")
+        raise InputError(path, f"its metadata is {metadata!r}", right)
     if metadata.get("schema") != schemas.VERSION:
         raise InputError(path, f"schema version {metadata.get('schema')}", f"version {schemas.VERSION}")
     for key in _PROMISED.get(artefact, ()):
         if not _is_sound(key, metadata.get(key)):
-            raise InputError(
-                path, f"its metadata says {key} = {metadata.get(key)!r}", "an unaltered file; make it again"
-            )
+            raise InputError(path, f"its metadata says {key} = {metadata.get(key)!r}", right)
     return metadata
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.cli import arguments
+from pipeline.cli import arguments, interrupts
 from pipeline.cli.arguments import Audit, Jobs, Out, ScenarioPath, Set
 from pipeline.core.errors import EgvsError, InputError
 from pipeline.core.version import __version__
@@ -34,7 +34,8 @@ _INTERRUPTED = 130
 def main() -> None:
     """Entry point: errors of this program become one message and an exit code."""
     try:
-        app()
+        with interrupts.after_imports():
+            app()
     except EgvsError as error:
         _fail(str(error), error.exit_code)
     except OSError as error:

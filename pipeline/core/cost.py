@@ -1,5 +1,7 @@
-"""The cost of a piece of work: wall seconds, processor seconds, and the highest memory that the process held meanwhile
-(Linux lets the mark be reset; elsewhere it is the highest so far)."""
+"""The cost of a piece of work: wall seconds, processor seconds, and the most memory that the process held meanwhile.
+
+Linux lets that mark be reset; elsewhere it is the highest so far.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +26,7 @@ class Cost:
 
     seconds: float = 0.0
     busy_s: float = 0.0
-    """Seconds that processors worked for this process and those that it waited for (SUMO): other people's work is not
-    in it."""
+    """Seconds that processors worked for this process and those that it waited for (SUMO), and for no other."""
     peak_mb: float = 0.0
     held_mb: float = 0.0
     """What the process held when the block began; elsewhere than on Linux, the highest until then."""
@@ -49,13 +50,11 @@ def measured() -> Iterator[Cost]:
 
 
 def let_go() -> None:
-    """Give back memory that is kept for later, so that the peak of what follows, above what is held then, is its
-    own."""
+    """Give back memory that is kept for later, so that the peak of what follows, above what is held, is its own."""
     gc.collect(1)  # old objects are as old as the program: to look for garbage among them takes 50 ms
     if (arrow := sys.modules.get("pyarrow")) is not None:
         arrow.default_memory_pool().release_unused()
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc's
-    if trim is not None:
+    if (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:  # glibc's
         trim(0)
 
 

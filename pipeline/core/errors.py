@@ -2,7 +2,8 @@
 
 Every error that reaches a user is an :class:`EgvsError`. Its text is one line (or a short list of lines) that names the
 place (file, key or row), what was found there, and what would be right. ``exit_code`` is what the command line ends
-with."""
+with.
+"""
 
 from __future__ import annotations
 

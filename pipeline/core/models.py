@@ -1,7 +1,8 @@
 """The base of what users write: values checked the same way everywhere.
 
 Models are frozen, unknown keys are errors, and numbers are finite unless a field says otherwise. No text or truth value
-passes for a number, no fraction for a count; lists pass for tuples, as in JSON."""
+passes for a number, no fraction for a count; lists pass for tuples, as in JSON.
+"""
 
 from __future__ import annotations
 

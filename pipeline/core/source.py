@@ -42,8 +42,7 @@ _IMPORT = re.compile(
 
 @dataclass(frozen=True)
 class Source:
-    """What some modules are made of: the digest of all their sources, and the libraries of :data:`LIBRARIES` that they
-    import."""
+    """The digest of some modules' sources, and the libraries of :data:`LIBRARIES` that they import."""
 
     digest: str
     libraries: frozenset[str]
@@ -53,24 +52,18 @@ class Source:
 def of(*modules: str) -> Source:
     """The source of modules, e.g. ``"pipeline.stages.score"``, and of everything that they import."""
     homes = {PACKAGE, *(module.partition(".")[0] for module in modules)}
-    found: dict[str, _File] = {}
-    waiting = list(modules)
+    digests: dict[str, str] = {}
+    waiting, tops = list(modules), set()
     while waiting:
         module = waiting.pop()
-        if module in found or module.partition(".")[0] not in homes or (path := _path(module)) is None:
+        if module in digests or module.partition(".")[0] not in homes or (path := _path(module)) is None:
             continue
-        found[module] = _read(path, module if path.name == "__init__.py" else module.rpartition(".")[0])
-        waiting += found[module].imports
-        waiting.append(module.rpartition(".")[0])
-    every = hashlib.sha256()
-    for module, file in sorted(found.items()):
-        every.update(f"{module} {file.sha256}\n".encode())
-    return Source(every.hexdigest(), frozenset().union(*(file.libraries for file in found.values())))
-
-
-def of_object(kind: type) -> Source:
-    """The source of the module that defines a class, and of everything that it imports."""
-    return of(kind.__module__)
+        folder = module.rpartition(".")[0]
+        digests[module], imports = _read(path, module if path.name == "__init__.py" else folder)
+        waiting += (*imports, folder)
+        tops |= {name.partition(".")[0] for name in imports}
+    every = "".join(f"{module} {digest}\n" for module, digest in sorted(digests.items()))
+    return Source(hashlib.sha256(every.encode()).hexdigest(), frozenset(tops & LIBRARIES.keys()))
 
 
 def versions(libraries: frozenset[str]) -> dict[str, str]:
@@ -86,19 +79,11 @@ def _version(distribution: str) -> str | None:
         return None
 
 
-@dataclass(frozen=True)
-class _File:
-    sha256: str
-    imports: tuple[str, ...]
-    libraries: frozenset[str]
-
-
 @cache
-def _read(path: Path, package: str) -> _File:
+def _read(path: Path, package: str) -> tuple[str, tuple[str, ...]]:
+    """A file's digest, and what it imports."""
     content = path.read_bytes()
-    imports = tuple(imported(content.decode("utf-8"), package))
-    libraries = frozenset(name.partition(".")[0] for name in imports) & LIBRARIES.keys()
-    return _File(hashlib.sha256(content).hexdigest(), imports, libraries)
+    return hashlib.sha256(content).hexdigest(), tuple(imported(content.decode("utf-8"), package))
 
 
 def imported(text: str, package: str) -> Iterator[str]:
@@ -117,8 +102,7 @@ def imported(text: str, package: str) -> Iterator[str]:
 
 @cache
 def _path(module: str) -> Path | None:
-    """A module's file; None for what is none (an attribute of a module), and for the door of this package, whose lazy
-    names would lead everywhere."""
+    """A module's file; None for an attribute of a module, and for this package's door, whose lazy names lead far."""
     top, _, rest = module.partition(".")
     if top == PACKAGE:
         inside = _ROOT.joinpath(*rest.split("."))

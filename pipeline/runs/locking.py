@@ -36,11 +36,11 @@ def locked(path: Path, *, shared: bool = False, wait: bool = True, remove: bool 
     remove
         Remove the file at the end. Who waited for it then takes the one that stands in its place.
     """
+    kind = (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | (0 if wait else fcntl.LOCK_NB)
     while True:
         descriptor = _open(path, shared)
         try:
-            kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
-            if not _take(descriptor, kind if wait else kind | fcntl.LOCK_NB):
+            if not _take(descriptor, kind):
                 yield False
                 return
             if not _is_still(descriptor, path):

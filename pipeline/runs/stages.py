@@ -1,4 +1,4 @@
-"""The stages, and the only place that calls them: what a stage depends on, and what came of it when it was made."""
+"""Calls the stages, which nothing else does: what a stage depends on, and what came of it when it was made."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from types import ModuleType
 from typing import Any
 
 from pipeline.artefacts import schemas
-from pipeline.artefacts.run_record import STAGES
+from pipeline.artefacts.run_record import STAGES, StageRecord
 from pipeline.core import files, source
 from pipeline.core.cost import Cost, measured
 from pipeline.effects import registry
 from pipeline.scenario.models import Scenario
-from pipeline.stages.base import StageInputs, Workspace
+from pipeline.stages.base import StageInputs, Summary, Workspace
 
 RANKING = STAGES[:-1]
 """What a ranking takes; the report is left out."""
@@ -28,14 +28,11 @@ class Inputs:
     key
         Hash of all of it: settings by value, files by hash, the program by the digest of its source, libraries by
         version.
-    files
-        The files among it: name -> sha256.
     read
-        As the stage named it.
+        What the stage reads, as it named it.
     """
 
     key: str
-    files: dict[str, str]
     read: StageInputs
 
 
@@ -48,45 +45,45 @@ class Made:
     artefacts
         Name -> sha256 of each file that it wrote.
     companions
-        Further files that belong to them, as paths in the run's folder: those that open in sumo-gui.
+        The same of further files that belong to them, by their path in the run's folder: those that open in sumo-gui.
     summary
         What the stage says of it, a JSON value.
     """
 
     artefacts: dict[str, str]
-    companions: tuple[str, ...]
-    summary: dict[str, Any]
+    companions: dict[str, str]
+    summary: Summary
     cost: Cost
+
+    @property
+    def files(self) -> dict[str, str]:
+        """Name -> sha256 of all of them."""
+        return self.artefacts | self.companions
+
+    def record(self, inputs: Inputs) -> StageRecord:
+        """What ``run.json`` holds of it."""
+        return StageRecord(inputs.key, dict(inputs.read.files), self.artefacts, self.summary, self.cost)
 
 
 def module_of(stage: str) -> ModuleType:
     """A stage's module, imported when it is needed (``--help`` stays quick)."""
+    module: ModuleType
     match stage:
         case "statics":
-            from pipeline.stages import statics
-
-            return statics
+            from pipeline.stages import statics as module
         case "scan":
-            from pipeline.stages import scan
-
-            return scan
+            from pipeline.stages import scan as module
         case "traffic":
-            from pipeline.stages import traffic
-
-            return traffic
+            from pipeline.stages import traffic as module
         case "tpog":
-            from pipeline.stages import tpog
-
-            return tpog
+            from pipeline.stages import tpog as module
         case "score":
-            from pipeline.stages import score
-
-            return score
+            from pipeline.stages import score as module
         case "report":
-            from pipeline.report import page
-
-            return page
-    raise ValueError(f"no stage {stage!r}; one of {', '.join(STAGES)}")
+            from pipeline.report import page as module
+        case _:
+            raise ValueError(f"no stage {stage!r}; one of {', '.join(STAGES)}")
+    return module
 
 
 def artefacts_of(stage: str) -> tuple[str, ...]:
@@ -98,7 +95,7 @@ def inputs(stage: str, work: Workspace) -> Inputs:
     """Everything that a stage's artefacts depend on; ``work`` holds those of the stages before."""
     read: StageInputs = module_of(stage).inputs(work)
     about = {"stage": stage, "inputs": read.to_json(), "program": program(stage, work.scenario, read.code)}
-    return Inputs(files.hash_of(about), dict(read.files), read)
+    return Inputs(files.hash_of(about), read)
 
 
 def make(stage: str, work: Workspace, inputs: Inputs, **options: Any) -> Made:
@@ -109,28 +106,27 @@ def make(stage: str, work: Workspace, inputs: Inputs, **options: Any) -> Made:
     with measured() as cost:
         summary = module.run(work, inputs.read, **options)
     artefacts = work.digests(*(name for name in module.ARTEFACTS if (out / name).exists()))
-    written = (name for name, stamp in _companions(module, out).items() if before.get(name) != stamp)
-    return Made(artefacts, tuple(sorted(written)), summary, cost)
+    written = sorted(name for name, stamp in _companions(module, out).items() if before.get(name) != stamp)
+    return Made(artefacts, {name: files.sha256_of(out / name) for name in written}, summary, cost)
 
 
 def _companions(module: ModuleType, out: Path) -> dict[str, tuple[int, int, int]]:
     """What lies in the folders that a stage writes beside its artefacts, with a stamp that writing changes."""
-    found = {}
-    for name in getattr(module, "COMPANIONS", ()):
-        for path in (out / name).rglob("*"):
-            if path.is_file() and not path.is_symlink():
-                about = path.stat()
-                stamp = (about.st_mtime_ns, about.st_ino, about.st_size)
-                found[path.relative_to(out).as_posix()] = stamp
-    return found
+    folders = [out / name for name in getattr(module, "COMPANIONS", ())]
+    paths = [path for folder in folders for path in folder.rglob("*") if path.is_file() and not path.is_symlink()]
+    stats = {path.relative_to(out).as_posix(): path.stat() for path in paths}
+    return {name: (stat.st_mtime_ns, stat.st_ino, stat.st_size) for name, stat in stats.items()}
 
 
-def program(stage: str, scenario: Scenario, acting: tuple[type, ...] = ()) -> dict[str, Any]:
-    """What a stage's artefacts depend on beside its inputs: its source, that of the effects that act in it (and, since
-    its summary names them, of those that turn out to change nothing), its schemas and templates, and the libraries."""
+def program(stage: str, scenario: Scenario, more_effects: tuple[type, ...] = ()) -> dict[str, Any]:
+    """What a stage's artefacts depend on beside its inputs.
+
+    Its source, that of the effects that act in it (and, since its summary names them, of those that turn out to change
+    nothing), its schemas and templates, and the libraries.
+    """
     named = registry.named(scenario, *_ASKS.get(stage, (stage,)))
-    effects = sorted({*acting, *(type(effect) for effect in named)}, key=lambda effect: effect.__module__)
-    own, theirs = source.of(module_of(stage).__name__), [source.of_object(effect) for effect in effects]
+    effects = sorted({*more_effects, *(type(effect) for effect in named)}, key=lambda effect: effect.__module__)
+    own, theirs = source.of(module_of(stage).__name__), [source.of(effect.__module__) for effect in effects]
     libraries = own.libraries.union(*(effect.libraries for effect in theirs))
     return {
         "source": own.digest,

@@ -48,8 +48,8 @@ class Entry:
     ----------
     made
         What came of the stage; the cost is that of making it.
-    sizes
-        Bytes of each file, artefacts and companions.
+    bytes
+        Of all files, artefacts and companions.
     created, last_used
         Seconds since the epoch.
     """
@@ -58,15 +58,9 @@ class Entry:
     stage: str
     key: str
     made: Made
-    hashes: dict[str, str]
-    sizes: dict[str, int]
+    bytes: int
     created: float
     last_used: float
-
-    @property
-    def bytes(self) -> int:
-        """Of all files."""
-        return sum(self.sizes.values())
 
 
 class _Damaged(Exception):
@@ -124,29 +118,23 @@ class Store:
         try:
             with self._shared():
                 entry = _read(folder)
-                for name, digest in entry.hashes.items():
+                for name, digest in entry.made.files.items():
                     _lay(folder / name, out / name, digest, link)
                 with suppress(OSError):  # a store that can only be read
                     os.utime(folder / _ENTRY)
                 return entry
         except _Damaged as damage:
             self._note(f"{folder}: the kept {stage} is damaged ({damage}), and made again")
-        with suppress(OSError), self._alone():
+        with suppress(OSError), locked(self.folder / ".lock"):
             self._remove(folder)
-        return None
-
-    def find(self, stage: str, key: str) -> Entry | None:
-        """An entry, its files unread; None where there is none."""
-        if self.folder is None:
-            return None
-        with suppress(_Damaged), self._shared():
-            return _read(self._place(stage, key))
         return None
 
     @contextmanager
     def maker(self, stage: str, key: str, *, wait: bool = True, progress: Progress = silent) -> Iterator[bool]:
-        """Be the only one that makes an entry; yields whether one is (without ``wait`` another may be, and a store that
-        cannot be written keeps nobody apart)."""
+        """Be the only one that makes an entry; yields whether one is (without ``wait`` another may be).
+
+        A store that cannot be written keeps nobody apart.
+        """
         if not self._can_write or self.folder is None:
             yield True
             return
@@ -172,20 +160,18 @@ class Store:
             return
         work = self.folder / ".work" / final.name
         try:
-            try:
-                shutil.rmtree(work, ignore_errors=True)
-                work.mkdir(parents=True)
-                for name in (*made.artefacts, *made.companions):
-                    _copy(out / name, work / name, link)
-                (work / _ENTRY).write_text(_to_json(stage, key, work, made), encoding="utf-8")
-                with self._shared():
-                    work.rename(final)
-            except BaseException:
-                shutil.rmtree(work, ignore_errors=True)
-                raise
+            shutil.rmtree(work, ignore_errors=True)
+            work.mkdir(parents=True)
+            for name in made.files:
+                _copy(out / name, work / name, link)
+            (work / _ENTRY).write_text(_to_json(stage, key, work, made), encoding="utf-8")
+            with self._shared():
+                work.rename(final)
             self.prune(self.bound_bytes)
         except OSError as error:
             self._do_without(error)
+        finally:
+            shutil.rmtree(work, ignore_errors=True)
 
     # ---- all entries
 
@@ -198,12 +184,11 @@ class Store:
         return sorted(found, key=lambda entry: entry.last_used, reverse=True)
 
     def prune(self, most_bytes: float) -> list[Entry]:
-        """Remove the entries used longest ago until the others take at most ``most_bytes``, all below 0; those
-        removed."""
+        """Remove those used longest ago until the others take at most ``most_bytes`` (below 0: all); those gone."""
         removed: list[Entry] = []
-        if sum(entry.bytes for entry in self.entries()) <= most_bytes or not self._folders():
+        if self.folder is None or sum(entry.bytes for entry in self.entries()) <= most_bytes or not self._folders():
             return removed
-        with self._alone():
+        with locked(self.folder / ".lock"):
             kept = self.entries()
             for folder in set(self._folders()) - {entry.folder for entry in kept}:
                 self._remove(folder)  # damaged
@@ -239,27 +224,19 @@ class Store:
                 held.enter_context(locked(self.folder / ".lock", shared=True))
             yield
 
-    @contextmanager
-    def _alone(self) -> Iterator[None]:
-        assert self.folder is not None
-        with locked(self.folder / ".lock"):
-            yield
-
     def _clear_work(self, folder: Path) -> None:
         """Remove what killed processes left; who is still at work holds its lock."""
         places = [place for name in (".work", ".locks") if (place := folder / name).is_dir()]
         for name in {path.name for place in places for path in place.iterdir()}:
-            if name.startswith("removed-"):
-                shutil.rmtree(folder / ".work" / name, ignore_errors=True)
-                continue
             with suppress(OSError), locked(folder / ".locks" / name, wait=False, remove=True) as free:
                 if free:
                     shutil.rmtree(folder / ".work" / name, ignore_errors=True)
 
     def _do_without(self, error: OSError) -> None:
         self._can_write = False
-        why = error.strerror or error
-        self._note(f"{self.folder}: the store cannot be written ({why}); the run goes on without it")
+        self._note(
+            f"{self.folder}: the store cannot be written ({error.strerror or error}); the run goes on without it"
+        )
 
 
 def _lay(kept: Path, path: Path, digest: str, link: bool) -> None:
@@ -286,17 +263,8 @@ def _copy(path: Path, other: Path, link: bool) -> None:
 
 
 def _to_json(stage: str, key: str, folder: Path, made: Made) -> str:
-    names = (*made.artefacts, *made.companions)
-    about = {
-        "stage": stage,
-        "key": key,
-        "artefacts": made.artefacts,
-        "companions": {name: files.sha256_of(folder / name) for name in made.companions},
-        "bytes": {name: (folder / name).stat().st_size for name in names},
-        "summary": made.summary,
-        "cost": asdict(made.cost),
-        "created": time.time(),
-    }
+    sizes = {name: (folder / name).stat().st_size for name in made.files}
+    about = {"stage": stage, "key": key, **asdict(made), "bytes": sizes, "created": time.time()}
     return json.dumps(about, indent=1, ensure_ascii=False) + "\n"
 
 
@@ -304,10 +272,10 @@ def _read(folder: Path) -> Entry:
     try:
         value = json.loads((folder / _ENTRY).read_text(encoding="utf-8"))
         last_used = (folder / _ENTRY).stat().st_mtime
-        made = Made(dict(value["artefacts"]), tuple(value["companions"]), dict(value["summary"]), Cost(**value["cost"]))
-        hashes = {**value["artefacts"], **value["companions"]}
-        sizes = {str(name): int(size) for name, size in value["bytes"].items()}
-        entry = Entry(folder, value["stage"], value["key"], made, hashes, sizes, float(value["created"]), last_used)
+        artefacts, companions, summary = (dict(value[name]) for name in ("artefacts", "companions", "summary"))
+        made = Made(artefacts, companions, summary, Cost(**value["cost"]))
+        size = sum(int(size) for size in value["bytes"].values())
+        entry = Entry(folder, value["stage"], value["key"], made, size, float(value["created"]), last_used)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise _Damaged(f"{_ENTRY}: {error}") from None
     if folder.name != f"{entry.stage}-{entry.key[:32]}":

@@ -14,7 +14,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +32,10 @@ from pipeline.scenario.models import Scenario
 from pipeline.stages.base import Workspace
 
 StageListener = Callable[[str, str, StageRecord | None], None]
-"""Called with (stage, state, its record) as a run goes on. States: "runs" (no record yet), then "done"; or "skipped"
-(nothing changed), or "fetched" (from the store)."""
+"""Called with (stage, state, its record) as a run goes on.
+
+States: "runs" (no record yet), then "done"; or "skipped" (nothing changed), or "fetched" (from the store).
+"""
 
 
 def unheard(_stage: str, _state: str, _record: StageRecord | None) -> None:
@@ -70,8 +72,8 @@ def run(
     """
     folder = Path(out) if out is not None else default_folder(scenario)
     with alone(folder):
-        run = _Run(Workspace(scenario, folder, jobs=jobs, progress=progress), Store.default(), listener)
-        record = _going_on(scenario, folder)
+        run = _Run(Workspace(scenario, folder, jobs=jobs, progress=progress), listener)
+        record = _record_so_far(scenario, folder)
         for name in STAGES:
             record = run.bring(name, record, **(options or {}).get(name, {}))
         return record
@@ -90,8 +92,8 @@ def run_one(
     """Run a single stage, whether its inputs changed or not, and note it in ``run.json``."""
     with alone(out):
         work = Workspace(scenario, out, jobs=jobs, progress=progress)
-        run = _Run(work, Store.default(), listener)
-        record = run.bring(name, _going_on(scenario, out), again=True, **options)
+        run = _Run(work, listener)
+        record = run.bring(name, _record_so_far(scenario, out), again=True, **options)
         for other in [stage for stage in record.stages if stage != name and not _is_of(stage, work, record)]:
             record = record.having(other, None)  # of other settings: the record would contradict itself
         record.write(out)
@@ -99,8 +101,7 @@ def run_one(
 
 
 def refresh_report(out: Path) -> Path | None:
-    """Draw the report of a whole run anew where something that it shows has changed, an accuracy study say; the
-    report's path.
+    """Draw the report of a whole run anew where something that it shows has changed (an accuracy study); its path.
 
     None, and nothing is done, where there is no whole run. For those who hold the folder
     (:func:`pipeline.runs.locking.alone`).
@@ -115,7 +116,7 @@ def refresh_report(out: Path) -> Path | None:
     work = Workspace(scenario, out)
     if not all(_is_of(name, work, record) for name in STAGES if name != "report"):
         return None
-    _Run(work, Store.default(), unheard).bring("report", record)
+    _Run(work, unheard).bring("report", record)
     return out / "report.html"
 
 
@@ -127,15 +128,15 @@ def default_folder(scenario: Scenario) -> Path:
 def fetch_or_make(
     name: str, work: Workspace, key: str, store: Store, make: Callable[[], Made], *, link: bool = False
 ) -> tuple[Made, bool]:
-    """A stage's artefacts in a workspace: from the store, else made, and kept there; of several processes that want the
-    same, one makes it. Returns what came of it, and whether it came from the store."""
+    """A stage's artefacts in a workspace: from the store, else made, and kept there.
+
+    Of several processes that want the same, one makes it. Returns what came of it, and whether it came from the store.
+    """
     out = work.folder
     work.forget(*stages.artefacts_of(name))
-    entry = store.take(name, key, out, link=link)
-    if entry is None:
+    if (entry := store.take(name, key, out, link=link)) is None:
         with store.maker(name, key, progress=work.progress):
-            entry = store.take(name, key, out, link=link)  # another one has made it meanwhile
-            if entry is None:
+            if (entry := store.take(name, key, out, link=link)) is None:  # nor has another one made it meanwhile
                 made = make()
                 store.put(name, key, out, made, link=link)
                 return made, False
@@ -149,13 +150,14 @@ class _Run:
     """One scenario in one folder."""
 
     work: Workspace
-    store: Store
     listener: StageListener
+    store: Store = field(default_factory=Store.default)
 
     def bring(self, name: str, record: RunRecord, *, again: bool = False, **options: Any) -> RunRecord:
         """Bring one stage up to date; the record of the run with it, written.
 
-        A stage with ``options`` is always run, and its artefacts are not kept in the store; ``again``: always run."""
+        A stage with ``options`` is always run, and its artefacts are not kept in the store; ``again``: always run.
+        """
         work, out = self.work, self.work.folder
         inputs = stages.inputs(name, work)
         last = record.stages.get(name)
@@ -165,7 +167,7 @@ class _Run:
         record = replace(record.having(name, None), scenario=work.scenario.model_dump(mode="json"))
         record.write(out)
         made, fetched = self._made(name, inputs, again, options)
-        done = StageRecord(inputs.key, inputs.files, made.artefacts, made.summary, made.cost)
+        done = made.record(inputs)
         record = record.having(name, done)
         record.write(out)
         self.listener(name, "fetched" if fetched else "done", done)
@@ -188,15 +190,11 @@ class _Run:
         return made, False
 
 
-def _before_the_first_stage(scenario: Scenario, folder: Path) -> RunRecord:
-    home = Path(os.path.relpath(scenario.folder, folder)).as_posix()
-    return RunRecord(__version__, scenario.seed, scenario.model_dump(mode="json"), home, {})
-
-
-def _going_on(scenario: Scenario, folder: Path) -> RunRecord:
+def _record_so_far(scenario: Scenario, folder: Path) -> RunRecord:
     """What is known of earlier work in this folder, with the scenario as it is now."""
-    record = _before_the_first_stage(scenario, folder)
-    return replace(record, stages=RunRecord.read(folder).stages) if (folder / RECORD).is_file() else record
+    home = Path(os.path.relpath(scenario.folder, folder)).as_posix()
+    known = RunRecord.read(folder).stages if (folder / RECORD).is_file() else {}
+    return RunRecord(__version__, scenario.seed, scenario.model_dump(mode="json"), home, known)
 
 
 def _is_of(name: str, work: Workspace, record: RunRecord) -> bool:
@@ -239,24 +237,24 @@ def verify(
     if not source.is_dir():
         raise InputError(folder / RECORD, f"the scenario's folder {source} is not there", "name it with --scenario")
     scenario = from_values(record.scenario, source, str(folder / RECORD))
-    wrong = [f"{name} was altered after the run" for name in _altered(folder, record)]
+    made_by_stages = {name: digest for stage in record.stages.values() for name, digest in stage.artefacts.items()}
+    wrong = [f"{name} was altered after the run" for name in made_by_stages if not _holds(folder, name, made_by_stages)]
     with tempfile.TemporaryDirectory(prefix="egvs-verify-") as temporary:
         elsewhere = Path(temporary)
-        again, work = (
-            _before_the_first_stage(scenario, elsewhere),
-            Workspace(scenario, elsewhere, jobs=jobs, progress=progress),
-        )
-        made_by_stages = {artefact for stage in record.stages.values() for artefact in stage.artefacts}
+        work = Workspace(scenario, elsewhere, jobs=jobs, progress=progress)
+        again = _record_so_far(scenario, elsewhere)
         for name, before in record.stages.items():
-            beside = before.files.keys() - made_by_stages
-            _lay_beside(folder, elsewhere, {file: before.files[file] for file in beside})
+            beside = before.files.keys() - made_by_stages.keys()
+            for file in beside:  # an accuracy study, which the report shows
+                if Path(file).name == file and _holds(folder, file, before.files):
+                    shutil.copyfile(folder / file, elsewhere / file)
             inputs = stages.inputs(name, work)
-            for file in sorted(file for file in beside if inputs.files.get(file) != before.files[file]):
+            for file in sorted(file for file in beside if inputs.read.files.get(file) != before.files[file]):
                 made_of_it = " and ".join(before.artefacts) or f"the stage {name}"
                 wrong.append(f"{made_of_it} shows {file}, which was replaced since; egvs {name} makes it anew")
             listener(name, "runs", None)
             made = stages.make(name, work, inputs)
-            after = StageRecord(inputs.key, inputs.files, made.artefacts, made.summary, made.cost)
+            after = made.record(inputs)
             listener(name, "done", after)
             again = again.having(name, replace(after, cost=before.cost))  # which the report shows
             again.write(elsewhere)
@@ -264,13 +262,9 @@ def verify(
     return wrong
 
 
-def _lay_beside(folder: Path, elsewhere: Path, read: dict[str, str]) -> None:
-    """Lay files of the run's folder that a stage read and no stage made (an accuracy study, which the report shows)
-    beside what is made again, where they are still the same."""
-    for name, digest in read.items():
-        path = folder / name
-        if Path(name).name == name and path.is_file() and files.sha256_of(path) == digest:
-            shutil.copyfile(path, elsewhere / name)
+def _holds(folder: Path, name: str, digests: dict[str, str]) -> bool:
+    """Whether a file is there as it was."""
+    return (folder / name).is_file() and files.sha256_of(folder / name) == digests[name]
 
 
 def _differences(before: StageRecord, after: StageRecord) -> Iterator[str]:
@@ -278,11 +272,3 @@ def _differences(before: StageRecord, after: StageRecord) -> Iterator[str]:
         then, now = (stage.artefacts.get(artefact, "absent")[:12] for stage in (before, after))
         if then != now:
             yield f"{artefact} differs from what the run made: {then} then, {now} now"
-
-
-def _altered(folder: Path, record: RunRecord) -> Iterator[str]:
-    for stage in record.stages.values():
-        for artefact, digest in stage.artefacts.items():
-            path = folder / artefact
-            if not path.is_file() or files.sha256_of(path) != digest:
-                yield artefact

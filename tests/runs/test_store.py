@@ -45,7 +45,7 @@ def assert_whole(store: Path) -> list[Entry]:
     entries = kept.entries()
     assert {entry.folder for entry in entries} == {path for path in store.iterdir() if path.name[0] != "."}
     for entry in entries:
-        for name, digest in entry.hashes.items():
+        for name, digest in entry.made.files.items():
             assert files.sha256_of(entry.folder / name) == digest
     for place in (".work", ".locks"):
         assert not (store / place).is_dir() or not list((store / place).iterdir())
