@@ -2,7 +2,8 @@
 
 The scale is viridis (van der Walt, Smith 2015; CC0), the same for every kind of colour vision, and in grey. On light
 pages the largest value is darkest, on dark pages brightest: what matters stands out on both. Colours are mixed in whole
-numbers, so that they are the same on every machine."""
+numbers, so that they are the same on every machine.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """Places of sites on a map: sites that share one, and where the names go, so that they hide little.
 
 Steps: group sites by place; for each place that is to be named try eight sides at four distances; take the first spot
-that covers nothing, or else the one that covers least."""
+that covers nothing, or else the one that covers least.
+"""
 
 from __future__ import annotations
 

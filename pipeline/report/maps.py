@@ -3,7 +3,8 @@
 - :func:`occupancy`: a field over the region, summed along z, with the static outlines and the sites;
 - :func:`site_map`: the sites, coloured by score, numbered by rank;
 - :func:`site_view`: what one site sees or misses; :func:`pipeline.report.plan.shared_scale` is the colour scale that
-  such figures share."""
+  such figures share.
+"""
 
 from __future__ import annotations
 
@@ -24,18 +25,8 @@ from pipeline.report.raster import ColumnValues
 
 @dataclass(frozen=True)
 class SiteView:
-    """A sensor in its place, and what a figure of it shows.
-
-    Attributes
-    ----------
-    site
-        Where it stands.
-    crossed
-        Which voxels its beams cross, (nx, ny, nz) bool.
-    outlines
-        Of the static world.
-    box
-        What the figure shows, world frame, metres.
+    """A sensor in its place, and what a figure of it shows: the voxels that its beams cross, (nx, ny, nz) bool, and the
+    static outlines within a box.
     """
 
     site: MapSite
@@ -50,7 +41,7 @@ def occupancy(
     """A field over the region of interest, with the static outlines and the sites."""
     plan = Plan(extent(grid, sites), "tpog", north=True)
     peak = float(values.max(initial=0.0))
-    parts = [_field(plan, grid, values, peak), _drawn(plan, outlines), plan.roi(grid)]
+    parts = [_field(plan, grid, values, peak), _outline_paths(plan, outlines), plan.roi(grid)]
     parts += [_titled(_dot(plan, s), f"{s.site}: rank {s.rank}") for s in sites]
     return plan.svg(parts, alt, bar=ColourBar(0.0, peak, label))
 
@@ -59,15 +50,15 @@ def site_map(grid: Grid, values: ColumnValues, outlines: Sequence[Outlines], sit
     """The sites over the static outlines: colour by score, number by rank, name beside it; occupied roads faint below.
 
     Of sites that share a place, the best is in the middle of its rings. Where many sites stand, only the first ten and
-    the last keep a name; every site tells its own under the pointer."""
+    the last keep a name; every site tells its own under the pointer.
+    """
     plan = Plan(extent(grid, sites), "sites", north=True)
     places = places_of(sites)
-    low, high = min(s.egvs for s in sites), max(s.egvs for s in sites)
-    crowded = is_crowded(sites)
+    crowded, low, high = is_crowded(sites), min(s.egvs for s in sites), max(s.egvs for s in sites)
     radius = 8.5 if not crowded else 6.0 if len(places) <= 120 else 4.0
     parts = [
         f'<g class="faint">{_field(plan, grid, values, float(values.max(initial=0.0)))}</g>',
-        f"<g>{_drawn(plan, outlines)}</g>",
+        f"<g>{_outline_paths(plan, outlines)}</g>",
         plan.roi(grid),
     ]
     parts += [_rings(plan, place, low, high, radius, crowded) for place in reversed(places)]
@@ -94,7 +85,7 @@ def site_view(grid: Grid, values: ColumnValues, peak: float, view: SiteView, pre
     parts = [
         plan.image(grid, raster.shade_image(np.logical_not(view.crossed.any(axis=2))), "shadow"),
         _field(plan, grid, values, peak),
-        _drawn(plan, view.outlines),
+        _outline_paths(plan, view.outlines),
         plan.roi(grid),
         _titled(f'<path class="sensor" d="M{x:.1f} {y - 9:.1f}l7.8 13.5h-15.6z"/>', f"{site.site}, the sensor"),
     ]
@@ -105,7 +96,7 @@ def _field(plan: Plan, grid: Grid, values: ColumnValues, peak: float) -> str:
     return "".join(plan.image(grid, png, look) for look, png in raster.field_images(values, peak))
 
 
-def _drawn(plan: Plan, outlines: Sequence[Outlines]) -> str:
+def _outline_paths(plan: Plan, outlines: Sequence[Outlines]) -> str:
     def path(ring: NDArray[np.float64]) -> str:
         xs = plan.left + (ring[:-1, 0] - plan.box[0]) * plan.scale
         ys = plan.top + (plan.box[3] - ring[:-1, 1]) * plan.scale
@@ -117,8 +108,8 @@ def _drawn(plan: Plan, outlines: Sequence[Outlines]) -> str:
     )
 
 
-def _titled(drawn: str, title: str) -> str:
-    return f"<g><title>{escape(title)}</title>{drawn}</g>"
+def _titled(shape: str, title: str) -> str:
+    return f"<g><title>{escape(title)}</title>{shape}</g>"
 
 
 def _dot(plan: Plan, site: MapSite) -> str:

@@ -54,16 +54,9 @@ class ScoredSite(MapSite):
 
 @dataclass(frozen=True)
 class Ranking:
-    """Sites by rank, those of equal rank in the order of the sites.
+    """Sites by rank, those of equal rank in the order of the sites; at least one.
 
-    Attributes
-    ----------
-    sites
-        At least one.
-    best
-        Those of rank 1.
-    close
-        Those that follow within ``CLOSE`` of the best score.
+    The ``best`` are those of rank 1, the ``close`` ones follow within ``CLOSE`` of the best score.
     """
 
     sites: tuple[ScoredSite, ...]

@@ -1,7 +1,8 @@
 """Values over the region of interest as indexed PNG images, in data URIs.
 
 The few lines that write PNG are ours: an imaging library takes longer to import than all images to write, and its
-compressor may choose other bytes on another processor."""
+compressor may choose other bytes on another processor.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ _MOST_PIXELS = 240_000
 
 def field_images(values: ColumnValues, peak: float) -> Iterator[tuple[str, str]]:
     """Class (``day`` for light pages, ``night`` for dark ones) and image of a field, on a square-root scale up to
-    ``peak``; nothing where that is 0."""
+    ``peak``; nothing where that is 0.
+    """
     if not peak > 0:
         return
     share = np.sqrt(np.minimum(shrunk(values, np.mean) / peak, 1.0))
@@ -44,7 +46,8 @@ def shade_image(shaded: NDArray[np.bool_]) -> str:
 
 def shrunk(values: ColumnValues, how: Callable[..., Any]) -> ColumnValues:
     """Fewer, larger pixels where there are more than ``_MOST_PIXELS``; those at the far edges stand for the columns
-    that are left."""
+    that are left.
+    """
     factor = math.ceil(math.sqrt(values.size / _MOST_PIXELS))
     if factor <= 1:
         return values
@@ -79,7 +82,6 @@ def _png(index: NDArray[Any], palette: bytes, alpha: bytes) -> str:
 
 
 def _deflate(data: bytes) -> bytes:
-    """A zlib stream from Arrow's compressor, which comes with the package: the system's may give other bytes
-    elsewhere."""
+    """A zlib stream from Arrow's compressor, which comes with the package: the system's may give other bytes."""
     gzip: bytes = pa.Codec("gzip", compression_level=6).compress(data, asbytes=True)
     return b"\x78\x9c" + gzip[10:-8] + zlib.adler32(data).to_bytes(4, "big")
