@@ -19,7 +19,7 @@ from pipeline.artefacts.readers import SEPARABLE, Tpog, read_tpog
 from pipeline.artefacts.run_record import RECORD, RunRecord, StageRecord
 from pipeline.core import files
 from pipeline.core.version import __version__
-from pipeline.report import figures, labels, wording
+from pipeline.report import figures, maps, wording
 from pipeline.report.colours import STYLE_SHEET
 from pipeline.report.figures import Figures
 from pipeline.report.ranking import Ranking
@@ -53,7 +53,17 @@ def inputs(work: Workspace) -> StageInputs:
     """The artefacts by hash, the summaries and costs of the earlier stages, and the settings that are shown."""
     scenario, stages = work.scenario, _recorded(work.folder)
     read = ["trajectories.parquet", "tpog.parquet", "statics.ply", "scores.parquet"]
-    settings: dict[str, Any] = {"shown": _shown(scenario), "keep": scenario.scan.keep}
+    shown = {
+        "name": scenario.name,
+        "description": scenario.description,
+        "seed": scenario.seed,
+        "roi": scenario.roi.model_dump(mode="json"),
+        "frame_period_s": scenario.traffic.frame_period_s,
+        "vehicles": scenario.traffic.vehicles,
+        "gamma": repr(scenario.score.gamma),
+        "effects": scenario.effects.model_dump(mode="json"),
+    }
+    settings: dict[str, Any] = {"shown": shown, "keep": scenario.scan.keep}
     hashes: dict[str, str] = {}
     if scenario.scan.keep:
         read.append("scans.parquet")
@@ -75,19 +85,6 @@ def _recorded(folder: Path) -> dict[str, StageRecord]:
     """Those of ``STAGES`` that ``run.json`` knows; InputError where it is damaged."""
     known = RunRecord.read(folder).stages if (folder / RECORD).is_file() else {}
     return {name: known[name] for name in STAGES if name in known}
-
-
-def _shown(scenario: Scenario) -> dict[str, Any]:
-    return {
-        "name": scenario.name,
-        "description": scenario.description,
-        "seed": scenario.seed,
-        "roi": scenario.roi.model_dump(mode="json"),
-        "frame_period_s": scenario.traffic.frame_period_s,
-        "vehicles": scenario.traffic.vehicles,
-        "gamma": repr(scenario.score.gamma),
-        "effects": scenario.effects.model_dump(mode="json"),
-    }
 
 
 def run(work: Workspace, inputs: StageInputs) -> Summary:
@@ -149,8 +146,8 @@ def page(
         limit_share=wording.share_of_limit(sites[0]),
         separable=SEPARABLE,
         has_traffic=has_traffic,
-        crowded=labels.is_crowded(sites),
-        rings=labels.has_shared_places(sites),
+        crowded=maps.is_crowded(sites),
+        rings=maps.has_shared_places(sites),
         style=Markup(STYLE_SHEET),
         gamma="∞" if math.isinf(gamma) else f"{gamma:g}",
         uncapped=math.isinf(gamma),

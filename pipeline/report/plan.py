@@ -19,8 +19,6 @@ from pipeline.report.colours import STEPS, STYLE_SHEET, opacity
 Box = tuple[float, float, float, float]
 """x0, y0, x1, y1: in the world frame, metres, or in a figure's units."""
 
-_WIDTH, _TALLEST = 760.0, 560.0
-
 
 @dataclass(frozen=True)
 class MapSite:
@@ -71,7 +69,7 @@ class Plan:
     """
 
     def __init__(
-        self, box: Box, prefix: str, width: float = _WIDTH, tallest: float = _TALLEST, north: bool = False
+        self, box: Box, prefix: str, width: float = 760.0, tallest: float = 560.0, north: bool = False
     ) -> None:
         self.box, self.prefix, self.width, self.north = box, prefix, width, north
         self._ticks = [round_values(box[0], box[2], 9 if width > 600 else 6), round_values(box[1], box[3], 6)]

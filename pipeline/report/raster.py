@@ -9,7 +9,7 @@ from __future__ import annotations
 import base64
 import math
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -35,7 +35,7 @@ def field_images(values: ColumnValues, peak: float) -> Iterator[tuple[str, str]]
     index = np.where(share > 0, 1 + np.floor(share * 253.999), 0).astype(np.uint8).T[::-1]
     alpha = bytes([0, *(round(255 * opacity(i / 254)) for i in range(255))])
     for look, stops in (("day", ON_LIGHT), ("night", ON_DARK)):
-        yield look, _png(index, b"\0\0\0" + _palette(stops), alpha)
+        yield look, _png(index, b"\0\0\0" + b"".join(mixed(n, 254, stops) for n in range(255)), alpha)
 
 
 def shade_image(shaded: NDArray[np.bool_]) -> str:
@@ -55,11 +55,6 @@ def shrunk(values: ColumnValues, how: Callable[..., Any]) -> ColumnValues:
     padded = np.pad(values, ((0, nx * factor - values.shape[0]), (0, ny * factor - values.shape[1])), mode="edge")
     smaller: ColumnValues = how(padded.reshape(nx, factor, ny, factor), axis=(1, 3))
     return smaller
-
-
-def _palette(stops: Sequence[str]) -> bytes:
-    """255 colours between the stops, RGB."""
-    return b"".join(mixed(n, 254, stops) for n in range(255))
 
 
 def _png(index: NDArray[Any], palette: bytes, alpha: bytes) -> str:
