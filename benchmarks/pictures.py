@@ -89,7 +89,7 @@ def before_and_after(name: str, folder: Path) -> Iterator[tuple[str, str]]:
         found.append((word, *seen(scenario, out, site)))
     tpog = read_tpog(out / "tpog.parquet")
     scored = ScoredSite.all_of(read_scores(out / "scores.parquet"))
-    place = next(s for s in scored if s.site == (site or scored[0].site)).on_map
+    place = next(s for s in scored if s.site == (site or scored[0].site))
     box = extent(tpog.grid, [place])
     outlines = outlines_of(read_ply(out / "statics.ply")[0], box)
     peak = max(float(field.max()) for _, field, _ in found)

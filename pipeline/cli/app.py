@@ -239,7 +239,7 @@ def effects(
     jobs: Jobs = None,
 ) -> None:
     """Print which effects exist; for a scenario, which it calls for, and why."""
-    from pipeline.cli import effect_tables
+    from pipeline.cli import tables
     from pipeline.cli.progress import Screen
     from pipeline.studies import ablation as ablations
     from pipeline.studies import effect_overview
@@ -247,11 +247,11 @@ def effects(
     if scenario is None:
         if ablation:
             raise InputError("--ablation", "without a scenario", "egvs effects SCENARIO --ablation")
-        effect_tables.print_effects(effect_overview.catalogue())
+        tables.print_effects(effect_overview.catalogue())
         return
     resolved, folder = _resolved(scenario, set_, out)
     prices, calls = effect_overview.prices(resolved, folder), effect_overview.called(resolved)
-    effect_tables.print_effects(calls, prices)
+    tables.print_effects(calls, prices)
     on = [call.name for call in calls if call.state == "on" and call.name in resolved.effects.named]
     unpriced = [name for name in on if name not in (prices or {})]
     if prices is None or unpriced:
@@ -264,7 +264,7 @@ def effects(
             )
         with Screen() as screen:
             changes = ablations.ablation(resolved, folder, jobs=jobs, progress=screen.progress)
-        effect_tables.print_ablation(changes)
+        tables.print_ablation(changes)
 
 
 # ---- catalogues, and scenarios to begin with
@@ -273,10 +273,10 @@ def effects(
 @app.command()
 def sensors() -> None:
     """Print the sensor catalogue."""
-    from pipeline.cli.sensor_table import print_sensors
+    from pipeline.cli import tables
     from pipeline.sensing.sensors import CATALOGUE
 
-    print_sensors(CATALOGUE.values())
+    tables.print_sensors(CATALOGUE.values())
 
 
 @app.command()
@@ -307,17 +307,17 @@ def store(
     clear: Annotated[bool, typer.Option("--clear", help="Remove every entry.")] = False,
 ) -> None:
     """What earlier runs made and what of it is kept; a run fetches from there what it would make again."""
-    from pipeline.cli import store_table
+    from pipeline.cli import tables
     from pipeline.runs.store import Store
 
     if most is not None and not prune:
         raise InputError("--max", "without --prune", "egvs store --prune --max 2G")
     kept = Store.default()
     if clear or prune:
-        bound = -1.0 if clear else kept.bound_bytes if most is None else store_table.bytes_of(most)
-        store_table.print_removed(kept, kept.prune(bound))
+        bound = -1.0 if clear else kept.bound_bytes if most is None else arguments.size_bytes(most)
+        tables.print_removed(kept, kept.prune(bound))
     else:
-        store_table.print_store(kept)
+        tables.print_store(kept)
 
 
 def _resolved(path: Path, set_: list[str] | None, out: Path | None) -> tuple[Scenario, Path]:

@@ -34,6 +34,15 @@ def duration_s(text: str) -> float:
     return seconds
 
 
+def size_bytes(text: str) -> float:
+    """``--max``: bytes from 500M or 2G."""
+    units = {"": 1.0, "K": 1e3, "M": 1e6, "G": 1e9, "T": 1e12}
+    match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)([KMGT]?)B?", text)
+    if match is None:
+        raise InputError("--max", repr(text), "a size, for example 500M or 2G")
+    return float(match[1]) * units[match[2]]
+
+
 def host_and_port(text: str) -> tuple[str, int]:
     """``--traci``: HOST:PORT."""
     host, _, port = text.rpartition(":")

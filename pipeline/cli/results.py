@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.table import Table
 
-from pipeline.artefacts.readers import read_scores
+from pipeline.artefacts.readers import SEPARABLE, read_scores
 from pipeline.artefacts.run_record import RunRecord
-from pipeline.cli.ranking_table import ranking_table
-from pipeline.cli.terminal import console, in_words, value_in_words
+from pipeline.cli.terminal import NARROW, WIDE, console, in_words, table, value_in_words
 from pipeline.report.ranking import ScoredSite
 
 if TYPE_CHECKING:
@@ -20,15 +20,41 @@ if TYPE_CHECKING:
 _FILE_WIDTH = 150
 
 
+def ranking_table(sites: Sequence[ScoredSite], width: int = WIDE) -> Table:
+    """Sites by rank; without poses and sensors where the terminal is narrow."""
+    is_wide, has_errors = width >= NARROW, any(site.egvs_se is not None for site in sites)
+    names = ["rank", "site", *(["x m", "y m", "z m", "sensor"] if is_wide else []), "EGVS bit"]
+    names += ["std error", "beats next"] if has_errors else []
+    names += ["of best", "entropy seen", *(["beams in ROI"] if is_wide else [])]
+    ranking = table(names, left=("site", "sensor"), whole=[name for name in names if name != "site"])
+    if not all(site.is_separable for site in sites):
+        chance = f"the chance that it truly scores higher is below {SEPARABLE:.0%}"
+        ranking.caption = f"~ not separable from the next site: {chance}"
+    by_rank = sorted(sites, key=lambda site: site.rank)
+    best = max((site.egvs for site in sites), default=0.0)
+    for site in by_rank:
+        sure = "" if site.is_separable else "~ "
+        cells = {
+            "rank": str(site.rank), "site": site.site, "x m": f"{site.x_m:.2f}", "y m": f"{site.y_m:.2f}",
+            "z m": f"{site.z_m:.2f}", "sensor": site.sensor, "EGVS bit": f"{site.egvs:.1f}",
+            "std error": "-" if site.relative_se is None else f"{site.relative_se:.1%}",
+            "beats next": "-" if site.beats_next is None or site is by_rank[-1] else f"{sure}{site.beats_next:.0%}",
+            "of best": f"{site.egvs / best:.1%}" if best > 0 else "-", "entropy seen": f"{site.entropy_seen:.1%}",
+            "beams in ROI": str(site.beams_in_roi),
+        }  # fmt: skip
+        ranking.add_row(*(cells[name] for name in names))
+    return ranking
+
+
 def print_run(folder: Path, record: RunRecord, *, anything_ran: bool) -> None:
     """The ranking, the artefacts, and what each stage cost."""
     out = console(_FILE_WIDTH)
     _print_scores(out, folder, record)
-    table = Table("stage", "artefact", "seconds", "peak MB", box=None, pad_edge=False)
+    stages = Table("stage", "artefact", "seconds", "peak MB", box=None, pad_edge=False)
     for stage, done in record.stages.items():
         names = "\n".join(str(folder / name) for name in done.artefacts)
-        table.add_row(stage, names, f"{done.cost.seconds:.2f}", f"{done.cost.peak_mb:.0f}")
-    out.print(table)
+        stages.add_row(stage, names, f"{done.cost.seconds:.2f}", f"{done.cost.peak_mb:.0f}")
+    out.print(stages)
     if not anything_ran:
         out.print("nothing to do: no stage's inputs changed since the last run")
 

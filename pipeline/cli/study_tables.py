@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.table import Table
 
-from pipeline.cli.terminal import WIDE, console
+from pipeline.cli.terminal import WIDE, console, table
 
 if TYPE_CHECKING:
     from pipeline.studies.accuracy import AccuracyStudy
@@ -55,17 +55,13 @@ def _reference(study: AccuracyStudy) -> str:
 
 
 def _settings(title: str, rows: Sequence[Row], errors: bool, is_wide: bool) -> Table:
-    table = Table(box=None, pad_edge=False, title=title, title_justify="left")
     names = ["", "setting", "seconds"]
     names += ["+-", "busy", "traffic", "tpog", "scan", "score", "memory MB", "disk MB"] if is_wide else []
     names += ["error", "std error"] if errors else []
     names += ["vs own"] if errors and is_wide else []
     names += ["tau", "rho", "kept", "regret"] if is_wide else ["tau", "kept", "regret"]
-    for name in names:
-        left = name in ("", "setting")
-        table.add_column(
-            name, justify="left" if left else "right", no_wrap=is_wide or name != "setting", overflow="fold"
-        )
+    settings = table(names, left=("", "setting"), whole=[name for name in names if is_wide or name != "setting"])
+    settings.title, settings.title_justify = title, "left"
     for r in rows:
         known = "-" if math.isnan(r.error_se) else f"{r.error_se:.2%}"
         cells = {
@@ -77,32 +73,24 @@ def _settings(title: str, rows: Sequence[Row], errors: bool, is_wide: bool) -> T
             "kept": ", ".join(["best"] * r.best_kept + ["three"] * r.best_three_kept) or "-",
             "regret": f"{r.regret:.2%}",
         }  # fmt: skip
-        table.add_row(*(cells[name] for name in names))
-    return table
+        settings.add_row(*(cells[name] for name in names))
+    return settings
 
 
 def _print_seeds(out: Console, seeds: Seeds) -> None:
     """How far scores of independent runs scatter, and what the standard errors said."""
-    table = Table(
-        box=None,
-        pad_edge=False,
-        title=f"{seeds.seeds} independent runs of {seeds.frames} frames, bit",
-        title_justify="left",
-    )
-    for name in ("site", "between runs", "standard error", "bias", "expected bias"):
-        table.add_column(name, justify="left" if name == "site" else "right")
+    scatter = table(("site", "between runs", "standard error", "bias", "expected bias"), left=("site",), fold=False)
+    scatter.title, scatter.title_justify = f"{seeds.seeds} independent runs of {seeds.frames} frames, bit", "left"
     for row in zip(seeds.sites, seeds.between, seeds.within, seeds.bias, seeds.expected_bias, strict=True):
-        table.add_row(row[0], *(f"{value:.0f}" for value in row[1:]))
-    out.print(table)
+        scatter.add_row(row[0], *(f"{value:.0f}" for value in row[1:]))
+    out.print(scatter)
     out.print(f"90 % intervals hold the score of all runs together in {seeds.covered:.1%} of cases")
 
 
 def _recommendation(study: AccuracyStudy, command: str) -> str:
     if study.empty:
-        return (
-            "every score is 0, so that there is nothing to choose by: "
-            "look where the region of interest and the traffic are"
-        )
+        nothing = "every score is 0, so that there is nothing to choose by"
+        return f"{nothing}: look where the region of interest and the traffic are"
     rivals = [row for row in study.rows if row.kind in ("approximates", "scenario")]
     if study.best is None and len(rivals) == 1:
         own = f"{rivals[0].judged:.2%}"

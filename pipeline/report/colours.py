@@ -2,7 +2,8 @@
 
 The scale is viridis (van der Walt, Smith 2015; CC0), the same for every kind of colour vision, and in grey. On light
 pages the largest value is darkest, on dark pages brightest: what matters stands out on both. Colours are mixed in whole
-numbers, so that they are the same on every machine."""
+numbers, so that they are the same on every machine.
+"""
 
 from __future__ import annotations
 
@@ -45,10 +46,11 @@ def step(value: float, low: float, high: float) -> int:
     return round(STEPS * (value - low) / (high - low)) if high > low else STEPS
 
 
-def _style_sheet() -> str:
-    light = "".join(f".q{i}{{fill:#{c};stop-color:#{c}}}" for i, c in enumerate(ON_LIGHT))
-    dark = "".join(f".q{i}{{fill:#{c};stop-color:#{c}}}" for i, c in enumerate(ON_DARK))
-    return f"""
+def _classes(stops: Sequence[str]) -> str:
+    return "".join(f".q{i}{{fill:#{c};stop-color:#{c}}}" for i, c in enumerate(stops))
+
+
+STYLE_SHEET = f"""
 .plan {{ --large: #d5d8df; --large-line: #7d8494; --green: #9fc3b6; --green-line: #5f8f80; --small: #4d5564; \
 --halo: #ffffff;
   display: block; width: 100%; height: auto; color: #1d2430; font: 12px system-ui, "DejaVu Sans", sans-serif; }}
@@ -71,17 +73,14 @@ stroke-linejoin: round; }}
 .plan .sensor {{ fill: #e8590c; stroke: var(--halo); stroke-width: 1.5; }}
 .plan image {{ image-rendering: pixelated; }}
 .plan .night {{ display: none; }}
-{light}
+{_classes(ON_LIGHT)}
 @media screen and (prefers-color-scheme: dark) {{
 .plan {{ --large: #343b48; --large-line: #7f889a; --green: #2f5b4f; --green-line: #6fa493; --small: #a9b2c3; \
 --halo: #12161d;
   color: #e6e9ef; }}
 .plan .low {{ fill: #ffffff; }} .plan .high {{ fill: #14181f; }}
 .plan .day {{ display: none; }} .plan .night {{ display: inline; }}
-{dark}
+{_classes(ON_DARK)}
 }}
 """
-
-
-STYLE_SHEET = _style_sheet()
 """What the figures' classes look like; a page that holds figures holds this once."""

@@ -1,7 +1,8 @@
 """The outlines of the static world seen from above, in world-frame metres (x east, y north).
 
 Steps: project each solid's triangles, leave out the ground and what lies outside; unite the triangles of a kind; sort
-the kinds by what they look like on a map; cut at the map's edge."""
+the kinds by what they look like on a map; cut at the map's edge.
+"""
 
 from __future__ import annotations
 
@@ -22,16 +23,8 @@ _GREEN = ("tree", "crown", "canopy", "hedge", "bush", "vegetation", "forest", "w
 
 @dataclass(frozen=True)
 class Outlines:
-    """All outlines of one look (``large``, ``green`` or ``small``).
-
-    Attributes
-    ----------
-    look
-        The class of the style sheet.
-    kinds
-        What they are, in words.
-    rings
-        Closed rings (n, 2), world frame, metres; holes among them (even-odd).
+    """All outlines of one look (``large``, ``green`` or ``small``: the class of the style sheet): kinds in words, and
+    closed rings (n, 2), world frame, metres, holes among them (even-odd).
     """
 
     look: str

@@ -4,28 +4,35 @@ Steps: read the scores, the TPOG and ``run.json``; draw (:mod:`pipeline.report.f
 ``report.html`` is one file that fetches nothing.
 
 It is a function of the artefacts and of what ``run.json`` holds of the earlier stages, their costs included: no clock,
-no path, no machine. A second run with the same costs writes the same bytes."""
+no path, no machine. A second run with the same costs writes the same bytes. Stages that ran one by one in a notebook
+leave no ``run.json``: the page then says that it does not know.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from pipeline.artefacts.readers import SEPARABLE, Tpog, read_tpog
+from pipeline.artefacts.run_record import RECORD, RunRecord, StageRecord
 from pipeline.core import files
 from pipeline.core.version import __version__
-from pipeline.report import figures, labels, wording
+from pipeline.report import figures, maps, wording
 from pipeline.report.colours import STYLE_SHEET
 from pipeline.report.figures import Figures
 from pipeline.report.ranking import Ranking
-from pipeline.report.record import ACCURACY, ShownRun, StudySummary
+from pipeline.report.study import ACCURACY, StudySummary
 from pipeline.scenario.models import Scenario
 from pipeline.stages.base import StageInputs, Summary, Workspace
 from pipeline.stages.scene import scan_inputs
 
 NAME = "report"
 ARTEFACTS = ("report.html",)
+
+STAGES = ("traffic", "statics", "tpog", "scan", "score")
+"""Those whose costs and artefacts the page shows, in its order."""
 
 LISTED, FIRST, LAST = 40, 30, 5
 """More than ``LISTED`` sites are shown as the first and the last of them."""
@@ -44,25 +51,9 @@ _LEFT_OUT = (
 
 def inputs(work: Workspace) -> StageInputs:
     """The artefacts by hash, the summaries and costs of the earlier stages, and the settings that are shown."""
+    scenario, stages = work.scenario, _recorded(work.folder)
     read = ["trajectories.parquet", "tpog.parquet", "statics.ply", "scores.parquet"]
-    stages = ShownRun.read(work.folder).stages
-    settings: dict[str, Any] = {"shown": _shown(work.scenario), "keep": work.scenario.scan.keep}
-    hashes: dict[str, str] = {}
-    if work.scenario.scan.keep:
-        read.append("scans.parquet")
-    else:
-        cast = scan_inputs(work)
-        settings["scan"], hashes = cast.settings, dict(cast.files)
-    hashes |= work.digests(*(name for name in (*read, *ACCURACY) if work.path(name).is_file()))
-    more = {
-        "costs": {name: [stage.seconds, stage.peak_mb] for name, stage in stages.items()},
-        "summaries": {name: dict(stages[name].summary) for name in ("traffic", "statics")},
-    }
-    return StageInputs(settings, hashes, more)
-
-
-def _shown(scenario: Scenario) -> dict[str, Any]:
-    return {
+    shown = {
         "name": scenario.name,
         "description": scenario.description,
         "seed": scenario.seed,
@@ -72,6 +63,28 @@ def _shown(scenario: Scenario) -> dict[str, Any]:
         "gamma": repr(scenario.score.gamma),
         "effects": scenario.effects.model_dump(mode="json"),
     }
+    settings: dict[str, Any] = {"shown": shown, "keep": scenario.scan.keep}
+    hashes: dict[str, str] = {}
+    if scenario.scan.keep:
+        read.append("scans.parquet")
+    else:
+        cast = scan_inputs(work)
+        settings["scan"], hashes = cast.settings, dict(cast.files)
+    hashes |= work.digests(*(name for name in (*read, *ACCURACY) if work.path(name).is_file()))
+    # what a stage sums up is the same in every run, but for the seconds of SUMO, which are not shown
+    summaries = {
+        name: {key: value for key, value in stages[name].summary.items() if key != "sumo_seconds"}
+        for name in ("traffic", "statics")
+        if name in stages
+    }
+    costs = {name: [stage.cost.seconds, stage.cost.peak_mb] for name, stage in stages.items()}
+    return StageInputs(settings, hashes, {"costs": costs, "summaries": summaries})
+
+
+def _recorded(folder: Path) -> dict[str, StageRecord]:
+    """Those of ``STAGES`` that ``run.json`` knows; InputError where it is damaged."""
+    known = RunRecord.read(folder).stages if (folder / RECORD).is_file() else {}
+    return {name: known[name] for name in STAGES if name in known}
 
 
 def run(work: Workspace, inputs: StageInputs) -> Summary:
@@ -84,43 +97,46 @@ def run(work: Workspace, inputs: StageInputs) -> Summary:
     """
     del inputs
     out = work.folder
-    ranking, tpog, record = Ranking.read(out / "scores.parquet"), read_tpog(out / "tpog.parquet"), ShownRun.read(out)
+    ranking, tpog, stages = Ranking.read(out / "scores.parquet"), read_tpog(out / "tpog.parquet"), _recorded(out)
     work.progress("artefacts read", 1, 3)
     drawn = figures.draw(work, ranking, tpog)
     work.progress("figures drawn", 2, 3)
-    html = page(work.scenario, ranking, tpog, drawn, record, StudySummary.read(out, record))
+    html = page(work.scenario, ranking, tpog, drawn, stages, StudySummary.read(out, stages))
     files.write_text(work.path(ARTEFACTS[0]), html)
     work.progress("page written", 3, 3)
-    return {
-        "best": ranking.sites[0].site,
-        "worst": ranking.last.site,
-        "kilobytes": round(len(html.encode("utf-8")) / 1000),
-    }
+    kilobytes = round(len(html.encode("utf-8")) / 1000)
+    return {"best": ranking.sites[0].site, "worst": ranking.last.site, "kilobytes": kilobytes}
 
 
 def page(
-    scenario: Scenario, ranking: Ranking, tpog: Tpog, drawn: Figures, record: ShownRun, study: StudySummary | None
+    scenario: Scenario,
+    ranking: Ranking,
+    tpog: Tpog,
+    drawn: Figures,
+    stages: Mapping[str, StageRecord],
+    study: StudySummary | None,
 ) -> str:
-    """The whole page, HTML text."""
+    """The whole page, HTML text; ``stages`` are those that are known, in the order of ``STAGES``."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 
+    loader = FileSystemLoader(Path(__file__).parent / "templates")
     environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent / "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
+        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters |= {"svg": Markup, "share": wording.share, "whole": wording.whole, "plain": wording.plain}
     sites, effects, gamma = ranking.sites, list(scenario.effects.named), scenario.score.gamma
     shortened, has_traffic = len(sites) > LISTED, bool(tpog.counts.any())
+    seconds = [stage.cost.seconds for stage in stages.values()]
     return environment.get_template("report.html.j2").render(
         scenario=scenario,
         ranking=ranking,
         tpog=tpog,
         figures=drawn,
-        record=record,
+        stages={name: stages.get(name) for name in STAGES},
+        total_s=math.fsum(seconds),
+        longest_s=max(seconds, default=0.0),
+        artefacts=[artefact for stage in stages.values() for artefact in stage.artefacts.items()],
         study=study,
         first=sites[:FIRST] if shortened else sites,
         last=sites[-LAST:] if shortened else (),
@@ -130,8 +146,8 @@ def page(
         limit_share=wording.share_of_limit(sites[0]),
         separable=SEPARABLE,
         has_traffic=has_traffic,
-        crowded=labels.is_crowded(ranking.on_map),
-        rings=labels.has_shared_places(ranking.on_map),
+        crowded=maps.is_crowded(sites),
+        rings=maps.has_shared_places(sites),
         style=Markup(STYLE_SHEET),
         gamma="∞" if math.isinf(gamma) else f"{gamma:g}",
         uncapped=math.isinf(gamma),

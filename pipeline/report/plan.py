@@ -3,7 +3,8 @@ region of interest, colour bar.
 
 A figure is SVG text. It is written here, not by a plotting library: colours then follow the page (light, dark, print)
 through the classes in :data:`pipeline.report.colours.STYLE_SHEET`, lettering stays text, and the bytes depend on no
-installed font."""
+installed font.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +18,6 @@ from pipeline.report.colours import STEPS, STYLE_SHEET, opacity
 
 Box = tuple[float, float, float, float]
 """x0, y0, x1, y1: in the world frame, metres, or in a figure's units."""
-
-_WIDTH, _TALLEST = 760.0, 560.0
 
 
 @dataclass(frozen=True)
@@ -70,7 +69,7 @@ class Plan:
     """
 
     def __init__(
-        self, box: Box, prefix: str, width: float = _WIDTH, tallest: float = _TALLEST, north: bool = False
+        self, box: Box, prefix: str, width: float = 760.0, tallest: float = 560.0, north: bool = False
     ) -> None:
         self.box, self.prefix, self.width, self.north = box, prefix, width, north
         self._ticks = [round_values(box[0], box[2], 9 if width > 600 else 6), round_values(box[1], box[3], 6)]
@@ -160,7 +159,10 @@ class ColourBar:
     even: bool = False
 
     def svg(self, prefix: str, x: float, y: float, width: float) -> str:
-        stops = "".join(self._stop(i) for i in range(STEPS + 1))
+        covers = [1.0 if self.even else opacity(i / STEPS) for i in range(STEPS + 1)]
+        stops = "".join(
+            f'<stop class="q{i}" offset="{i / STEPS:.4f}" stop-opacity="{part:.2f}"/>' for i, part in enumerate(covers)
+        )
         fill = f'<linearGradient id="{prefix}-scale">{stops}</linearGradient>'
         place = f'x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="12"'
         bar = f'<rect class="axis" style="fill:url(#{prefix}-scale)" {place}/>'
@@ -173,13 +175,8 @@ class ColourBar:
         title = f'<text x="{x + width / 2:.1f}" y="{y + 44:.1f}" text-anchor="middle">{escape(self.label)}{note}</text>'
         return f"<g>{fill}{bar}{ticks}{title}</g>"
 
-    def _stop(self, i: int) -> str:
-        covers = 1.0 if self.even else opacity(i / STEPS)
-        return f'<stop class="q{i}" offset="{i / STEPS:.4f}" stop-opacity="{covers:.2f}"/>'
-
     def _ticks(self, x: float, width: float) -> list[tuple[float, str]]:
-        """Round values, no closer to each other than their lettering allows; on a square-root scale, finer towards
-        zero."""
+        """Round values, no closer than their lettering allows; on a square-root scale, finer towards zero."""
         span = self.high - self.low
         values = round_values(self.low, self.high, 6)
         if not self.even:

@@ -18,28 +18,21 @@ CLOSE = 0.01
 
 
 @dataclass(frozen=True)
-class ScoredSite:
-    """A row of ``scores.parquet``; see its schema for units.
+class ScoredSite(MapSite):
+    """What is shown of a row of ``scores.parquet``; see its schema for units.
 
-    ``egvs_se``, ``egvs_bias`` and ``beats_next`` are None where no standard errors were computed."""
+    ``egvs_se`` and ``beats_next`` are None where no standard errors were computed.
+    """
 
-    site: str
-    x_m: float
-    y_m: float
-    z_m: float
     yaw_deg: float
     pitch_deg: float
     roll_deg: float
     sensor: str
-    egvs: float
     egvs_limit: float
-    rank: int
-    beams: int
     beams_in_roi: int
     returns: int
     entropy_seen: float
     egvs_se: float | None = None
-    egvs_bias: float | None = None
     beats_next: float | None = None
 
     @classmethod
@@ -55,27 +48,15 @@ class ScoredSite:
 
     @property
     def relative_se(self) -> float | None:
-        """The standard error as a share of the score; None where either is not known or 0."""
+        """The standard error as a share of the score; None where it is not known, or the score is 0."""
         return self.egvs_se / self.egvs if self.egvs_se is not None and self.egvs > 0 else None
-
-    @property
-    def on_map(self) -> MapSite:
-        """As the maps want it."""
-        return MapSite(self.site, self.x_m, self.y_m, self.z_m, self.egvs, self.rank)
 
 
 @dataclass(frozen=True)
 class Ranking:
-    """Sites by rank, those of equal rank in the order of the sites.
+    """Sites by rank, those of equal rank in the order of the sites; at least one.
 
-    Attributes
-    ----------
-    sites
-        At least one.
-    best
-        Those of rank 1.
-    close
-        Those that follow within ``CLOSE`` of the best score.
+    The ``best`` are those of rank 1, the ``close`` ones follow within ``CLOSE`` of the best score.
     """
 
     sites: tuple[ScoredSite, ...]
@@ -117,11 +98,6 @@ class Ranking:
     def shared_ranks(self) -> set[int]:
         """Ranks that several sites have."""
         return {rank for rank, count in Counter(s.rank for s in self.sites).items() if count > 1}
-
-    @property
-    def on_map(self) -> list[MapSite]:
-        """As the maps want it."""
-        return [site.on_map for site in self.sites]
 
     def of_best(self, site: ScoredSite) -> float:
         """A score as a share of the best one; 0 where that is 0."""

@@ -1,14 +1,15 @@
 """Values over the region of interest as indexed PNG images, in data URIs.
 
 The few lines that write PNG are ours: an imaging library takes longer to import than all images to write, and its
-compressor may choose other bytes on another processor."""
+compressor may choose other bytes on another processor.
+"""
 
 from __future__ import annotations
 
 import base64
 import math
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -26,14 +27,15 @@ _MOST_PIXELS = 240_000
 
 def field_images(values: ColumnValues, peak: float) -> Iterator[tuple[str, str]]:
     """Class (``day`` for light pages, ``night`` for dark ones) and image of a field, on a square-root scale up to
-    ``peak``; nothing where that is 0."""
+    ``peak``; nothing where that is 0.
+    """
     if not peak > 0:
         return
     share = np.sqrt(np.minimum(shrunk(values, np.mean) / peak, 1.0))
     index = np.where(share > 0, 1 + np.floor(share * 253.999), 0).astype(np.uint8).T[::-1]
     alpha = bytes([0, *(round(255 * opacity(i / 254)) for i in range(255))])
     for look, stops in (("day", ON_LIGHT), ("night", ON_DARK)):
-        yield look, _png(index, b"\0\0\0" + _palette(stops), alpha)
+        yield look, _png(index, b"\0\0\0" + b"".join(mixed(n, 254, stops) for n in range(255)), alpha)
 
 
 def shade_image(shaded: NDArray[np.bool_]) -> str:
@@ -44,7 +46,8 @@ def shade_image(shaded: NDArray[np.bool_]) -> str:
 
 def shrunk(values: ColumnValues, how: Callable[..., Any]) -> ColumnValues:
     """Fewer, larger pixels where there are more than ``_MOST_PIXELS``; those at the far edges stand for the columns
-    that are left."""
+    that are left.
+    """
     factor = math.ceil(math.sqrt(values.size / _MOST_PIXELS))
     if factor <= 1:
         return values
@@ -52,11 +55,6 @@ def shrunk(values: ColumnValues, how: Callable[..., Any]) -> ColumnValues:
     padded = np.pad(values, ((0, nx * factor - values.shape[0]), (0, ny * factor - values.shape[1])), mode="edge")
     smaller: ColumnValues = how(padded.reshape(nx, factor, ny, factor), axis=(1, 3))
     return smaller
-
-
-def _palette(stops: Sequence[str]) -> bytes:
-    """255 colours between the stops, RGB."""
-    return b"".join(mixed(n, 254, stops) for n in range(255))
 
 
 def _png(index: NDArray[Any], palette: bytes, alpha: bytes) -> str:
@@ -79,7 +77,6 @@ def _png(index: NDArray[Any], palette: bytes, alpha: bytes) -> str:
 
 
 def _deflate(data: bytes) -> bytes:
-    """A zlib stream from Arrow's compressor, which comes with the package: the system's may give other bytes
-    elsewhere."""
+    """A zlib stream from Arrow's compressor, which comes with the package: the system's may give other bytes."""
     gzip: bytes = pa.Codec("gzip", compression_level=6).compress(data, asbytes=True)
     return b"\x78\x9c" + gzip[10:-8] + zlib.adler32(data).to_bytes(4, "big")

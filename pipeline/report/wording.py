@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 from pipeline.report.ranking import CLOSE, Ranking, ScoredSite
 
@@ -21,16 +20,12 @@ def headline(ranking: Ranking, has_traffic: bool) -> str:
         return f"{top.site}, the only site, {sees}"
     if ranking.is_tie:
         same = f"All {len(best)} sites score the same"
-        return f"{same}: each {sees}" if _see_the_same(best) else same
+        return f"{same}: each {sees}" if len({site.entropy_seen for site in best}) == 1 else same
     if len(best) > 1:
         few = len(best) <= 4
         names = ", ".join(s.site for s in best[:-1]) if few else f"{top.site} and {len(best) - 2} others"
         return f"{names} and {best[-1].site} share the first place of {others + 1}: {top.site} {sees}"
     return f"{top.site} is the best of {others + 1} sites: it {sees}"
-
-
-def _see_the_same(sites: Sequence[ScoredSite]) -> bool:
-    return len({s.entropy_seen for s in sites}) == 1
 
 
 def lead(ranking: Ranking) -> str:

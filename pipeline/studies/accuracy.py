@@ -171,7 +171,7 @@ def _study(
     if REFERENCE not in scores:
         times = 1
     _write(written[0], scenario, rows, scores[SCENARIO], times, tolerance)
-    front_figure.draw_figure([_plotted(row) for row in rows], tolerance, scenario.name, written[1])
+    front_figure.draw_figure(rows, tolerance, scenario.name, written[1])
     neighbours = scores.get(REFERENCE, scores[SCENARIO]).neighbours
     empty = not any(scores[SCENARIO].shares)
     return AccuracyStudy(
@@ -331,12 +331,6 @@ def _repeat(
                 done += 1
                 progress("repeats", done, 0)
     return done
-
-
-def _plotted(r: Row) -> front_figure.PlottedSetting:
-    return front_figure.PlottedSetting(
-        r.setting, r.kind, r.knob, r.seconds, r.judged, r.tau, r.regret, r.front, r.recommended, r.default
-    )
 
 
 def _write(path: Path, scenario: Scenario, rows: list[Row], own: SettingScores, times: int, tolerance: float) -> None:

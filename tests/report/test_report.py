@@ -26,7 +26,6 @@ from pipeline.report.figures import Figures
 from pipeline.report.outlines import outlines_of
 from pipeline.report.plan import MapSite
 from pipeline.report.ranking import Ranking
-from pipeline.report.record import ShownRun
 from pipeline.scenario.effects import EffectsModel
 from pipeline.scenario.loading import from_values
 from pipeline.scoring.egvs import EntropyField
@@ -332,7 +331,7 @@ def test_effects_are_named_and_no_longer_left_out(made):
     assert "Effects none" in Reader(text).text and "fog" in text
     foggy = about.with_effects(EffectsModel.of({"fog": {"visibility_m": 100}, "moving_occlusion": {}}))
     ranking, tpog = Ranking.read(out / "scores.parquet"), read_tpog(out / "tpog.parquet")
-    shown = report.page(foggy, ranking, tpog, Figures("", "", (), "", ()), ShownRun.read(out), None)
+    shown = report.page(foggy, ranking, tpog, Figures("", "", (), "", ()), {}, None)
     assert "this run models fog, moving occlusion. Left out are rain, " in Reader(shown).text
 
 

@@ -244,12 +244,12 @@ def test_a_ranking_fits_the_terminal(mini: Path, tmp_path: Path, width: int) -> 
     """No number is cut, on the narrowest terminal too."""
     from rich.console import Console
 
-    from pipeline.cli import ranking_table
+    from pipeline.cli.results import ranking_table
 
     pipeline.run(pipeline.load(mini), tmp_path)
     table = pipeline.read_scores(tmp_path / "scores.parquet")
     console = Console(width=width, record=True, file=io.StringIO())
-    console.print(ranking_table.ranking_table(ScoredSite.all_of(table), width))
+    console.print(ranking_table(ScoredSite.all_of(table), width))
     text = console.export_text()
     assert "…" not in text
     assert all(len(line) <= width for line in text.splitlines())

@@ -16,7 +16,7 @@ import pytest
 import pipeline
 from pipeline.artefacts import tables
 from pipeline.artefacts.readers import SEPARABLE
-from pipeline.cli.ranking_table import ranking_table
+from pipeline.cli.results import ranking_table
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Grid
 from pipeline.report.ranking import ScoredSite
