@@ -14,6 +14,7 @@ SUMO (https://eclipse.dev/sumo) stands in for the paper's game-engine simulator.
 from __future__ import annotations
 
 import os
+from dataclasses import asdict
 from pathlib import Path
 
 from pipeline.artefacts import tables
@@ -79,11 +80,11 @@ def run(work: Workspace, inputs: StageInputs, traci: tuple[str, int] | None = No
     acting, notes = on_traffic.live(scenario)
     source = recording.record(scenario, work.path(COMPANIONS[0]), acting, work.progress, traci)
     with source as recorded, tables.writer(work.path(ARTEFACTS[0]), "trajectories") as file:
-        written = trajectories.write(scenario, recorded, acting, file, work.progress)
+        tally, reports = trajectories.write(scenario, recorded, acting, file, work.progress)
         period_s, frames = recorded.window.period_ms / 1000.0, scenario.traffic.frames
         file.describe(work.metadata(inputs, frames=frames, frame_period_s=period_s, sumo=inputs.more["sumo"]))
         summary = recorded.summary()
-    result = written.counts.to_json() | ({} if summary is None else summary.to_json())
+    result = tally.to_json(period_s) | ({} if summary is None else asdict(summary))
     if notes:
         result["notes"] = [*result.get("notes", []), *notes]
-    return result | written.of_extensions
+    return result | reports

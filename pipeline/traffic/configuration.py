@@ -240,7 +240,7 @@ class Prepared:
     """Whether the trips are drawn here, not a user's."""
     adds_traffic: bool
     """Whether extensions added traffic to it."""
-    notes: tuple[str, ...]
+    notes: list[str]
 
     @property
     def config(self) -> list[str]:
@@ -294,7 +294,7 @@ def prepare(scenario: Scenario, folder: Path, extensions: Iterable[TrafficExtens
     number = int(sumo_seed.generate_state(1)[0]) & 0x7FFFFFFF
     options = given.options | named | _settings(traffic, when, number, vehicles)
     files.write_text(folder / CONFIG, _config_xml(options))
-    return Prepared(folder, options, when, roads, drawn, bool(adding), tuple(notes))
+    return Prepared(folder, options, when, roads, drawn, bool(adding), notes)
 
 
 def _settings(traffic: TrafficModel, when: Timing, seed: int, vehicles: int) -> dict[str, str]:

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
-from typing import Any
 
 import pyarrow as pa
 
@@ -30,26 +29,13 @@ _LEAST_PATIENCE_S = 180.0
 
 @dataclass(frozen=True)
 class RecordingSummary:
-    """What SUMO did, as far as it is known: version, seconds, flags, collisions.
-
-    ``flags`` and ``seconds`` are None of a SUMO that somebody else started.
-    """
+    """What SUMO did: ``flags`` and ``sumo_seconds`` are None of one that somebody else started."""
 
     sumo: str
-    seconds: float | None
+    sumo_seconds: float | None
     flags: list[str] | None
     collisions: int
-    notes: tuple[str, ...] = ()
-
-    def to_json(self) -> dict[str, Any]:
-        """As the stage reports it."""
-        return {
-            "sumo": self.sumo,
-            "sumo_seconds": self.seconds,
-            "flags": self.flags,
-            "collisions": self.collisions,
-            "notes": list(self.notes),
-        }
+    notes: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
