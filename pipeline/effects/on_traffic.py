@@ -9,6 +9,7 @@ from pipeline.effects import registry
 from pipeline.effects.base import Traffic
 from pipeline.scenario.models import Scenario
 from pipeline.traffic import configuration
+from pipeline.world.building import GroundSource
 
 SELF_ACTING: dict[str, Callable[[Scenario], bool]] = {"slope": configuration.may_have_heights}
 """Effects that switch themselves on where leaving them out would be wrong; and a quick look whether they may, so that
@@ -30,9 +31,9 @@ def live(scenario: Scenario) -> tuple[tuple[Traffic[Any], ...], tuple[str, ...]]
     return tuple(acting), tuple(notes)
 
 
-def ground(scenario: Scenario) -> Traffic[Any] | None:
+def ground(scenario: Scenario) -> GroundSource | None:
     """The effect that lays the ground; None where it is flat."""
-    return next((effect for effect in _asked(scenario) if effect.LAYS_GROUND and effect.acts(scenario)[0]), None)
+    return next((e for e in _asked(scenario) if isinstance(e, GroundSource) and e.acts(scenario)[0]), None)
 
 
 def _asked(scenario: Scenario) -> Iterator[Traffic[Any]]:

@@ -275,7 +275,7 @@ def prepare(scenario: Scenario, folder: Path, extensions: Iterable[TrafficExtens
     traffic, place = scenario.traffic, place_of(scenario)
     given = sources(scenario)
     when = timing(traffic, given.begin_s, place)
-    adding = [extension for extension in extensions if extension.adds_traffic]
+    adding = [extension for extension in extensions if extension.ADDS_TRAFFIC]
     others = [OTHERS.replace("others", f"others{number or ''}") for number in range(len(adding))]
     folder.mkdir(parents=True, exist_ok=True)
     named = _copies(given, folder, others)

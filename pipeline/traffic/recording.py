@@ -18,7 +18,7 @@ from pipeline.core.errors import InputError
 from pipeline.core.progress import Progress
 from pipeline.formats import safe_xml
 from pipeline.scenario.models import Scenario
-from pipeline.traffic import configuration, extensions, fcd, live, network, sumo
+from pipeline.traffic import configuration, fcd, live, network, sumo
 from pipeline.traffic.boxes import Size
 from pipeline.traffic.configuration import COLLISIONS, FCD, LOG, PERSONS, STOPS, Prepared
 from pipeline.traffic.extensions import TrafficExtension
@@ -82,7 +82,8 @@ def record(
     """
     if scenario.traffic.fcd is not None and traci is not None:
         raise InputError("--traci", "the scenario names a finished FCD file", "network or sumocfg in [traffic]")
-    extensions.refuse(acting, scenario)
+    for refusal in filter(None, (extension.refuses(scenario) for extension in acting)):
+        raise refusal
     if scenario.traffic.fcd is not None:
         return _finished(scenario)
     if traci is not None:
@@ -142,7 +143,7 @@ def _running(scenario: Scenario, host: str, port: int, acting: Sequence[TrafficE
     net_file = given.files["net-file"][0]
     cycle_s = 0.0 if network.is_osm(net_file) else network.read(net_file).cycle_s
     observations = live.LiveObservations()
-    persons = any(extension.adds_traffic for extension in acting)
+    persons = any(extension.ADDS_TRAFFIC for extension in acting)
     with sumo.connected(host, port) as connection:
         version = sumo.version_in(connection.getVersion()[1])
         yield Recording(

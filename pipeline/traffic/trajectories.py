@@ -15,7 +15,7 @@ from pipeline.core.errors import RunError
 from pipeline.core.progress import Progress
 from pipeline.scenario.models import Scenario
 from pipeline.scenario.traffic import TrafficModel
-from pipeline.traffic import boxes, extensions, frames
+from pipeline.traffic import boxes, frames
 from pipeline.traffic.extensions import BoxChange, TrafficExtension
 from pipeline.traffic.frames import FrameGroup
 from pipeline.traffic.recording import Recording
@@ -36,7 +36,7 @@ def write(
     tally, period_s = TrafficTally(scenario.traffic.frames), recording.window.period_ms / 1000.0
     changes: list[BoxChange] | None = None
     for group in _groups(recording):
-        uncounted = extensions.uncounted_types(acting, recording.sizes)
+        uncounted = frozenset[str]().union(*(extension.uncounted_types(recording.sizes) for extension in acting))
         if changes is None:  # a running SUMO tells sizes with its first rows
             own = {name: size for name, size in recording.sizes.items() if name not in uncounted}
             changes = [c for extension in acting if (c := extension.box_change(scenario, own)) is not None]

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ GROUND_MARGIN_M = 500.0
 """How far the ground plane goes on beyond everything; more than any sensor in the catalogue reaches."""
 
 
+@runtime_checkable
 class GroundSource(Protocol):
     """Something that lays a ground which goes up and down."""
 
@@ -38,7 +39,7 @@ class GroundSource(Protocol):
     def ground(
         self, scenario: Scenario, low_m: NDArray[np.float64] | None = None, high_m: NDArray[np.float64] | None = None
     ) -> Surface:
-        """The ground over a rectangle."""
+        """The ground over a rectangle; around the network when None."""
         ...
 
 

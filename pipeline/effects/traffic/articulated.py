@@ -74,36 +74,25 @@ class Articulated(Traffic[ArticulatedParameters]):
     Model: ClassVar[type[EffectParameters]] = ArticulatedParameters
 
     def acts(self, scenario: Scenario) -> tuple[bool, str]:
-        """Where each known kind is one part, nothing changes; of a user's own SUMO demand the kinds are not known
-        beforehand.
+        """Where each kind is one part, nothing changes. InputError when parts do not fit the kinds.
 
-        Raises
-        ------
-        InputError
-            When parts do not fit the scenario's kinds.
+        Of a user's own SUMO demand the kinds are not known beforehand.
         """
-        sizes = known_sizes(scenario)
-        if sizes is not None and not self.geometries(sizes, place_of(scenario)):
+        own = scenario.traffic.sumocfg is not None or scenario.traffic.routes
+        if not own and not self.geometries(kind_sizes(scenario), self.place(scenario)):
             return False, "no kind of vehicle has more than one part"
         return True, "named"
 
     def box_change(self, scenario: Scenario, sizes: Mapping[str, Size]) -> Follower:
         """Each box of several parts becomes one box a part."""
-        return Follower(self.geometries(sizes, place_of(scenario)))
+        return Follower(self.geometries(sizes, self.place(scenario)))
 
     def geometries(self, sizes: Mapping[str, Size], place: str) -> dict[str, Geometry]:
-        """Kind -> its parts, for kinds of more than one.
-
-        Raises
-        ------
-        InputError
-            When a kind is not there, or its parts are longer than it is.
-        """
+        """Kind -> its parts, for kinds of more than one; InputError when one is missing, or shorter than its parts."""
         for name in self.parameters.kinds:
             if name not in sizes:
-                raise InputError(
-                    f"{place}.kinds", f"there is no kind of vehicle {name!r}", f"one of {', '.join(sorted(sizes))}"
-                )
+                known = ", ".join(sorted(sizes))
+                raise InputError(f"{place}.kinds", f"there is no kind of vehicle {name!r}", f"one of {known}")
         geometries = {}
         for name, size in sizes.items():
             parts = self.parameters.kinds.get(name) or (_by_class(size) if self.parameters.auto else None)
@@ -112,19 +101,6 @@ class Articulated(Traffic[ArticulatedParameters]):
                 if len(geometry.lengths_m) > 1:
                     geometries[name] = geometry
         return geometries
-
-
-def place_of(scenario: Scenario) -> str:
-    """Where messages point to."""
-    return f"{scenario.file}: effects.articulated"
-
-
-def known_sizes(scenario: Scenario) -> dict[str, Size] | None:
-    """The kinds that can occur, where the scenario says so itself; None where a user's SUMO files do."""
-    traffic = scenario.traffic
-    if traffic.sumocfg is not None or traffic.routes:
-        return None
-    return kind_sizes(scenario)
 
 
 def _by_class(size: Size) -> VehicleParts | None:

@@ -83,11 +83,10 @@ class PedestriansBicycles(Traffic[PedestriansBicyclesParameters]):
         if scenario.traffic.fcd is None or not self.acts(scenario)[0]:
             return None
         reason = "the scenario names a finished FCD file, so nobody can be added"
-        return InputError(f"{scenario.file}: effects.{self.NAME}", reason, "network or sumocfg in [traffic]")
+        return InputError(self.place(scenario), reason, "network or sumocfg in [traffic]")
 
     def acts(self, scenario: Scenario) -> tuple[bool, str]:
         """Rates of 0 bring nobody."""
-        del scenario
         both = self.parameters.pedestrians_per_h == 0 and self.parameters.bicycles_per_h == 0
         return (False, "both rates are 0") if both else (True, "named")
 
@@ -104,14 +103,8 @@ class PedestriansBicycles(Traffic[PedestriansBicyclesParameters]):
     def plan(
         self, scenario: Scenario, roads: Network, begin_s: float, end_s: float, rng: np.random.Generator
     ) -> TrafficPlan:
-        """Draw everybody's trips between two times.
-
-        Raises
-        ------
-        InputError
-            When the network has no place for them.
-        """
-        place, hours = f"{scenario.file}: effects.pedestrians_bicycles", (end_s - begin_s) / 3600.0
+        """Draw everybody's trips between two times; InputError when the network has no place for them."""
+        place, hours = self.place(scenario), (end_s - begin_s) / 3600.0
         walkers, riders = rng.spawn(2)
         times = [
             np.sort(begin_s + draw.random(round(rate * hours)) * (end_s - begin_s))

@@ -54,7 +54,6 @@ class Slope(Traffic[SlopeParameters]):
     SOURCE: ClassVar[str] = "SUMO networks with elevation; Delaunay surface (Barber et al. 1996, Qhull)"
     Model: ClassVar[type[EffectParameters]] = SlopeParameters
     SELF_ACTING: ClassVar[bool] = True
-    LAYS_GROUND: ClassVar[bool] = True
 
     def acts(self, scenario: Scenario) -> tuple[bool, str]:
         """Where the network has relief, whoever names it."""
@@ -72,7 +71,6 @@ class Slope(Traffic[SlopeParameters]):
 
     def box_change(self, scenario: Scenario, sizes: Mapping[str, Size]) -> Seating:
         """Boxes are seated on the ground around the network."""
-        del sizes
         return Seating(self.ground(scenario))
 
     def ground(
