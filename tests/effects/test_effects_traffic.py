@@ -19,7 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.artefacts import tables
-from pipeline.artefacts.boxes import COLUMNS
+from pipeline.artefacts.boxes import COLUMNS, FrameBoxes
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Grid, Roi
 from pipeline.effects import scenes
@@ -29,10 +29,11 @@ from pipeline.effects.traffic.articulated import Articulated
 from pipeline.effects.traffic.slope import Slope
 from pipeline.scenario.effects import ArticulatedParameters, SlopeParameters
 from pipeline.scenario.loading import from_values, load
+from pipeline.scoring import occupancy
 from pipeline.sensing import sites
 from pipeline.sensing.scanner import Scanner
 from pipeline.sensing.scene import Scene
-from pipeline.stages import statics, tpog, traffic
+from pipeline.stages import statics, traffic
 from pipeline.traffic import boxes, fcd, network, sumo, trajectories
 from pipeline.traffic.boxes import Size
 from pipeline.traffic.frames import FrameGroup
@@ -562,7 +563,7 @@ def test_people_never_lower_a_voxels_count(climbed):
         kept = ~np.isin(r["kind"], ["bicycle", "pedestrian"]) | np.isin(r["kind"], kinds)
         values = np.column_stack([r[name][kept] for name in COLUMNS])
         values[:, :3] = grid.to_grid_m(values[:, :3])
-        counts.append(tpog.count(tpog.Boxes(r["frame"][kept].astype(np.int64), values), grid, 240))
+        counts.append(occupancy.count(FrameBoxes(r["frame"][kept].astype(np.int64), values), grid, 240))
     assert all(np.all(more >= less) and more.sum() > less.sum() for less, more in itertools.pairwise(counts))
 
 
