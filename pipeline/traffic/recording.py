@@ -20,7 +20,7 @@ from pipeline.formats import safe_xml
 from pipeline.scenario.models import Scenario
 from pipeline.traffic import configuration, fcd, live, network, sumo
 from pipeline.traffic.boxes import Size
-from pipeline.traffic.configuration import COLLISIONS, FCD, LOG, PERSONS, STOPS, Prepared
+from pipeline.traffic.configuration import COLLISIONS, CONFIG, FCD, LOG, PERSONS, STOPS, Prepared, as_flags
 from pipeline.traffic.extensions import TrafficExtension
 from pipeline.traffic.frames import Window
 
@@ -75,10 +75,7 @@ def record(
 ) -> AbstractContextManager[Recording]:
     """The recording of a scenario's traffic; SUMO runs in ``folder``, or listens at ``traci`` already.
 
-    Raises
-    ------
-    InputError
-        When the scenario has a finished file that was to be recorded live, or an extension refuses it.
+    InputError when the scenario has a finished file that was to be recorded live, or an extension refuses it.
     """
     if scenario.traffic.fcd is not None and traci is not None:
         raise InputError("--traci", "the scenario names a finished FCD file", "network or sumocfg in [traffic]")
@@ -97,11 +94,9 @@ def _finished(scenario: Scenario) -> Iterator[Recording]:
     traffic, place = scenario.traffic, configuration.place_of(scenario)
     assert traffic.fcd is not None
     path = scenario.find(traffic.fcd, "traffic.fcd")
-    window = Window(
-        traffic.frames,
-        max(1, configuration.milliseconds(traffic.frame_period_s, f"{place}.frame_period_s")),
-        skip_ms=configuration.milliseconds(traffic.warmup_s, f"{place}.warmup_s"),
-    )
+    period_ms = max(1, configuration.milliseconds(traffic.frame_period_s, f"{place}.frame_period_s"))
+    skip_ms = configuration.milliseconds(traffic.warmup_s, f"{place}.warmup_s")
+    window = Window(traffic.frames, period_ms, skip_ms=skip_ms)
     yield Recording(fcd.read(path), window, kind_sizes(scenario), place)
 
 
@@ -116,10 +111,8 @@ def _simulated(
         sizes |= extension.sizes()
     path, persons = folder / FCD, folder / PERSONS
     try:
-        seconds = simulate(prepared, progress)
-        summary = RecordingSummary(
-            sumo.version(), round(seconds, 3), prepared.flags, _collisions(prepared), prepared.notes
-        )
+        seconds, flags = round(simulate(prepared, progress), 3), as_flags(prepared.options | prepared.outputs)
+        summary = RecordingSummary(sumo.version(), seconds, flags, _collisions(prepared), prepared.notes)
         yield Recording(
             fcd.read(path) if _has_rows(path) else (),
             prepared.timing.window(),
@@ -173,13 +166,12 @@ def simulate(prepared: Prepared, progress: Progress) -> float:
 
     def watch() -> None:
         if (now_ms := _last_time_ms(path)) is not None:
-            progress(
-                "frames simulated", min(when.frames, max(0, (now_ms - when.first_ms) // when.period_ms)), when.frames
-            )
+            done = (now_ms - when.first_ms) // when.period_ms
+            progress("frames simulated", min(when.frames, max(0, done)), when.frames)
 
     start = perf_counter()
-    flags = [word for key, value in prepared.outputs.items() for word in (f"--{key}", value)]
-    sumo.run("sumo", [*prepared.config, *flags], prepared.folder, prepared.folder / LOG, watch)
+    flags = ["-c", CONFIG, *as_flags(prepared.outputs)]
+    sumo.run("sumo", flags, prepared.folder, prepared.folder / LOG, watch)
     return perf_counter() - start
 
 
@@ -197,8 +189,8 @@ def _last_time_ms(path: Path) -> int | None:
 
 
 def type_sizes(prepared: Prepared) -> dict[str, Size]:
-    """Ask SUMO for the sizes of all vehicle types of a user's demand, since its defaults depend on the vClass."""
-    with sumo.served([*prepared.config, "--route-steps", "0"], prepared.folder) as connection:
+    """Sizes of all types of a user's demand; asked of SUMO, since its defaults depend on the vClass."""
+    with sumo.served(["-c", CONFIG, "--route-steps", "0"], prepared.folder) as connection:
         return {name: live.ask_size(connection, name) for name in connection.vehicletype.getIDList()}
 
 

@@ -32,7 +32,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -118,10 +118,7 @@ class PedestriansBicycles(Traffic[PedestriansBicyclesParameters]):
 
     def _types(self) -> Iterator[str]:
         for name, size in self.sizes().items():
-            upright = demand.UPRIGHT if name == BICYCLE else {}
-            values: dict[str, Any] = {"id": name, "vClass": size.vclass, "length": size.length_m, "width": size.width_m}
-            values |= {"height": size.height_m} | upright
-            yield f"    <vType {' '.join(f'{key}={quoteattr(str(value))}' for key, value in values.items())}/>"
+            yield demand.vtype_xml(name, size, demand.UPRIGHT if name == BICYCLE else {})
 
 
 # ---- on foot
