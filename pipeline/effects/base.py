@@ -164,8 +164,7 @@ class Detect(Effect[P]):
 
 
 class Traffic(Effect[P], TrafficExtension):
-    """Who moves, and how boxes are made of it; one that also has a ``ground`` is a
-    :class:`pipeline.world.building.GroundSource`."""
+    """Who moves, and how boxes are made of it. With ``ground``: a :class:`pipeline.world.building.GroundSource`."""
 
     STAGE: ClassVar[str] = "traffic"
     KIND: ClassVar[str] = "traffic"

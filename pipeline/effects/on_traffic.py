@@ -12,8 +12,7 @@ from pipeline.traffic import configuration
 from pipeline.world.building import GroundSource
 
 SELF_ACTING: dict[str, Callable[[Scenario], bool]] = {"slope": configuration.may_have_heights}
-"""Effects that switch themselves on where leaving them out would be wrong; and a quick look whether they may, so that
-elsewhere none is imported."""
+"""Effects that switch themselves on where leaving them out would be wrong; a quick look tells where they may."""
 
 
 def live(scenario: Scenario) -> tuple[tuple[Traffic[Any], ...], tuple[str, ...]]:

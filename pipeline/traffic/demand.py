@@ -35,8 +35,7 @@ _FAR_SHARE = 0.25
 
 @dataclass(frozen=True)
 class Pairs:
-    """Trips that a kind may make: ``origin[i]`` to ``target[i]`` (positions in ``Network.edges``), drawn with
-    ``weight[i]``."""
+    """Trips that a kind may make: from ``origin`` to ``target`` (positions in ``Network.edges``), with weights."""
 
     origin: Ints
     target: Ints
@@ -86,14 +85,9 @@ def _fringe(lanes: Floats, links: Ints) -> tuple[Ints, Ints]:
 
 
 def _reachable(
-    network: Network,
-    weights: Floats,
-    links: Ints,
-    sources: Ints,
-    sinks: Ints,
-    min_trip_m: float,
-    fringe: bool = True,
+    network: Network, weights: Floats, links: Ints, sources: Ints, sinks: Ints, min_trip_m: float, fringe: bool = True
 ) -> Pairs:
+    """The pairs of a source and a sink that can be reached from it, is no way back, and is far enough."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import breadth_first_order
 
@@ -115,12 +109,9 @@ def _reachable(
 
 
 def draw(
-    network: Network,
-    kinds: Sequence[VehicleKind],
-    all_pairs: Sequence[Pairs],
-    departs_s: Floats,
+    network: Network, kinds: Sequence[VehicleKind], all_pairs: Sequence[Pairs], departs_s: Floats,
     rng: np.random.Generator,
-) -> list[tuple[str, str, str]]:
+) -> list[tuple[str, str, str]]:  # fmt: skip
     """For each departure: the name of the kind, the edge where the trip starts, the edge where it ends."""
     shares = np.array([kind.share for kind in kinds])
     chosen = rng.choice(len(kinds), size=departs_s.size, p=shares / shares.sum())

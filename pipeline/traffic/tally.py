@@ -75,8 +75,7 @@ def _share_space(boxes: VehicleBoxes, a: Ints, b: Ints) -> NDArray[np.bool_]:
 
 
 def _whole_pairs(boxes: VehicleBoxes, pairs: Ints) -> Ints:
-    """Pairs of parts -> pairs of vehicles, each once, as rows of the boxes that are left when only first parts are
-    kept."""
+    """Pairs of parts -> pairs of vehicles, each once, as rows of the boxes whose first parts alone are kept."""
     assert boxes.part is not None
     vehicle = np.cumsum(boxes.part == 0) - 1
     return np.unique(vehicle[pairs], axis=0).reshape(-1, 2)

@@ -54,8 +54,7 @@ PEDESTRIAN, BICYCLE = "egvs_pedestrian", "egvs_bicycle"
 TYPES = frozenset((PEDESTRIAN, BICYCLE))
 
 _RIDES_M_S = 4.0
-"""A bicycle's mean speed over a trip, stops left out, at the least; SUMO's own bicycles ride 5.56 m/s on a free
-road."""
+"""A bicycle's least mean speed over a trip, without stops; SUMO's own ride 5.56 m/s on a free road."""
 
 _WAITS_S = 30.0
 _BEYOND_S = 3600.0
@@ -121,6 +120,9 @@ class PedestriansBicycles(Traffic[PedestriansBicyclesParameters]):
             yield demand.vtype_xml(name, size, demand.UPRIGHT if name == BICYCLE else {})
 
 
+SidewalkPlace = tuple[Sidewalk, float]
+
+
 # ---- on foot
 
 
@@ -134,11 +136,7 @@ def _walks(
     pairs = _ends(ways.sidewalks) or _anywhere(ways.sidewalks)
     if not pairs:
         raise InputError(f"{place}.pedestrians_per_h", "no sidewalk leads to another", _MAKES_WALKS)
-    notes = (
-        []
-        if ways.crossings
-        else ["pedestrians_bicycles: the network has no crossings, so people stay on their side of the road"]
-    )
+    note = "pedestrians_bicycles: the network has no crossings, so people stay on their side of the road"
     chosen, people = rng.integers(len(pairs), size=times_s.size), []
     for number, (depart, pair) in enumerate(zip(times_s, chosen, strict=True)):
         (start, start_m), (end, end_m) = pairs[pair]
@@ -147,15 +145,11 @@ def _walks(
             f' departPos="{start_m:.2f}"><walk from={quoteattr(start.edge)} to={quoteattr(end.edge)}'
             f' arrivalPos="{end_m:.2f}"/></person>'
         )
-    return people, notes
-
-
-SidewalkPlace = tuple[Sidewalk, float]
+    return people, [] if ways.crossings else [note]
 
 
 def _ends(sidewalks: tuple[Sidewalk, ...]) -> list[tuple[SidewalkPlace, SidewalkPlace]]:
-    """Pairs of sidewalk ends at two nodes of the fringe (which lead to one neighbour only) that people can walk
-    between."""
+    """Pairs of sidewalk ends at two nodes of the fringe (with one neighbour only) that people can walk between."""
     neighbours: dict[str, set[str]] = {}
     for walk in sidewalks:
         neighbours.setdefault(walk.from_node, set()).add(walk.to_node)
@@ -168,9 +162,8 @@ def _ends(sidewalks: tuple[Sidewalk, ...]) -> list[tuple[SidewalkPlace, Sidewalk
 
 def _anywhere(sidewalks: tuple[Sidewalk, ...]) -> list[tuple[SidewalkPlace, SidewalkPlace]]:
     """From the middle of any sidewalk to that of any other that hangs together with it."""
-    return [
-        ((a, a.length_m / 2), (b, b.length_m / 2)) for a in sidewalks for b in sidewalks if a != b and a.part == b.part
-    ]
+    pairs = [(a, b) for a in sidewalks for b in sidewalks if a != b and a.part == b.part]
+    return [((a, a.length_m / 2), (b, b.length_m / 2)) for a, b in pairs]
 
 
 # ---- on bicycles
@@ -178,8 +171,7 @@ def _anywhere(sidewalks: tuple[Sidewalk, ...]) -> list[tuple[SidewalkPlace, Side
 
 @dataclass(frozen=True)
 class _Ride:
-    """One trip: when it starts, over which edges, how long it takes at most (mostly), and the last edge's lane and
-    length."""
+    """One trip; ``takes_s`` at most (mostly). ``first`` and ``last`` are its first and last edge's lane and length."""
 
     depart_s: float
     edges: tuple[str, ...]
@@ -202,9 +194,8 @@ def _rides(
         way = router.way(int(pairs.origin[pair]), int(pairs.target[pair]))
         length = sum(router.lengths_m[edge] for edge in way)
         takes = length / _RIDES_M_S + _WAITS_S * len(way)
-        rides.append(
-            _Ride(depart, tuple(roads.edges[i].id for i in way), takes, router.lane(way[0]), router.lane(way[-1]))
-        )
+        edges = tuple(roads.edges[i].id for i in way)
+        rides.append(_Ride(depart, edges, takes, router.lane(way[0]), router.lane(way[-1])))
     return rides
 
 
@@ -241,10 +232,10 @@ class _Router:
 
 
 def _on_few_vehicles(rides: list[_Ride], begin_s: float, end_s: float) -> Iterator[str]:
-    """One ``<vehicle>`` for trips one after another: each trip goes to the vehicle that has been free for longest, or
-    to a new one.
+    """One ``<vehicle>`` for trips one after another; each goes to the one that is free for longest, or to a new one.
 
-    A vehicle starts at once, jumps to its first trip, from trip to trip, and at last beyond the simulation's end."""
+    A vehicle starts at once, jumps to its first trip, from trip to trip, and at last beyond the simulation's end.
+    """
     free: list[tuple[float, int]] = []
     strings: list[list[_Ride]] = []
     for ride in rides:
