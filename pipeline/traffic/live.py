@@ -80,8 +80,8 @@ def _check_clock(connection: Any, when: Timing, address: str) -> None:
             " longer traffic.warmup_s"
         )
     if (when.first_ms - now) % when.step_ms:
-        where = f"from {now / 1000:g} s, steps of {step / 1000:g} s"
-        raise RunError(f"--traci {address}: {where} do not meet {first}")
+        steps = f"from {now / 1000:g} s, steps of {step / 1000:g} s"
+        raise RunError(f"--traci {address}: {steps} do not meet {first}")
 
 
 class _Subscriptions:
