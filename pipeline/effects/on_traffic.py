@@ -17,17 +17,18 @@ SELF_ACTING: dict[str, Callable[[Scenario], bool]] = {"slope": configuration.may
 
 def live(scenario: Scenario) -> tuple[tuple[Traffic[Any], ...], tuple[str, ...]]:
     """The effects that act, in order; and notes on those that act by themselves or are skipped."""
-    acting, notes = [], []
+    effects, notes = [], []
     for effect in _asked(scenario):
-        (on, reason), named = effect.acts(scenario), effect.NAME in scenario.effects.named
+        on, reason = effect.acts(scenario)
         if on:
-            acting.append(effect)
-        if on and effect.SELF_ACTING:
-            notes.append(f"{effect.NAME}: on, {reason}")
-        elif not on:
-            skipped = f"named, but {reason}: skipped, the result is the same"
-            notes.append(f"{effect.NAME}: {skipped if named else f'off, {reason}'}")
-    return tuple(acting), tuple(notes)
+            effects.append(effect)
+            if effect.SELF_ACTING:
+                notes.append(f"{effect.NAME}: on, {reason}")
+        elif effect.NAME in scenario.effects.named:
+            notes.append(f"{effect.NAME}: named, but {reason}: skipped, the result is the same")
+        else:
+            notes.append(f"{effect.NAME}: off, {reason}")
+    return tuple(effects), tuple(notes)
 
 
 def ground(scenario: Scenario) -> GroundSource | None:

@@ -5,7 +5,8 @@ Hands out Arrow tables with the columns of :data:`SCHEMA`, piece by piece, so th
 
 Positions are SUMO's own: the middle of the front bumper in metres, the angle in degrees clockwise from north, the slope
 in degrees. Times are whole milliseconds, SUMO's own unit. Rows without a vehicle (SUMO writes one for an empty step)
-are left out; so are persons (unless asked for) and containers."""
+are left out; so are persons (unless asked for) and containers.
+"""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ class Recording:
 def record(
     scenario: Scenario,
     folder: Path,
-    acting: Sequence[TrafficExtension],
+    extensions: Sequence[TrafficExtension],
     progress: Progress,
     traci: tuple[str, int] | None,
 ) -> AbstractContextManager[Recording]:
@@ -79,13 +79,13 @@ def record(
     """
     if scenario.traffic.fcd is not None and traci is not None:
         raise InputError("--traci", "the scenario names a finished FCD file", "network or sumocfg in [traffic]")
-    for refusal in filter(None, (extension.refuses(scenario) for extension in acting)):
+    for refusal in filter(None, (extension.refuses(scenario) for extension in extensions)):
         raise refusal
     if scenario.traffic.fcd is not None:
         return _finished(scenario)
     if traci is not None:
-        return _running(scenario, *traci, acting)
-    return _simulated(scenario, folder, progress, acting)
+        return _running(scenario, *traci, extensions)
+    return _simulated(scenario, folder, progress, extensions)
 
 
 @contextmanager
@@ -102,12 +102,12 @@ def _finished(scenario: Scenario) -> Iterator[Recording]:
 
 @contextmanager
 def _simulated(
-    scenario: Scenario, folder: Path, progress: Progress, acting: Sequence[TrafficExtension]
+    scenario: Scenario, folder: Path, progress: Progress, extensions: Sequence[TrafficExtension]
 ) -> Iterator[Recording]:
     """From SUMO as a subprocess; its FCD file is removed once it is read."""
-    prepared = configuration.prepare(scenario, folder, acting)
+    prepared = configuration.prepare(scenario, folder, extensions)
     sizes = kind_sizes(scenario) if prepared.drawn else type_sizes(prepared)
-    for extension in acting:
+    for extension in extensions:
         sizes |= extension.sizes()
     path, persons = folder / FCD, folder / PERSONS
     try:
@@ -129,14 +129,14 @@ def _simulated(
 
 
 @contextmanager
-def _running(scenario: Scenario, host: str, port: int, acting: Sequence[TrafficExtension]) -> Iterator[Recording]:
+def _running(scenario: Scenario, host: str, port: int, extensions: Sequence[TrafficExtension]) -> Iterator[Recording]:
     """From a SUMO that somebody else started."""
     given = configuration.sources(scenario)
     when = configuration.timing(scenario.traffic, given.begin_s, configuration.place_of(scenario))
     net_file = given.files["net-file"][0]
     cycle_s = 0.0 if network.is_osm(net_file) else network.read(net_file).cycle_s
     observations = live.LiveObservations()
-    persons = any(extension.ADDS_TRAFFIC for extension in acting)
+    persons = any(extension.ADDS_TRAFFIC for extension in extensions)
     with sumo.connected(host, port) as connection:
         version = sumo.version_in(connection.getVersion()[1])
         yield Recording(

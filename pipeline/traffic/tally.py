@@ -28,7 +28,8 @@ def overlapping(boxes: VehicleBoxes) -> NDArray[np.int64]:
     Exact for rectangles (separating axes). Candidates come from square cells, at least as wide as the longest diagonal:
     a pair that overlaps lies in one cell or in two that touch. Cells are numbered along y, then x, then by frame, with
     an empty row and column between, so that a box's later neighbours are two runs: its own cell and the next, and three
-    cells of the next column."""
+    cells of the next column.
+    """
     if not boxes.frame.size:
         return np.empty((0, 2), dtype=np.int64)
     half = np.hypot(boxes.length_m, boxes.width_m) / 2

@@ -26,7 +26,11 @@ GROUP_FRAMES = 500
 
 
 def write(
-    scenario: Scenario, recording: Recording, acting: Sequence[TrafficExtension], file: TableWriter, progress: Progress
+    scenario: Scenario,
+    recording: Recording,
+    extensions: Sequence[TrafficExtension],
+    file: TableWriter,
+    progress: Progress,
 ) -> tuple[TrafficTally, dict[str, Any]]:
     """Write a recording's boxes, changed by the extensions that act; what they add up to, and what extensions report.
 
@@ -36,10 +40,10 @@ def write(
     tally, period_s = TrafficTally(scenario.traffic.frames), recording.window.period_ms / 1000.0
     changes: list[BoxChange] | None = None
     for group in _groups(recording):
-        uncounted = frozenset[str]().union(*(extension.uncounted_types(recording.sizes) for extension in acting))
+        uncounted = frozenset[str]().union(*(extension.uncounted_types(recording.sizes) for extension in extensions))
         if changes is None:  # a running SUMO tells sizes with its first rows
             own = {name: size for name, size in recording.sizes.items() if name not in uncounted}
-            changes = [c for extension in acting if (c := extension.box_change(scenario, own)) is not None]
+            changes = [c for extension in extensions if (c := extension.box_change(scenario, own)) is not None]
         made = boxes.from_bumpers(group, recording.sizes, period_s, recording.place, uncounted)
         for change in changes:
             made = change.change(made)

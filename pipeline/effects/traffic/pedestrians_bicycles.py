@@ -25,7 +25,8 @@ Intermodal Transport (the striping model).
 
 Calls for it: sites that must see people. Limits: pedestrians' boxes may overlap where SUMO lets people pass closely,
 and on crossings that they share with turning traffic; nobody walks in groups; bicycles do not use sidewalks; sizes do
-not vary."""
+not vary.
+"""
 
 from __future__ import annotations
 

@@ -21,7 +21,8 @@ Source: SUMO's networks with elevation (https://sumo.dlr.de/docs/Networks/Elevat
 Delaunay triangulation: Barber, Dobkin, Huhdanpaa 1996, ACM TOMS 22(4), 469-483 (Qhull).
 
 Limits: those of one surface (a box more than 1 m off it, on a bridge, keeps SUMO's own slope); no camber; vehicles'
-speeds do not depend on the grade in SUMO's car-following."""
+speeds do not depend on the grade in SUMO's car-following.
+"""
 
 from __future__ import annotations
 
