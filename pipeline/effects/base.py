@@ -29,9 +29,9 @@ import numpy as np
 from pipeline.core.errors import InputError
 from pipeline.scenario.effects import EffectParameters
 from pipeline.sensing.scene import BeamCutter, BeamExpander
+from pipeline.traffic.extensions import TrafficExtension
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -41,10 +41,6 @@ if TYPE_CHECKING:
     from pipeline.sensing.crossings import Crossings
     from pipeline.sensing.scene import Scene
     from pipeline.sensing.sensors import Sensor
-    from pipeline.traffic.boxes import Size
-    from pipeline.traffic.extensions import BoxChange, TrafficPlan
-    from pipeline.traffic.network import Network
-    from pipeline.world.terrain import Surface
 
 P = TypeVar("P", bound=EffectParameters)
 
@@ -144,33 +140,17 @@ class Detect(Effect[P]):
         raise NotImplementedError
 
 
-class Traffic(Effect[P]):
-    """Who moves, and how boxes are made of it: a :class:`pipeline.traffic.extensions.TrafficExtension` that changes
-    nothing."""
+class Traffic(Effect[P], TrafficExtension):
+    """Who moves, and how boxes are made of it. With ``ground``: a :class:`pipeline.world.building.GroundSource`."""
 
     STAGE: ClassVar[str] = "traffic"
     KIND: ClassVar[str] = "traffic"
     SELF_ACTING: ClassVar[bool] = False
     """Whether it also acts where nobody names it; then :meth:`acts` alone decides."""
-    ADDS_TRAFFIC: ClassVar[bool] = False
-    """Whether it has a :meth:`plan`."""
-    LAYS_GROUND: ClassVar[bool] = False
-    """Whether it has a :meth:`ground`."""
-
-    @property
-    def adds_traffic(self) -> bool:
-        """See :data:`ADDS_TRAFFIC`."""
-        return self.ADDS_TRAFFIC
 
     def acts(self, scenario: Scenario) -> tuple[bool, str]:
         """Whether it can change anything, judged from the scenario alone; and why (not)."""
-        del scenario
         return True, "named"
-
-    def refuses(self, scenario: Scenario) -> InputError | None:
-        """Why this scenario cannot have it; None when it can."""
-        del scenario
-        return None
 
     def why_idle(self, scene: Scene) -> str | None:
         """As :meth:`acts` has it."""
@@ -181,28 +161,6 @@ class Traffic(Effect[P]):
         """As :meth:`refuses` has it."""
         return self.refuses(scene.scenario)
 
-    def sizes(self) -> dict[str, Size]:
-        """Sizes of the types of vehicles and persons that it adds."""
-        return {}
-
-    def uncounted_types(self, sizes: Mapping[str, Size]) -> frozenset[str]:
-        """Which of SUMO's types are no vehicles of the scenario."""
-        del sizes
-        return frozenset()
-
-    def plan(
-        self, scenario: Scenario, roads: Network, begin_s: float, end_s: float, rng: np.random.Generator
-    ) -> TrafficPlan:
-        """The traffic that it adds between two times."""
-        raise NotImplementedError
-
-    def box_change(self, scenario: Scenario, sizes: Mapping[str, Size]) -> BoxChange | None:
-        """What changes the boxes of a recording whose vehicles have these sizes; None for nothing."""
-        del scenario, sizes
-        return None
-
-    def ground(
-        self, scenario: Scenario, low_m: NDArray[np.float64] | None = None, high_m: NDArray[np.float64] | None = None
-    ) -> Surface:
-        """The ground over a rectangle; around the network when None."""
-        raise NotImplementedError
+    def place(self, scenario: Scenario) -> str:
+        """Where messages point to."""
+        return f"{scenario.file}: effects.{self.NAME}"

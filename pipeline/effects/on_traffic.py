@@ -9,30 +9,31 @@ from pipeline.effects import registry
 from pipeline.effects.base import Traffic
 from pipeline.scenario.models import Scenario
 from pipeline.traffic import configuration
+from pipeline.world.building import GroundSource
 
 SELF_ACTING: dict[str, Callable[[Scenario], bool]] = {"slope": configuration.may_have_heights}
-"""Effects that switch themselves on where leaving them out would be wrong; and a quick look whether they may, so that
-elsewhere none is imported."""
+"""Effects that switch themselves on where leaving them out would be wrong; a quick look tells where they may."""
 
 
 def live(scenario: Scenario) -> tuple[tuple[Traffic[Any], ...], tuple[str, ...]]:
     """The effects that act, in order; and notes on those that act by themselves or are skipped."""
-    acting, notes = [], []
+    effects, notes = [], []
     for effect in _asked(scenario):
-        (on, reason), named = effect.acts(scenario), effect.NAME in scenario.effects.named
+        on, reason = effect.acts(scenario)
         if on:
-            acting.append(effect)
-        if on and effect.SELF_ACTING:
-            notes.append(f"{effect.NAME}: on, {reason}")
-        elif not on:
-            skipped = f"named, but {reason}: skipped, the result is the same"
-            notes.append(f"{effect.NAME}: {skipped if named else f'off, {reason}'}")
-    return tuple(acting), tuple(notes)
+            effects.append(effect)
+            if effect.SELF_ACTING:
+                notes.append(f"{effect.NAME}: on, {reason}")
+        elif effect.NAME in scenario.effects.named:
+            notes.append(f"{effect.NAME}: named, but {reason}: skipped, the result is the same")
+        else:
+            notes.append(f"{effect.NAME}: off, {reason}")
+    return tuple(effects), tuple(notes)
 
 
-def ground(scenario: Scenario) -> Traffic[Any] | None:
+def ground(scenario: Scenario) -> GroundSource | None:
     """The effect that lays the ground; None where it is flat."""
-    return next((effect for effect in _asked(scenario) if effect.LAYS_GROUND and effect.acts(scenario)[0]), None)
+    return next((e for e in _asked(scenario) if isinstance(e, GroundSource) and e.acts(scenario)[0]), None)
 
 
 def _asked(scenario: Scenario) -> Iterator[Traffic[Any]]:

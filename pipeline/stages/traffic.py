@@ -14,6 +14,7 @@ SUMO (https://eclipse.dev/sumo) stands in for the paper's game-engine simulator.
 from __future__ import annotations
 
 import os
+from dataclasses import asdict
 from pathlib import Path
 
 from pipeline.artefacts import tables
@@ -38,14 +39,14 @@ def inputs(work: Workspace) -> StageInputs:
         sources = configuration.sources(scenario).all()
         if traffic.sumocfg is not None:
             sources.insert(0, scenario.find(traffic.sumocfg, "traffic.sumocfg"))
-    acting, _ = on_traffic.live(scenario)
+    effects, _ = on_traffic.live(scenario)
     settings = {"seed": scenario.seed, "name": scenario.name, "traffic": traffic.model_dump(mode="json")}
     # one that acts by itself depends on the network alone
-    if named := registry.settings(effect for effect in acting if not effect.SELF_ACTING):
+    if named := registry.settings(effect for effect in effects if not effect.SELF_ACTING):
         settings["effects"] = named
     hashes = {_label(path, scenario): files.sha256_of(path) for path in sources}
     version = None if traffic.fcd is not None else sumo.version()
-    return StageInputs(settings, hashes, {"sumo": version}, tuple(type(effect) for effect in acting))
+    return StageInputs(settings, hashes, {"sumo": version}, tuple(type(effect) for effect in effects))
 
 
 def _label(path: Path, scenario: Scenario) -> str:
@@ -76,14 +77,14 @@ def run(work: Workspace, inputs: StageInputs, traci: tuple[str, int] | None = No
         When SUMO fails, N vehicles are not held, or a vehicle stands without end.
     """
     scenario = work.scenario
-    acting, notes = on_traffic.live(scenario)
-    source = recording.record(scenario, work.path(COMPANIONS[0]), acting, work.progress, traci)
+    effects, notes = on_traffic.live(scenario)
+    source = recording.record(scenario, work.path(COMPANIONS[0]), effects, work.progress, traci)
     with source as recorded, tables.writer(work.path(ARTEFACTS[0]), "trajectories") as file:
-        written = trajectories.write(scenario, recorded, acting, file, work.progress)
+        tally, reports = trajectories.write(scenario, recorded, effects, file, work.progress)
         period_s, frames = recorded.window.period_ms / 1000.0, scenario.traffic.frames
         file.describe(work.metadata(inputs, frames=frames, frame_period_s=period_s, sumo=inputs.more["sumo"]))
         summary = recorded.summary()
-    result = written.counts.to_json() | ({} if summary is None else summary.to_json())
+    result = tally.to_json(period_s) | ({} if summary is None else asdict(summary))
     if notes:
         result["notes"] = [*result.get("notes", []), *notes]
-    return result | written.of_extensions
+    return result | reports

@@ -23,6 +23,7 @@ from pipeline.core.errors import InputError
 from pipeline.traffic.frames import FrameGroup
 
 _POSITION_DIGITS, _ANGLE_DIGITS = 6, 9
+_NUMBERS = ("x_m", "y_m", "z_m", "yaw_rad", "pitch_rad", "length_m", "width_m", "height_m")
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
@@ -65,8 +66,7 @@ class VehicleBoxes:
     part: Ints | None = None
     """0, or 1.. for the rear parts of an articulated vehicle; None where every vehicle is one box."""
     uncounted: NDArray[np.bool_] | None = None
-    """Those who do not count as vehicles of the scenario (an extension's pedestrians and bicycles); None where all
-    count."""
+    """Who does not count as the scenario's vehicle (an extension's pedestrians, bicycles); None where all count."""
 
     def rows(self, index: Ints) -> dict[str, Any]:
         """The arrays that have one element a row, at ``index``."""
@@ -85,10 +85,7 @@ class VehicleBoxes:
             "part": np.zeros(n, np.uint8) if self.part is None else self.part.astype(np.uint8),
             "vehicle": _strings(self.names, self.code),
             "kind": _strings(self.kinds, self.kind),
-            **{
-                name: getattr(self, name)
-                for name in ("x_m", "y_m", "z_m", "yaw_rad", "pitch_rad", "length_m", "width_m", "height_m")
-            },
+            **{name: getattr(self, name) for name in _NUMBERS},
         }
 
 
@@ -101,61 +98,34 @@ def from_bumpers(
 ) -> VehicleBoxes:
     """The boxes of a group of whole frames. Those of ``uncounted_types`` do not count as vehicles of the scenario.
 
-    Raises
-    ------
-    InputError
-        When a vehicle is of a type without a known size, or is twice in a frame.
+    InputError when a vehicle is of a type without a known size, or is twice in a frame.
     """
     names, code = _sorted_codes(group.rows["id"])
     types, type_code = _sorted_codes(group.rows["type"])
-    for name in types:
-        if name not in sizes:
-            raise InputError(
-                place,
-                f"vehicle type {name!r} has no known size",
-                f"a kind of that name with length_m, width_m and height_m (known: {', '.join(sorted(sizes))})",
-            )
+    for name in (name for name in types if name not in sizes):
+        right = f"a kind of that name with length_m, width_m and height_m (known: {', '.join(sorted(sizes))})"
+        raise InputError(place, f"vehicle type {name!r} has no known size", right)
     order = np.lexsort((code, group.frame))
     frame, code, type_code = group.frame[order], code[order], type_code[order]
     twice = np.flatnonzero((np.diff(frame) == 0) & (np.diff(code) == 0))
     if twice.size:
-        raise InputError(
-            place, f"vehicle {names[code[twice[0]]]!r} is twice in frame {frame[twice[0]]}", "one row a vehicle a frame"
-        )
+        what = f"vehicle {names[code[twice[0]]]!r} is twice in frame {frame[twice[0]]}"
+        raise InputError(place, what, "one row a vehicle a frame")
     kinds = sorted({sizes[name].vclass for name in types})
     kind = np.array([kinds.index(sizes[name].vclass) for name in types], dtype=np.int64)[type_code]
     length, width, height = (
         np.array([getattr(sizes[name], key) for name in types], dtype=np.float64)[type_code]
         for key in ("length_m", "width_m", "height_m")
     )
-    x, y, z, angle, slope, speed = (
-        group.rows[key].to_numpy()[order] for key in ("x", "y", "z", "angle", "slope", "speed")
-    )
-    centre = centres(x, y, z, angle, slope, length, height)
+    keys = ("x", "y", "z", "angle", "slope", "speed")
+    x, y, z, angle, slope, speed = (group.rows[key].to_numpy()[order] for key in keys)
+    uncounted = np.array([name in uncounted_types for name in types], dtype=np.bool_)
+    poses = *centres(x, y, z, angle, slope, length, height), yaw_rad(angle), tidy_rad(np.deg2rad(slope))
     boxes = VehicleBoxes(
-        group.first_frame,
-        group.frames,
-        frame,
-        names,
-        code,
-        kinds,
-        kind,
-        *centre,
-        yaw_rad(angle),
-        _tidy(np.deg2rad(slope), _ANGLE_DIGITS),
-        length,
-        width,
-        height,
-        speed,
-        types,
-        type_code,
-        uncounted=_is_one_of(uncounted_types, types)[type_code] if uncounted_types else None,
-    )
+        group.first_frame, group.frames, frame, names, code, kinds, kind, *poses, length, width, height, speed,
+        types, type_code, uncounted=uncounted[type_code] if uncounted_types else None,
+    )  # fmt: skip
     return boxes if not np.isnan(speed).any() else _with_speed(boxes, period_s)
-
-
-def _is_one_of(some: frozenset[str], types: list[str]) -> NDArray[np.bool_]:
-    return np.array([name in some for name in types], dtype=np.bool_)
 
 
 def centres(
@@ -166,9 +136,9 @@ def centres(
 
     half, flat = length_m / 2, cosdg(slope_deg)
     return (
-        _tidy(x - half * flat * sindg(angle_deg), _POSITION_DIGITS),
-        _tidy(y - half * flat * cosdg(angle_deg), _POSITION_DIGITS),
-        _tidy(z - half * sindg(slope_deg) + height_m / 2, _POSITION_DIGITS),
+        tidy_m(x - half * flat * sindg(angle_deg)),
+        tidy_m(y - half * flat * cosdg(angle_deg)),
+        tidy_m(z - half * sindg(slope_deg) + height_m / 2),
     )
 
 
@@ -176,29 +146,23 @@ def yaw_rad(angle_deg: Floats) -> Floats:
     """Degrees clockwise from north -> radians counter-clockwise from +x, in (-pi, pi], rounded to 1 nanoradian."""
     degrees = 90.0 - np.asarray(angle_deg, dtype=np.float64)
     degrees = degrees - 360.0 * np.ceil((degrees - 180.0) / 360.0)
-    rounded = _tidy(np.deg2rad(degrees), _ANGLE_DIGITS)
+    rounded = tidy_rad(np.deg2rad(degrees))
     # pi itself lies between two nanoradians, and the upper one is outside the interval
     return np.where(np.abs(rounded) > np.pi, np.pi, rounded)
 
 
-def _tidy(values: Floats, digits: int) -> Floats:
-    """Rounded, and without negative zeros."""
-    return np.round(values, digits) + 0.0
-
-
 def tidy_m(values: Floats) -> Floats:
-    """Metres as trajectories have them: rounded to 1 micrometre."""
-    return _tidy(values, _POSITION_DIGITS)
+    """Metres as trajectories have them: rounded to 1 micrometre, without negative zeros."""
+    return np.round(values, _POSITION_DIGITS) + 0.0
 
 
 def tidy_rad(values: Floats) -> Floats:
-    """Radians as trajectories have them: rounded to 1 nanoradian."""
-    return _tidy(values, _ANGLE_DIGITS)
+    """Radians as trajectories have them: rounded to 1 nanoradian, without negative zeros."""
+    return np.round(values, _ANGLE_DIGITS) + 0.0
 
 
 def _with_speed(boxes: VehicleBoxes, period_s: float) -> VehicleBoxes:
-    """Fill speeds that the file does not give from the way to the next frame, or from the last one where there is
-    none."""
+    """Fill speeds that the file does not give from the way to the next frame, or else from the last one."""
     order = np.lexsort((boxes.frame, boxes.code))
     follows = (np.diff(boxes.code[order]) == 0) & (np.diff(boxes.frame[order]) == 1)
     way = np.hypot(np.diff(boxes.x_m[order]), np.diff(boxes.y_m[order])) / period_s
@@ -206,8 +170,7 @@ def _with_speed(boxes: VehicleBoxes, period_s: float) -> VehicleBoxes:
     onward, back = np.append(way, np.nan), np.insert(way, 0, np.nan)
     speed = np.empty(order.size)
     speed[order] = np.where(np.isnan(onward), back, onward)
-    speed = np.where(np.isnan(boxes.speed_m_s), speed, boxes.speed_m_s)
-    return replace(boxes, speed_m_s=speed)
+    return replace(boxes, speed_m_s=np.where(np.isnan(boxes.speed_m_s), speed, boxes.speed_m_s))
 
 
 def _sorted_codes(column: pa.ChunkedArray) -> tuple[list[str], Ints]:

@@ -34,45 +34,19 @@ OTHERS, PERSONS, MAP = "others.rou.xml", "persons.csv", "map.osm.xml"
 """Route file of an extension (those of further ones count up), and what SUMO records of persons."""
 
 _SYNONYMS = {
-    "n": "net-file",
-    "net": "net-file",
-    "r": "route-files",
-    "routes": "route-files",
-    "route": "route-files",
-    "a": "additional-files",
-    "additional": "additional-files",
-    "b": "begin",
-    "e": "end",
-    "F": "weight-files",
-}
+    "n": "net-file", "net": "net-file", "r": "route-files", "route": "route-files", "routes": "route-files",
+    "a": "additional-files", "additional": "additional-files", "b": "begin", "e": "end", "F": "weight-files",
+}  # fmt: skip
 _LEFT_OUT = {
-    "end",
-    "random",
-    "start",
-    "quit-on-end",
-    "human-readable-time",
-    "verbose",
-    "remote-port",
-    "num-clients",
-    "log",
-    "message-log",
-    "error-log",
-    "device.rerouting.threads",
-    "precision",
-    "configuration-file",
-    "game",
-    "demo",
-}
+    "end", "random", "start", "quit-on-end", "human-readable-time", "verbose", "remote-port", "num-clients", "log",
+    "message-log", "error-log", "device.rerouting.threads", "precision", "configuration-file", "game", "demo",
+}  # fmt: skip
 _LEFT_OUT_STARTS = ("save-", "gui-", "osg-", "device.fcd.", "summary", "game.")
 _TRUE = {"true", "1", "yes", "on", "t", "x"}
 _OSM_FLAGS = (
-    "--geometry.remove",
-    "--junctions.join",
-    "--tls.guess-signals",
-    "--tls.join",
-    "--sidewalks.guess",
+    "--geometry.remove", "--junctions.join", "--tls.guess-signals", "--tls.join", "--sidewalks.guess",
     "--crossings.guess",
-)
+)  # fmt: skip
 FCD_DIGITS = 8
 """Decimals that SUMO writes."""
 
@@ -126,8 +100,7 @@ def milliseconds(value_s: float, place: str) -> int:
 
 
 def timing(traffic: TrafficModel, begin_s: float, place: str) -> Timing:
-    """Check that period and warm-up are whole numbers of steps (SUMO itself only warns, and records the wrong
-    times)."""
+    """The times; period and warm-up are whole numbers of steps (SUMO itself only warns, and records wrong times)."""
     step = milliseconds(traffic.step_s, f"{place}.step_s")
     if step < 1:
         raise InputError(f"{place}.step_s = {traffic.step_s:g}", "is below a millisecond", "at least 0.001")
@@ -136,24 +109,15 @@ def timing(traffic: TrafficModel, begin_s: float, place: str) -> Timing:
         value = milliseconds(getattr(traffic, key), f"{place}.{key}")
         if value % step:
             near = " or ".join(f"{n * step / 1000:g}" for n in (value // step, value // step + 1) if n)
-            raise InputError(
-                f"{place}.{key} = {value / 1000:g}",
-                f"is no whole number of steps of {step / 1000:g} s",
-                f"for example {near}, or another step_s",
-            )
+            what, right = f"is no whole number of steps of {step / 1000:g} s", f"for example {near}, or another step_s"
+            raise InputError(f"{place}.{key} = {value / 1000:g}", what, right)
         values.append(value)
     begin = milliseconds(begin_s, f"{place}: begin")
     return Timing(begin, begin + values[1], values[0], step, traffic.frames)
 
 
 def sources(scenario: Scenario) -> Sources:
-    """The files that a simulation reads.
-
-    Raises
-    ------
-    InputError
-        When the scenario, or a configuration that it names, names a file that is not there.
-    """
+    """The files that a simulation reads; InputError when the scenario, or its configuration, names a missing one."""
     traffic = scenario.traffic
     if traffic.sumocfg is not None:
         return _configured(scenario.find(traffic.sumocfg, "traffic.sumocfg"))
@@ -165,8 +129,7 @@ def sources(scenario: Scenario) -> Sources:
 
 
 def network_path(scenario: Scenario) -> Path | None:
-    """The network that a scenario, or the configuration that it names, simulates; None where it names a finished
-    file."""
+    """The network that a scenario or its configuration simulates; None where it names a finished file."""
     traffic = scenario.traffic
     if traffic.network is not None:
         return scenario.find(traffic.network, "traffic.network")
@@ -191,17 +154,14 @@ def _configured(path: Path) -> Sources:
         if key == "begin":
             begin_s = _seconds(value, path)
         elif key == "no-internal-links" and value.lower() in _TRUE:
-            raise InputError(
-                f"{path}: {key} = {value!r}", "lets vehicles jump over junctions (up to 42 m)", "remove it"
-            )
+            what = "lets vehicles jump over junctions (up to 42 m)"
+            raise InputError(f"{path}: {key} = {value!r}", what, "remove it")
         elif key in _LEFT_OUT or key.startswith(_LEFT_OUT_STARTS) or "output" in key:
             continue
         elif key.endswith(("-file", "-files")):
-            for piece in pieces:
-                if not piece.is_file():
-                    raise InputError(
-                        f"{path}: {key} = {value!r}", f"no such file ({piece})", "a path relative to the configuration"
-                    )
+            for missing in (piece for piece in pieces if not piece.is_file()):
+                what = f"no such file ({missing})"
+                raise InputError(f"{path}: {key} = {value!r}", what, "a path relative to the configuration")
             files[key] = pieces
         else:
             options[key] = value
@@ -223,9 +183,8 @@ def _seconds(value: str, path: Path) -> float:
     try:
         return float(value)
     except ValueError:
-        raise InputError(
-            f"{path}: begin = {value!r}", "is no number of seconds", "for example 25200 for seven o'clock"
-        ) from None
+        right = "for example 25200 for seven o'clock"
+        raise InputError(f"{path}: begin = {value!r}", "is no number of seconds", right) from None
 
 
 @dataclass(frozen=True)
@@ -240,25 +199,14 @@ class Prepared:
     """Whether the trips are drawn here, not a user's."""
     adds_traffic: bool
     """Whether extensions added traffic to it."""
-    notes: tuple[str, ...]
-
-    @property
-    def config(self) -> list[str]:
-        """The flags that start this run, without outputs."""
-        return ["-c", CONFIG]
-
-    @property
-    def flags(self) -> list[str]:
-        """Every flag of the run, as one would type it in its folder."""
-        return [word for key, value in (self.options | self.outputs).items() for word in (f"--{key}", value)]
+    notes: list[str]
 
     @property
     def outputs(self) -> dict[str, str]:
         """What this program has SUMO write."""
-        attributes = _ATTRIBUTES + (",z,slope" if self.roads.has_heights else "")
         wanted = {
             "fcd-output": FCD,
-            "fcd-output.attributes": attributes,
+            "fcd-output.attributes": _ATTRIBUTES + (",z,slope" if self.roads.has_heights else ""),
             "fcd-output.skip-empty": "true",
             "device.fcd.begin": _text(self.timing.first_ms),
             "device.fcd.period": _text(self.timing.period_ms),
@@ -275,7 +223,7 @@ def prepare(scenario: Scenario, folder: Path, extensions: Iterable[TrafficExtens
     traffic, place = scenario.traffic, place_of(scenario)
     given = sources(scenario)
     when = timing(traffic, given.begin_s, place)
-    adding = [extension for extension in extensions if extension.adds_traffic]
+    adding = [extension for extension in extensions if extension.ADDS_TRAFFIC]
     others = [OTHERS.replace("others", f"others{number or ''}") for number in range(len(adding))]
     folder.mkdir(parents=True, exist_ok=True)
     named = _copies(given, folder, others)
@@ -294,7 +242,7 @@ def prepare(scenario: Scenario, folder: Path, extensions: Iterable[TrafficExtens
     number = int(sumo_seed.generate_state(1)[0]) & 0x7FFFFFFF
     options = given.options | named | _settings(traffic, when, number, vehicles)
     files.write_text(folder / CONFIG, _config_xml(options))
-    return Prepared(folder, options, when, roads, drawn, bool(adding), tuple(notes))
+    return Prepared(folder, options, when, roads, drawn, bool(adding), notes)
 
 
 def _settings(traffic: TrafficModel, when: Timing, seed: int, vehicles: int) -> dict[str, str]:
@@ -320,15 +268,20 @@ def _text(time_ms: int) -> str:
     return f"{time_ms // 1000}.{time_ms % 1000:03d}"
 
 
+def as_flags(options: Mapping[str, str]) -> list[str]:
+    """Options as one would type them."""
+    return [word for key, value in options.items() for word in (f"--{key}", value)]
+
+
 def _draw(
     scenario: Scenario, roads: network.Network, when: Timing, rng: np.random.Generator, folder: Path
 ) -> list[str]:
+    """Write drawn trips and their vTypes; what the user should know of them."""
     traffic, place = scenario.traffic, place_of(scenario)
     demand.check_kinds(traffic.kinds, sumo.vehicle_classes(), place)
     pairs = [demand.pairs(roads, kind, traffic, rng, place) for kind in traffic.kinds]
-    departs_s = (
-        np.arange(int(np.ceil((when.end_ms - when.begin_ms) / 1000.0 * traffic.trips_per_s))) / traffic.trips_per_s
-    )
+    count = int(np.ceil((when.end_ms - when.begin_ms) / 1000.0 * traffic.trips_per_s))
+    departs_s = np.arange(count) / traffic.trips_per_s
     trips = demand.draw(roads, traffic.kinds, pairs, departs_s, rng)
     files.write_text(folder / TRIPS, demand.trips_xml(trips, departs_s))
     files.write_text(folder / VTYPES, demand.vtypes_xml(traffic.kinds))
@@ -362,11 +315,11 @@ def _copies(given: Sources, folder: Path, others: Iterable[str]) -> dict[str, st
 
 def convert_osm(path: Path, network_path: Path) -> None:
     """Turn a map of OpenStreetMap into a network; its world frame starts at the network's south-west corner."""
-    folder, readable = network_path.parent, path
+    folder = network_path.parent
     if osm.is_pbf(path):  # netconvert reads XML only
-        readable = folder / MAP
-        osm.write_xml(path, readable)
-    source = os.path.relpath(readable, folder)
+        osm.write_xml(path, folder / MAP)
+        path = folder / MAP
+    source = os.path.relpath(path, folder)
     sumo.run("netconvert", ["--osm-files", source, *_OSM_FLAGS, "-o", network_path.name], folder)
 
 

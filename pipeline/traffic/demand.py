@@ -14,15 +14,16 @@ randomTrips.py. All randomness comes from the generator that is passed in.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.core.errors import InputError
 from pipeline.scenario.traffic import TrafficModel, VehicleKind
+from pipeline.traffic.boxes import Floats, Ints, Size
 from pipeline.traffic.network import Network
 
 UPRIGHT = {"maxSpeedLat": "1.0", "lcMaxSpeedLatStanding": "0", "lcMaxSpeedLatFactor": "0.2"}
@@ -34,30 +35,23 @@ _FAR_SHARE = 0.25
 
 @dataclass(frozen=True)
 class Pairs:
-    """Trips that a kind may make: ``origin[i]`` to ``target[i]`` (positions in ``Network.edges``), drawn with
-    ``weight[i]``."""
+    """Trips that a kind may make: from ``origin`` to ``target`` (positions in ``Network.edges``), with weights."""
 
-    origin: NDArray[np.int64]
-    target: NDArray[np.int64]
-    weight: NDArray[np.float64]
+    origin: Ints
+    target: Ints
+    weight: Floats
     fringe: bool
 
 
 def pairs(network: Network, kind: VehicleKind, traffic: TrafficModel, rng: np.random.Generator, place: str) -> Pairs:
     """The trips that ``kind`` may make.
 
-    Raises
-    ------
-    InputError
-        When there is none: the kind may drive nowhere, or no trip is as long as ``min_trip_m``.
+    InputError when there is none: the kind may drive nowhere, or no trip is as long as ``min_trip_m``.
     """
+    who = f"kind {kind.name!r} (vClass {kind.vclass})"
     lanes = np.array([edge.lanes_for(kind.vclass) for edge in network.edges], dtype=np.float64)
     if not lanes.any():
-        raise InputError(
-            f"{place}.kinds",
-            f"kind {kind.name!r} (vClass {kind.vclass}) may use no lane of the network",
-            "a kind that the network admits",
-        )
+        raise InputError(f"{place}.kinds", f"{who} may use no lane of the network", "a kind that the network admits")
     min_trip_m, weights = traffic.min_trip_m, _weights(network, lanes, traffic, place)
     links = network.links(kind.vclass)
     sources, sinks = _fringe(lanes, links)
@@ -67,15 +61,12 @@ def pairs(network: Network, kind: VehicleKind, traffic: TrafficModel, rng: np.ra
         some = np.sort(rng.choice(anywhere, min(_MAX_ORIGINS, anywhere.size), replace=False))
         trips = _reachable(network, weights, links, some, anywhere, far, fringe=False)
     if not trips.weight.any():
-        raise InputError(
-            f"{place}.kinds",
-            f"kind {kind.name!r} (vClass {kind.vclass}) can go from no edge to another that is {min_trip_m:g} m away",
-            "a connected network, or a smaller min_trip_m",
-        )
+        what = f"{who} can go from no edge to another that is {min_trip_m:g} m away"
+        raise InputError(f"{place}.kinds", what, "a connected network, or a smaller min_trip_m")
     return trips
 
 
-def _weights(network: Network, lanes: NDArray[np.float64], traffic: TrafficModel, place: str) -> NDArray[np.float64]:
+def _weights(network: Network, lanes: Floats, traffic: TrafficModel, place: str) -> Floats:
     """How likely a trip starts or ends at each edge: as the scenario says, else by its lanes for this kind."""
     index = {edge.id: i for i, edge in enumerate(network.edges)}
     weights = lanes.copy()
@@ -86,7 +77,7 @@ def _weights(network: Network, lanes: NDArray[np.float64], traffic: TrafficModel
     return weights
 
 
-def _fringe(lanes: NDArray[np.float64], links: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _fringe(lanes: Floats, links: Ints) -> tuple[Ints, Ints]:
     onward = links[links[:, 2] == 0]
     usable = lanes > 0
     entered, left = (np.isin(np.arange(lanes.size), onward[:, column]) for column in (1, 0))
@@ -94,14 +85,9 @@ def _fringe(lanes: NDArray[np.float64], links: NDArray[np.int64]) -> tuple[NDArr
 
 
 def _reachable(
-    network: Network,
-    weights: NDArray[np.float64],
-    links: NDArray[np.int64],
-    sources: NDArray[np.int64],
-    sinks: NDArray[np.int64],
-    min_trip_m: float,
-    fringe: bool = True,
+    network: Network, weights: Floats, links: Ints, sources: Ints, sinks: Ints, min_trip_m: float, fringe: bool = True
 ) -> Pairs:
+    """The pairs of a source and a sink that can be reached from it, is no way back, and is far enough."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import breadth_first_order
 
@@ -123,12 +109,9 @@ def _reachable(
 
 
 def draw(
-    network: Network,
-    kinds: Sequence[VehicleKind],
-    all_pairs: Sequence[Pairs],
-    departs_s: NDArray[np.float64],
+    network: Network, kinds: Sequence[VehicleKind], all_pairs: Sequence[Pairs], departs_s: Floats,
     rng: np.random.Generator,
-) -> list[tuple[str, str, str]]:
+) -> list[tuple[str, str, str]]:  # fmt: skip
     """For each departure: the name of the kind, the edge where the trip starts, the edge where it ends."""
     shares = np.array([kind.share for kind in kinds])
     chosen = rng.choice(len(kinds), size=departs_s.size, p=shares / shares.sum())
@@ -142,7 +125,7 @@ def draw(
     ]
 
 
-def trips_xml(trips: Sequence[tuple[str, str, str]], departs_s: NDArray[np.float64]) -> str:
+def trips_xml(trips: Sequence[tuple[str, str, str]], departs_s: Floats) -> str:
     """A SUMO route file with one ``<trip>`` a departure."""
     lines = [
         f'    <trip id="{index}" depart="{depart:.3f}" from={quoteattr(origin)} to={quoteattr(target)}'
@@ -154,36 +137,27 @@ def trips_xml(trips: Sequence[tuple[str, str, str]], departs_s: NDArray[np.float
 
 def vtypes_xml(kinds: Sequence[VehicleKind]) -> str:
     """A SUMO additional file with one ``<vType>`` a kind, with its real size."""
-    lines = []
-    for kind in kinds:
-        values = (
-            {
-                "id": kind.name,
-                "vClass": kind.vclass,
-                "length": kind.length_m,
-                "width": kind.width_m,
-                "height": kind.height_m,
-            }
-            | UPRIGHT
-            | kind.attributes
-        )
-        lines.append(f"    <vType {' '.join(f'{key}={quoteattr(str(value))}' for key, value in values.items())}/>")
+    lines = [
+        vtype_xml(kind.name, Size(kind.length_m, kind.width_m, kind.height_m, kind.vclass), UPRIGHT | kind.attributes)
+        for kind in kinds
+    ]
     return "\n".join(["<additional>", *lines, "</additional>", ""])
+
+
+def vtype_xml(name: str, size: Size, attributes: Mapping[str, Any]) -> str:
+    """One ``<vType>``, on a line of its own."""
+    box = {"length": size.length_m, "width": size.width_m, "height": size.height_m}
+    values = {"id": name, "vClass": size.vclass, **box, **attributes}
+    return f"    <vType {' '.join(f'{key}={quoteattr(str(value))}' for key, value in values.items())}/>"
 
 
 def check_kinds(kinds: Sequence[VehicleKind], vehicle_classes: frozenset[str], place: str) -> None:
     """Refuse an unknown vClass, and attributes that would contradict the kind's own keys."""
     for kind in kinds:
         if kind.vclass not in vehicle_classes:
-            raise InputError(
-                f"{place}.kinds",
-                f"kind {kind.name!r} has the vClass {kind.vclass!r}",
-                f"one of {', '.join(sorted(vehicle_classes))}",
-            )
+            what, right = f"kind {kind.name!r} has the vClass {kind.vclass!r}", ", ".join(sorted(vehicle_classes))
+            raise InputError(f"{place}.kinds", what, f"one of {right}")
         own = sorted({"id", "vClass", "length", "width", "height"} & kind.attributes.keys())
         if own:
-            raise InputError(
-                f"{place}.kinds",
-                f"kind {kind.name!r} has {', '.join(own)} among its attributes",
-                "name, vclass, length_m, width_m and height_m of the kind",
-            )
+            what = f"kind {kind.name!r} has {', '.join(own)} among its attributes"
+            raise InputError(f"{place}.kinds", what, "name, vclass, length_m, width_m and height_m of the kind")

@@ -11,16 +11,17 @@ changes, in the order of the extensions.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
-import numpy as np
+if TYPE_CHECKING:
+    import numpy as np
 
-from pipeline.core.errors import InputError
-from pipeline.scenario.models import Scenario
-from pipeline.traffic.boxes import Size, VehicleBoxes
-from pipeline.traffic.network import Network
+    from pipeline.core.errors import InputError
+    from pipeline.scenario.models import Scenario
+    from pipeline.traffic.boxes import Size, VehicleBoxes
+    from pipeline.traffic.network import Network
 
 
 @dataclass(frozen=True)
@@ -55,43 +56,29 @@ class BoxChange(Protocol):
 
 
 class TrafficExtension(Protocol):
-    """Something that goes beyond plain vehicles on flat ground."""
+    """Something that goes beyond plain vehicles on flat ground. As it stands here, it changes nothing."""
 
-    @property
-    def adds_traffic(self) -> bool:
-        """Whether it has a plan; people on foot are recorded then."""
-        ...
+    ADDS_TRAFFIC: ClassVar[bool] = False
+    """Whether it has a :meth:`plan`; people on foot are recorded then."""
 
     def refuses(self, scenario: Scenario) -> InputError | None:
         """Why this scenario cannot have it; None when it can."""
-        ...
+        return None
 
     def sizes(self) -> dict[str, Size]:
         """Sizes of the types of vehicles and persons that it adds."""
-        ...
+        return {}
 
     def uncounted_types(self, sizes: Mapping[str, Size]) -> frozenset[str]:
         """Which of SUMO's types are no vehicles of the scenario."""
-        ...
+        return frozenset()
 
     def plan(
         self, scenario: Scenario, roads: Network, begin_s: float, end_s: float, rng: np.random.Generator
     ) -> TrafficPlan:
-        """The traffic that it adds between two times; asked for only where it ``adds_traffic``."""
-        ...
+        """The traffic that it adds between two times."""
+        return TrafficPlan("<routes/>", 0)
 
     def box_change(self, scenario: Scenario, sizes: Mapping[str, Size]) -> BoxChange | None:
         """What changes the boxes of a recording whose vehicles have these sizes; None for nothing."""
-        ...
-
-
-def uncounted_types(extensions: Iterable[TrafficExtension], sizes: Mapping[str, Size]) -> frozenset[str]:
-    """SUMO's types of those who are no vehicles of the scenario."""
-    return frozenset[str]().union(*(extension.uncounted_types(sizes) for extension in extensions))
-
-
-def refuse(extensions: Iterable[TrafficExtension], scenario: Scenario) -> None:
-    """Raise what the first extension refuses the scenario for."""
-    for extension in extensions:
-        if (refusal := extension.refuses(scenario)) is not None:
-            raise refusal
+        return None

@@ -5,7 +5,8 @@ Hands out Arrow tables with the columns of :data:`SCHEMA`, piece by piece, so th
 
 Positions are SUMO's own: the middle of the front bumper in metres, the angle in degrees clockwise from north, the slope
 in degrees. Times are whole milliseconds, SUMO's own unit. Rows without a vehicle (SUMO writes one for an empty step)
-are left out; so are persons (unless asked for) and containers."""
+are left out; so are persons (unless asked for) and containers.
+"""
 
 from __future__ import annotations
 
@@ -23,18 +24,9 @@ from pipeline.core.errors import InputError
 from pipeline.formats import safe_xml
 from pipeline.scenario.types import FARTHEST_M
 
+_NUMBERS = ("x", "y", "z", "angle", "slope", "speed")
 SCHEMA = pa.schema(
-    [
-        ("time_ms", pa.int64()),
-        ("id", pa.string()),
-        ("type", pa.string()),
-        ("x", pa.float64()),
-        ("y", pa.float64()),
-        ("z", pa.float64()),
-        ("angle", pa.float64()),
-        ("slope", pa.float64()),
-        ("speed", pa.float64()),
-    ]
+    {"time_ms": pa.int64(), "id": pa.string(), "type": pa.string()} | dict.fromkeys(_NUMBERS, pa.float64())
 )
 """Columns of every table here. z and slope are 0 and speed is NaN where the file has none."""
 
@@ -54,16 +46,9 @@ RIGHT = "FCD with the attributes id, x, y, angle and type (--fcd-output.attribut
 def read(path: Path, who: str = "vehicle") -> Iterator[pa.Table]:
     """The file's rows in the order of the file, as tables of :data:`SCHEMA`.
 
-    Parameters
-    ----------
-    who
-        ``"vehicle"``, or ``"person"`` for what ``--person-fcd-output`` wrote. A person's slope is left out: people
-        stand upright, and SUMO gives the lane's slope whichever way they walk.
-
-    Raises
-    ------
-    InputError
-        Naming the file and the row: a column is missing, a value is no number, time runs back, the file is damaged.
+    ``who`` is ``"vehicle"``, or ``"person"`` for what ``--person-fcd-output`` wrote. A person's slope is left out:
+    people stand upright, and SUMO gives the lane's slope whichever way they walk. InputError names the file and the
+    row: a column is missing, a value is no number, time runs back, the file is damaged.
     """
     if not path.is_file():
         raise InputError(path, "no such file", "a file that SUMO wrote with --fcd-output")
@@ -71,12 +56,11 @@ def read(path: Path, who: str = "vehicle") -> Iterator[pa.Table]:
         head = file.read(256).lstrip(b"\xef\xbb\xbf \t\r\n")
     if not head:
         raise InputError(path, "is empty", RIGHT)
-    if head.startswith(b"PAR1"):
-        yield from _checked(_parquet(path, who), path, "row")
-    elif head.startswith(b"<"):
+    if head.startswith(b"<"):
         yield from _checked(_xml(path, who), path, f"{who} element")
     else:
-        yield from _checked(_csv(path, who), path, "row")
+        reader = _parquet if head.startswith(b"PAR1") else _csv
+        yield from _checked(reader(path, who), path, "row")
 
 
 def _csv(path: Path, who: str) -> Iterator[pa.RecordBatch]:
@@ -168,81 +152,66 @@ def _columns(names: list[str], path: Path, who: str) -> dict[str, str]:
 
 
 def _checked(batches: Iterable[pa.RecordBatch], path: Path, unit: str) -> Iterator[pa.Table]:
-    """Into :data:`SCHEMA`, with every number finite and time never running back. Rows count from 1, without a
-    header."""
+    """Into :data:`SCHEMA`, with every number finite and time never running back."""
     done, last_ms = 0, None
     for batch in batches:
-        values = {name: batch.column(name) for name in batch.schema.names}
-        taken = pc.and_(pc.is_valid(values["id"]), pc.fill_null(pc.not_equal(values["id"], ""), False))
-        row = np.flatnonzero(taken.to_numpy(zero_copy_only=False)) + done + 1
-        values = {name: pc.filter(column, taken) for name, column in values.items()}
-        _typed(values, row, path, unit)
-        for name in ("time", "x", "y", "angle", *(n for n in _OPTIONAL if n in values and n != "speed")):
-            _finite(values, name, row, path, unit)
-        time_ms = _milliseconds(values, row, path, unit)
-        last_ms = _forward(time_ms, last_ms, row, path, unit)
+        piece = _Piece(batch, done, path, unit)
         done += batch.num_rows
-        if row.size:
-            yield _table(values, time_ms)
+        piece.check_types()
+        for name in ("time", "x", "y", "angle", *(n for n in _OPTIONAL if n in piece.values and n != "speed")):
+            piece.check_finite(name)
+        time_ms = piece.milliseconds()
+        if time_ms.size:
+            piece.check_order(time_ms, last_ms)
+            last_ms = int(time_ms[-1])
+            yield _table(piece.values, time_ms)
 
 
-def _finite(values: dict[str, Any], name: str, row: NDArray[np.int64], path: Path, unit: str) -> None:
-    bad = np.flatnonzero(~(np.abs(_floats(values[name])) <= FARTHEST_M))
-    if bad.size:
-        value = values[name][int(bad[0])].as_py()
-        raise InputError(
-            f"{path}: {unit} {row[bad[0]]}",
-            f"{name} of vehicle {values['id'][int(bad[0])].as_py()!r} is {'empty' if value is None else value}",
-            f"a finite number, at most {FARTHEST_M:g}",
-        )
+class _Piece:
+    """A piece of a file: the columns of the rows that have a vehicle, and where these rows are in the file."""
 
+    def __init__(self, batch: pa.RecordBatch, done: int, path: Path, unit: str) -> None:
+        """``done`` rows came before; rows count from 1, without a header."""
+        names = batch.column("id")
+        taken = pc.and_(pc.is_valid(names), pc.fill_null(pc.not_equal(names, ""), False))
+        self.values: dict[str, Any] = {n: pc.filter(batch.column(n), taken) for n in batch.schema.names}
+        self._row = _rows_of(taken) + done + 1
+        self._path, self._unit = path, unit
 
-def _typed(values: dict[str, Any], row: NDArray[np.int64], path: Path, unit: str) -> None:
-    bad = _rows_of(pc.fill_null(pc.equal(values["type"], ""), True))
-    if bad.size:
-        raise InputError(
-            f"{path}: {unit} {row[bad[0]]}",
-            f"vehicle {values['id'][int(bad[0])].as_py()!r} has no type",
-            "the vehicle's type, which its size comes from",
-        )
+    def check_types(self) -> None:
+        for i in _rows_of(pc.fill_null(pc.equal(self.values["type"], ""), True)):
+            raise self._wrong(i, f"{self._vehicle(i)} has no type", "the vehicle's type, which its size comes from")
 
+    def check_finite(self, name: str) -> None:
+        for i in np.flatnonzero(~(np.abs(_floats(self.values[name])) <= FARTHEST_M)):
+            value = self.values[name][int(i)].as_py()
+            what = f"{name} of {self._vehicle(i)} is {'empty' if value is None else value}"
+            raise self._wrong(i, what, f"a finite number, at most {FARTHEST_M:g}")
 
-def _milliseconds(values: dict[str, Any], row: NDArray[np.int64], path: Path, unit: str) -> NDArray[np.int64]:
-    exact = _floats(values["time"]) * 1000.0
-    whole = np.rint(exact)
-    bad = np.flatnonzero(np.abs(exact - whole) > 1e-3)
-    if bad.size:
-        raise InputError(
-            f"{path}: {unit} {row[bad[0]]}",
-            f"time {exact[bad[0]] / 1000.0:.6f} s",
-            "a whole number of milliseconds, as SUMO counts",
-        )
-    return whole.astype(np.int64)
+    def milliseconds(self) -> NDArray[np.int64]:
+        exact = _floats(self.values["time"]) * 1000.0
+        whole = np.rint(exact)
+        for i in np.flatnonzero(np.abs(exact - whole) > 1e-3):
+            raise self._wrong(i, f"time {exact[i] / 1000.0:.6f} s", "a whole number of milliseconds, as SUMO counts")
+        return whole.astype(np.int64)
 
+    def check_order(self, time_ms: NDArray[np.int64], last_ms: int | None) -> None:
+        before = np.concatenate([[time_ms[0] if last_ms is None else last_ms], time_ms[:-1]])
+        for i in np.flatnonzero(time_ms < before):
+            what = f"time {time_ms[i] / 1000:g} s comes after {before[i] / 1000:g} s"
+            raise self._wrong(i, what, "rows in order of time")
 
-def _forward(
-    time_ms: NDArray[np.int64], last_ms: int | None, row: NDArray[np.int64], path: Path, unit: str
-) -> int | None:
-    if not time_ms.size:
-        return last_ms
-    before = np.concatenate([[time_ms[0] if last_ms is None else last_ms], time_ms[:-1]])
-    bad = np.flatnonzero(time_ms < before)
-    if bad.size:
-        raise InputError(
-            f"{path}: {unit} {row[bad[0]]}",
-            f"time {time_ms[bad[0]] / 1000:g} s comes after {before[bad[0]] / 1000:g} s",
-            "rows in order of time",
-        )
-    return int(time_ms[-1])
+    def _vehicle(self, i: np.int64) -> str:
+        return f"vehicle {self.values['id'][int(i)].as_py()!r}"
+
+    def _wrong(self, i: np.int64, what: str, right: str) -> InputError:
+        return InputError(f"{self._path}: {self._unit} {self._row[i]}", what, right)
 
 
 def _table(values: dict[str, Any], time_ms: NDArray[np.int64]) -> pa.Table:
     n = time_ms.size
-    filled = {
-        name: pa.array(_floats(values[name]) if name in values else np.full(n, default))
-        for name, default in _OPTIONAL.items()
-    }
-    columns = values | filled | {"time_ms": pa.array(time_ms)}
+    given = {name: _floats(values[name]) if name in values else np.full(n, blank) for name, blank in _OPTIONAL.items()}
+    columns = values | {"time_ms": pa.array(time_ms)} | {name: pa.array(column) for name, column in given.items()}
     return pa.table([pc.cast(columns[f.name], f.type) for f in SCHEMA], schema=SCHEMA)
 
 

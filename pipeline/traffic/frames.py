@@ -72,9 +72,8 @@ class _Cutter:
         kept = np.flatnonzero((off == 0) & (frame >= 0) & (frame < window.count))
         if kept.size:
             self.frames.append(frame[kept])
-            self.tables.append(
-                table.slice(int(kept[0]), int(kept[-1] - kept[0] + 1)) if _is_run(kept) else table.take(kept)
-            )
+            is_run = kept[-1] - kept[0] + 1 == kept.size
+            self.tables.append(table.slice(int(kept[0]), kept.size) if is_run else table.take(kept))
         return int(np.clip(-((self.first_ms - self.last_ms) // window.period_ms), 0, window.count))
 
     def take(self, frames: int) -> FrameGroup:
@@ -95,11 +94,9 @@ class _Cutter:
         if self.first_ms is None:
             raise InputError(self.place, "holds no vehicle", RIGHT)
         if self.step_ms and window.period_ms % self.step_ms:
-            raise InputError(
-                f"{self.place}: frame_period_s = {window.period_ms / 1000:g}",
-                f"the file's time steps are {self.step_ms / 1000:g} s apart",
-                "a multiple of that",
-            )
+            what = f"the file's time steps are {self.step_ms / 1000:g} s apart"
+            place = f"{self.place}: frame_period_s = {window.period_ms / 1000:g}"
+            raise InputError(place, what, "a multiple of that")
         there = max(0, (self.last_ms - self.first_ms) // window.period_ms + 1)
         if there < window.count:
             raise InputError(
@@ -112,25 +109,14 @@ class _Cutter:
 
 def together(some: FrameGroup, others: FrameGroup) -> FrameGroup:
     """Two streams' rows of the same frames as one group."""
-    return FrameGroup(
-        some.first_frame,
-        some.frames,
-        np.concatenate([some.frame, others.frame]),
-        pa.concat_tables([some.rows, others.rows]).combine_chunks(),
-    )
-
-
-def _is_run(kept: NDArray[np.int64]) -> bool:
-    return bool(kept[-1] - kept[0] + 1 == kept.size)
+    rows = pa.concat_tables([some.rows, others.rows]).combine_chunks()
+    return FrameGroup(some.first_frame, some.frames, np.concatenate([some.frame, others.frame]), rows)
 
 
 def groups(tables: Iterable[pa.Table], window: Window, frames_each: int, place: str) -> Iterator[FrameGroup]:
     """Cut a stream of rows into groups of ``frames_each`` whole frames (the last may be shorter).
 
-    Raises
-    ------
-    InputError
-        When the stream ends before the window does, or its time steps do not fit the window's period.
+    InputError when the stream ends before the window does, or its time steps do not fit the window's period.
     """
     cutter = _Cutter(window, place)
     for table in tables:

@@ -42,11 +42,11 @@ class LiveObservations:
 def poll(
     connection: Any, when: Timing, observations: LiveObservations, address: str, *, persons: bool = False
 ) -> Iterator[pa.Table]:
-    """Step a running SUMO through the recording, and give its rows as its FCD file would have them; also those of
-    persons where they are wanted.
+    """Step a running SUMO through the recording, and give its rows as its FCD file would have them.
 
-    After a step, TraCI's clock is one step ahead of the state that it shows: what SUMO's FCD calls time t is seen at t
-    + step."""
+    After a step, TraCI's clock is one step ahead of the state that it shows: what SUMO's FCD calls time t is seen at
+    t + step.
+    """
     _check_clock(connection, when, address)
     watched = _Subscriptions(connection, observations.sizes, persons)
     while (shown_ms := round(connection.simulation.getTime() * 1000)) < when.end_ms:
@@ -71,20 +71,17 @@ def ask_size(connection: Any, name: str) -> Size:
 def _check_clock(connection: Any, when: Timing, address: str) -> None:
     step = round(connection.simulation.getDeltaT() * 1000)
     if step != when.step_ms:
-        raise InputError(
-            f"--traci {address}", f"that SUMO's step is {step / 1000:g} s", f"traffic.step_s = {when.step_ms / 1000:g}"
-        )
-    now = round(connection.simulation.getTime() * 1000)
+        right = f"traffic.step_s = {when.step_ms / 1000:g}"
+        raise InputError(f"--traci {address}", f"that SUMO's step is {step / 1000:g} s", right)
+    now, first = round(connection.simulation.getTime() * 1000), f"the first frame at {when.first_ms / 1000:g} s"
     if now > when.first_ms:
         raise RunError(
-            f"--traci {address}: that SUMO is at {now / 1000:g} s already, after the first frame at"
-            f" {when.first_ms / 1000:g} s; start it anew, or set a longer traffic.warmup_s"
+            f"--traci {address}: that SUMO is at {now / 1000:g} s already, after {first}; start it anew, or set a"
+            " longer traffic.warmup_s"
         )
     if (when.first_ms - now) % when.step_ms:
-        raise RunError(
-            f"--traci {address}: from {now / 1000:g} s, steps of {step / 1000:g} s do not meet the first frame at"
-            f" {when.first_ms / 1000:g} s"
-        )
+        steps = f"from {now / 1000:g} s, steps of {step / 1000:g} s"
+        raise RunError(f"--traci {address}: {steps} do not meet {first}")
 
 
 class _Subscriptions:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -46,10 +46,8 @@ class Permission:
     @classmethod
     def of(cls, attributes: Mapping[str, str]) -> Permission:
         """From those of a ``<lane>`` or a ``<connection>``."""
-        allow, disallow = attributes.get("allow"), attributes.get("disallow")
-        return cls(
-            None if allow in (None, "", "all") else frozenset(str(allow).split()), frozenset((disallow or "").split())
-        )
+        allow, disallow = attributes.get("allow", ""), attributes.get("disallow", "")
+        return cls(None if allow in ("", "all") else frozenset(allow.split()), frozenset(disallow.split()))
 
     def admits(self, vclass: str) -> bool:
         """Whether a vehicle of ``vclass`` may go there."""
@@ -66,8 +64,8 @@ class Shape:
     place: str
 
     @cached_property
-    def points_m(self) -> NDArray[np.float64]:
-        """(n, 3) float64; z is 0 where the file names none. InputError when the text holds no coordinates."""
+    def shape_m(self) -> NDArray[np.float64]:
+        """(n, 3) float64, metres; z is 0 where the file names none. InputError when the text holds no coordinates."""
         try:
             points = [[float(v) for v in point.split(",")] for point in self.text.split()]
             return np.array([[*point, 0.0][:3] for point in points], dtype=np.float64).reshape(-1, 3)
@@ -81,21 +79,15 @@ class Shape:
 
 
 @dataclass(frozen=True)
-class Lane:
+class Lane(Shape):
     """A lane: its middle line, or a walking area's outline.
 
     ``width_m`` is None where the file names none; ``length_m`` is as SUMO counts.
     """
 
-    shape: Shape
     width_m: float | None
     length_m: float
     permission: Permission
-
-    @property
-    def shape_m(self) -> NDArray[np.float64]:
-        """(n, 3) float64, metres."""
-        return self.shape.points_m
 
 
 @dataclass(frozen=True)
@@ -112,12 +104,12 @@ class Edge:
     @cached_property
     def start_m(self) -> tuple[float, float]:
         """Where its first lane starts."""
-        return _point(self.lanes[0].shape.text.split()[0])
+        return _point(self.lanes[0].text.split()[0])
 
     @cached_property
     def end_m(self) -> tuple[float, float]:
         """Where its first lane ends."""
-        return _point(self.lanes[0].shape.text.split()[-1])
+        return _point(self.lanes[0].text.split()[-1])
 
     def lanes_for(self, vclass: str) -> int:
         """How many of its lanes ``vclass`` may use."""
@@ -137,19 +129,13 @@ class Connection:
 
 
 @dataclass(frozen=True)
-class Junction:
-    """Where edges meet; ``type`` is SUMO's ("traffic_light", "dead_end", "internal", ...)."""
+class Junction(Shape):
+    """Where edges meet, with its outline; ``type`` is SUMO's ("traffic_light", "dead_end", "internal", ...)."""
 
     id: str
     type: str
     at_m: tuple[float, float]
-    shape: Shape
     incoming_lanes: tuple[str, ...]
-
-    @property
-    def shape_m(self) -> NDArray[np.float64]:
-        """Its outline, (n, 3) float64, metres; (0, 3) where it has none."""
-        return self.shape.points_m
 
 
 @dataclass(frozen=True)
@@ -210,7 +196,7 @@ class Network:
     @cached_property
     def has_heights(self) -> bool:
         """Whether any lane has heights."""
-        return any(lane.shape.has_heights for edge in self.all_edges for lane in edge.lanes)
+        return any(lane.has_heights for edge in self.all_edges for lane in edge.lanes)
 
     @cached_property
     def diagonal_m(self) -> float:
@@ -250,124 +236,86 @@ class Network:
 def read(path: Path, name: Path | None = None) -> Network:
     """Read a network; messages call it ``name`` where it is a copy of what the user named.
 
-    Raises
-    ------
-    InputError
-        When the file is no SUMO network, is damaged, or has no road.
+    InputError when the file is no SUMO network, is damaged, or has no road.
     """
     copy, path = path, name or path
-    reading = _Reading(path)
+    edges: list[Edge] = []
+    connections: list[dict[str, str]] = []
+    lane_links: list[tuple[str, str]] = []
+    junctions: list[Junction] = []
+    cycle_s, location = 0.0, None
     for element in safe_xml.children(copy, "net", path):
         try:
-            reading.take(element)
+            match element.tag:
+                case "edge":
+                    edges.append(_edge(element, path))
+                case "connection":
+                    start, end = element.attrib["from"], element.get("to", "")
+                    if not start.startswith(":"):
+                        connections.append(element.attrib)
+                    if start.startswith(":") or end.startswith(":"):
+                        start_lane, end_lane = f"{start}_{element.get('fromLane')}", f"{end}_{element.get('toLane')}"
+                        lane_links.append((start_lane, end_lane))
+                case "junction":
+                    junctions.append(_junction(element.attrib, path))
+                case "tlLogic":
+                    phases = element.iter("phase")
+                    cycle_s = max(cycle_s, sum(float(p.get("maxDur", p.attrib["duration"])) for p in phases))
+                case "location":
+                    location = Location(element.get("projParameter", ""), _point(element.attrib["netOffset"]))
         except (KeyError, ValueError, IndexError) as error:
             what = f"<{element.tag} id={element.get('id', element.get('from', ''))!r}>"
             raise InputError(path, f"{what} is not as in a SUMO network ({error!r})", _RIGHT) from None
-    if not reading.index:
+    roads = [edge for edge in edges if not edge.function]
+    if not roads:
         raise InputError(path, "the network has no road", "a network with at least one edge")
-    return reading.network()
+    ways = tuple(_road_connections(connections, roads, path))
+    return Network(tuple(edges), ways, tuple(junctions), cycle_s, location, tuple(lane_links))
 
 
-@dataclass
-class _Reading:
-    """What was read so far."""
+def _edge(element: Element, path: Path) -> Edge:
+    function, start, end, name = (element.get(key, "") for key in ("function", "from", "to", "name"))
+    edge = Edge(element.attrib["id"], function, start, end, name, tuple(_lane(e, path) for e in element.iter("lane")))
+    if not function:
+        if not start or not end:
+            raise KeyError("to" if start else "from")
+        _ = edge.start_m, edge.end_m  # a road has a lane with coordinates
+    return edge
 
-    path: Path
-    edges: list[Edge] = field(default_factory=list)
-    roads: list[Edge] = field(default_factory=list)
-    index: dict[str, int] = field(default_factory=dict)
-    connections: list[dict[str, str]] = field(default_factory=list)
-    junctions: list[Junction] = field(default_factory=list)
-    lane_links: list[tuple[str, str]] = field(default_factory=list)
-    cycle_s: float = 0.0
-    location: Location | None = None
 
-    def take(self, element: Element) -> None:
-        match element.tag:
-            case "edge":
-                self._take_edge(element)
-            case "connection":
-                self._take_connection(element.attrib)
-            case "junction":
-                self.junctions.append(self._junction(element.attrib))
-            case "tlLogic":
-                self.cycle_s = max(self.cycle_s, cycle_s(element.iter("phase")))
-            case "location":
-                offset_m = _point(element.attrib["netOffset"])
-                self.location = Location(element.get("projParameter", ""), offset_m)
+def _lane(lane: Element, path: Path) -> Lane:
+    width_m = float(lane.attrib["width"]) if "width" in lane.attrib else None
+    length_m, place = float(lane.get("length", 0)), f"{path}: lane {lane.get('id', '')}"
+    return Lane(lane.attrib["shape"], place, width_m, length_m, Permission.of(lane.attrib))
 
-    def _take_edge(self, element: Element) -> None:
-        function, start, end, name = (element.get(key, "") for key in ("function", "from", "to", "name"))
-        lanes = tuple(self._lane(lane.attrib) for lane in element.iter("lane"))
-        edge = Edge(element.attrib["id"], function, start, end, name, lanes)
-        self.edges.append(edge)
-        if not function:
-            if not edge.from_node or not edge.to_node:
-                raise KeyError("to" if edge.from_node else "from")
-            _ = edge.start_m, edge.end_m  # a road has a lane with coordinates
-            self.index[edge.id] = len(self.roads)
-            self.roads.append(edge)
 
-    def _lane(self, lane: dict[str, str]) -> Lane:
-        width = lane.get("width")
-        return Lane(
-            Shape(lane["shape"], f"{self.path}: lane {lane.get('id', '')}"),
-            None if width is None else float(width),
-            float(lane.get("length", 0)),
-            Permission.of(lane),
-        )
+def _junction(junction: dict[str, str], path: Path) -> Junction:
+    name, at_m = junction["id"], (float(junction["x"]), float(junction["y"]))
+    incoming = tuple(junction.get("incLanes", "").split())
+    shape, place = junction.get("shape", ""), f"{path}: junction {name}"
+    return Junction(shape, place, name, junction.get("type", ""), at_m, incoming)
 
-    def _take_connection(self, connection: dict[str, str]) -> None:
-        start, end = connection["from"], connection.get("to", "")
-        if not start.startswith(":"):
-            self.connections.append(connection)
-        if start.startswith(":") or end.startswith(":"):
-            self.lane_links.append((f"{start}_{connection.get('fromLane')}", f"{end}_{connection.get('toLane')}"))
 
-    def _junction(self, junction: dict[str, str]) -> Junction:
-        name = junction["id"]
-        return Junction(
-            name,
-            junction.get("type", ""),
-            (float(junction["x"]), float(junction["y"])),
-            Shape(junction.get("shape", ""), f"{self.path}: junction {name}"),
-            tuple(junction.get("incLanes", "").split()),
-        )
-
-    def network(self) -> Network:
-        return Network(
-            tuple(self.edges),
-            tuple(self._road_connections()),
-            tuple(self.junctions),
-            self.cycle_s,
-            self.location,
-            tuple(self.lane_links),
-        )
-
-    def _road_connections(self) -> Iterator[Connection]:
-        for connection in self.connections:
-            start = connection["from"]
-            try:
-                source, target = (self.index.get(connection[key]) for key in ("from", "to"))
-                lanes = int(connection["fromLane"]), int(connection["toLane"])
-            except (KeyError, ValueError) as error:
-                raise InputError(self.path, f"a <connection> from {start!r} is damaged ({error!r})", _RIGHT) from None
-            if source is None or target is None:
-                continue  # to or from a walking area or a crossing
-            if lanes[0] >= len(self.roads[source].lanes) or lanes[1] >= len(self.roads[target].lanes):
-                raise InputError(self.path, f"a <connection> from {start!r} names a lane that is not there", _RIGHT)
-            turnaround = connection.get("dir") in _TURNAROUNDS
-            yield Connection(source, lanes[0], target, lanes[1], turnaround, Permission.of(connection))
+def _road_connections(connections: Iterable[dict[str, str]], roads: Sequence[Edge], path: Path) -> Iterator[Connection]:
+    index = {road.id: i for i, road in enumerate(roads)}
+    for connection in connections:
+        start = connection["from"]
+        try:
+            source, target = (index.get(connection[key]) for key in ("from", "to"))
+            lanes = int(connection["fromLane"]), int(connection["toLane"])
+        except (KeyError, ValueError) as error:
+            raise InputError(path, f"a <connection> from {start!r} is damaged ({error!r})", _RIGHT) from None
+        if source is None or target is None:
+            continue  # to or from a walking area or a crossing
+        if lanes[0] >= len(roads[source].lanes) or lanes[1] >= len(roads[target].lanes):
+            raise InputError(path, f"a <connection> from {start!r} names a lane that is not there", _RIGHT)
+        turnaround = connection.get("dir") in _TURNAROUNDS
+        yield Connection(source, lanes[0], target, lanes[1], turnaround, Permission.of(connection))
 
 
 def _point(text: str) -> tuple[float, float]:
     x, y = text.split(",")[:2]
     return float(x), float(y)
-
-
-def cycle_s(phases: Iterable[Element]) -> float:
-    """How long a signal program takes at most to come round."""
-    return sum(float(p.get("maxDur", p.attrib["duration"])) for p in phases)
 
 
 def is_osm(path: Path) -> bool:
@@ -376,8 +324,7 @@ def is_osm(path: Path) -> bool:
 
 
 def may_have_heights(path: Path) -> bool:
-    """Whether any shape of the file has a third coordinate: a quick look, so that a flat network need not be read to
-    know that it is flat."""
+    """Whether any shape has a third coordinate: a quick look, so that a flat network need not be read."""
     if is_osm(path) or not path.is_file():
         return False
     with safe_xml.opened(path) as file:
@@ -389,7 +336,7 @@ def _is_sidewalk(lane: Lane) -> bool:
     return lane.permission.admits(_PEDESTRIAN) and not lane.permission.admits("passenger")
 
 
-def _parts(lanes: list[str], links: Sequence[tuple[str, str]]) -> list[int]:
+def _parts(lanes: Sequence[str], links: Sequence[tuple[str, str]]) -> list[int]:
     """For each lane, the number of the part that it belongs to: the same for lanes that hang together."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components

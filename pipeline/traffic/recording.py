@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
-from typing import Any
 
 import pyarrow as pa
 
@@ -19,9 +18,9 @@ from pipeline.core.errors import InputError
 from pipeline.core.progress import Progress
 from pipeline.formats import safe_xml
 from pipeline.scenario.models import Scenario
-from pipeline.traffic import configuration, extensions, fcd, live, network, sumo
+from pipeline.traffic import configuration, fcd, live, network, sumo
 from pipeline.traffic.boxes import Size
-from pipeline.traffic.configuration import COLLISIONS, FCD, LOG, PERSONS, STOPS, Prepared
+from pipeline.traffic.configuration import COLLISIONS, CONFIG, FCD, LOG, PERSONS, STOPS, Prepared, as_flags
 from pipeline.traffic.extensions import TrafficExtension
 from pipeline.traffic.frames import Window
 
@@ -30,26 +29,13 @@ _LEAST_PATIENCE_S = 180.0
 
 @dataclass(frozen=True)
 class RecordingSummary:
-    """What SUMO did, as far as it is known: version, seconds, flags, collisions.
-
-    ``flags`` and ``seconds`` are None of a SUMO that somebody else started.
-    """
+    """What SUMO did: ``flags`` and ``sumo_seconds`` are None of one that somebody else started."""
 
     sumo: str
-    seconds: float | None
+    sumo_seconds: float | None
     flags: list[str] | None
     collisions: int
-    notes: tuple[str, ...] = ()
-
-    def to_json(self) -> dict[str, Any]:
-        """As the stage reports it."""
-        return {
-            "sumo": self.sumo,
-            "sumo_seconds": self.seconds,
-            "flags": self.flags,
-            "collisions": self.collisions,
-            "notes": list(self.notes),
-        }
+    notes: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -83,25 +69,23 @@ class Recording:
 def record(
     scenario: Scenario,
     folder: Path,
-    acting: Sequence[TrafficExtension],
+    extensions: Sequence[TrafficExtension],
     progress: Progress,
     traci: tuple[str, int] | None,
 ) -> AbstractContextManager[Recording]:
     """The recording of a scenario's traffic; SUMO runs in ``folder``, or listens at ``traci`` already.
 
-    Raises
-    ------
-    InputError
-        When the scenario has a finished file that was to be recorded live, or an extension refuses it.
+    InputError when the scenario has a finished file that was to be recorded live, or an extension refuses it.
     """
     if scenario.traffic.fcd is not None and traci is not None:
         raise InputError("--traci", "the scenario names a finished FCD file", "network or sumocfg in [traffic]")
-    extensions.refuse(acting, scenario)
+    for refusal in filter(None, (extension.refuses(scenario) for extension in extensions)):
+        raise refusal
     if scenario.traffic.fcd is not None:
         return _finished(scenario)
     if traci is not None:
-        return _running(scenario, *traci, acting)
-    return _simulated(scenario, folder, progress, acting)
+        return _running(scenario, *traci, extensions)
+    return _simulated(scenario, folder, progress, extensions)
 
 
 @contextmanager
@@ -110,29 +94,25 @@ def _finished(scenario: Scenario) -> Iterator[Recording]:
     traffic, place = scenario.traffic, configuration.place_of(scenario)
     assert traffic.fcd is not None
     path = scenario.find(traffic.fcd, "traffic.fcd")
-    window = Window(
-        traffic.frames,
-        max(1, configuration.milliseconds(traffic.frame_period_s, f"{place}.frame_period_s")),
-        skip_ms=configuration.milliseconds(traffic.warmup_s, f"{place}.warmup_s"),
-    )
+    period_ms = max(1, configuration.milliseconds(traffic.frame_period_s, f"{place}.frame_period_s"))
+    skip_ms = configuration.milliseconds(traffic.warmup_s, f"{place}.warmup_s")
+    window = Window(traffic.frames, period_ms, skip_ms=skip_ms)
     yield Recording(fcd.read(path), window, kind_sizes(scenario), place)
 
 
 @contextmanager
 def _simulated(
-    scenario: Scenario, folder: Path, progress: Progress, acting: Sequence[TrafficExtension]
+    scenario: Scenario, folder: Path, progress: Progress, extensions: Sequence[TrafficExtension]
 ) -> Iterator[Recording]:
     """From SUMO as a subprocess; its FCD file is removed once it is read."""
-    prepared = configuration.prepare(scenario, folder, acting)
+    prepared = configuration.prepare(scenario, folder, extensions)
     sizes = kind_sizes(scenario) if prepared.drawn else type_sizes(prepared)
-    for extension in acting:
+    for extension in extensions:
         sizes |= extension.sizes()
     path, persons = folder / FCD, folder / PERSONS
     try:
-        seconds = simulate(prepared, progress)
-        summary = RecordingSummary(
-            sumo.version(), round(seconds, 3), prepared.flags, _collisions(prepared), prepared.notes
-        )
+        seconds, flags = round(simulate(prepared, progress), 3), as_flags(prepared.options | prepared.outputs)
+        summary = RecordingSummary(sumo.version(), seconds, flags, _collisions(prepared), prepared.notes)
         yield Recording(
             fcd.read(path) if _has_rows(path) else (),
             prepared.timing.window(),
@@ -149,14 +129,14 @@ def _simulated(
 
 
 @contextmanager
-def _running(scenario: Scenario, host: str, port: int, acting: Sequence[TrafficExtension]) -> Iterator[Recording]:
+def _running(scenario: Scenario, host: str, port: int, extensions: Sequence[TrafficExtension]) -> Iterator[Recording]:
     """From a SUMO that somebody else started."""
     given = configuration.sources(scenario)
     when = configuration.timing(scenario.traffic, given.begin_s, configuration.place_of(scenario))
     net_file = given.files["net-file"][0]
     cycle_s = 0.0 if network.is_osm(net_file) else network.read(net_file).cycle_s
     observations = live.LiveObservations()
-    persons = any(extension.adds_traffic for extension in acting)
+    persons = any(extension.ADDS_TRAFFIC for extension in extensions)
     with sumo.connected(host, port) as connection:
         version = sumo.version_in(connection.getVersion()[1])
         yield Recording(
@@ -186,13 +166,12 @@ def simulate(prepared: Prepared, progress: Progress) -> float:
 
     def watch() -> None:
         if (now_ms := _last_time_ms(path)) is not None:
-            progress(
-                "frames simulated", min(when.frames, max(0, (now_ms - when.first_ms) // when.period_ms)), when.frames
-            )
+            done = (now_ms - when.first_ms) // when.period_ms
+            progress("frames simulated", min(when.frames, max(0, done)), when.frames)
 
     start = perf_counter()
-    flags = [word for key, value in prepared.outputs.items() for word in (f"--{key}", value)]
-    sumo.run("sumo", [*prepared.config, *flags], prepared.folder, prepared.folder / LOG, watch)
+    flags = ["-c", CONFIG, *as_flags(prepared.outputs)]
+    sumo.run("sumo", flags, prepared.folder, prepared.folder / LOG, watch)
     return perf_counter() - start
 
 
@@ -210,8 +189,8 @@ def _last_time_ms(path: Path) -> int | None:
 
 
 def type_sizes(prepared: Prepared) -> dict[str, Size]:
-    """Ask SUMO for the sizes of all vehicle types of a user's demand, since its defaults depend on the vClass."""
-    with sumo.served([*prepared.config, "--route-steps", "0"], prepared.folder) as connection:
+    """Sizes of all types of a user's demand; asked of SUMO, since its defaults depend on the vClass."""
+    with sumo.served(["-c", CONFIG, "--route-steps", "0"], prepared.folder) as connection:
         return {name: live.ask_size(connection, name) for name in connection.vehicletype.getIDList()}
 
 

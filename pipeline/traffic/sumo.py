@@ -36,13 +36,7 @@ _SHOWN_ERRORS = 12
 
 
 def binary(name: str) -> Path:
-    """Find a program of SUMO where SUMO users expect it: environment, SUMO_HOME, wheel, PATH.
-
-    Raises
-    ------
-    MissingBackendError
-        When it is in none of these places.
-    """
+    """A program of SUMO in the environment, SUMO_HOME, wheel or PATH; MissingBackendError when it is in none."""
     import shutil
 
     import sumolib
@@ -54,14 +48,11 @@ def binary(name: str) -> Path:
 
 
 def environment() -> dict[str, str]:
-    """The environment that SUMO's programs need: this process' own, SUMO_HOME, and where the wheel keeps PROJ's
-    data."""
+    """What SUMO's programs need: this process' own variables, SUMO_HOME, and where the wheel keeps PROJ's data."""
     home = sumo_home()
     proj = home / "data" / "proj"
-    values = {"SUMO_HOME": str(home)}
-    if proj.is_dir():
-        values |= {"PROJ_DATA": str(proj), "PROJ_LIB": str(proj)}
-    return values | dict(os.environ)
+    more = {"PROJ_DATA": str(proj), "PROJ_LIB": str(proj)} if proj.is_dir() else {}
+    return {"SUMO_HOME": str(home), **more, **os.environ}
 
 
 @cache
@@ -137,16 +128,9 @@ def run(
 
 
 def _start(name: str, arguments: Sequence[str], folder: Path, printed: Any, complaints: Any) -> subprocess.Popen[bytes]:
-    program = binary(name)
+    program, streams = binary(name), {"stdin": subprocess.DEVNULL, "stdout": printed, "stderr": complaints}
     try:
-        return subprocess.Popen(
-            [str(program), *arguments],
-            cwd=folder,
-            env=environment(),
-            stdin=subprocess.DEVNULL,
-            stdout=printed,
-            stderr=complaints,
-        )
+        return subprocess.Popen([str(program), *arguments], cwd=folder, env=environment(), **streams)
     except OSError as error:
         raise MissingBackendError(f"{program} cannot be started: {error.strerror}") from None
 
@@ -164,25 +148,21 @@ def failure(name: str, code: int, text: str) -> RunError:
     """The error for a program of SUMO that ended with exit code ``code`` and said ``text``."""
     missing = re.search(r"error while loading shared libraries: ([^:\s]+)", text)
     if missing:
+        library = missing.group(1)
         return MissingBackendError(
-            f"{name} cannot start, the system library {missing.group(1)} is missing; on Debian: {APT_LINE}"
+            f"{name} cannot start, the system library {library} is missing; on Debian: {APT_LINE}"
         )
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    told = [line for line in lines if not line.startswith(("Warning", "Quitting", "pj_obj_create"))] or lines[-1:]
+    errors = [line for line in lines if not line.startswith(("Warning", "Quitting", "pj_obj_create"))] or lines[-1:]
     how = f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
-    return RunError("\n".join([f"{name} {how}:", *(f"  {line}" for line in told[:_SHOWN_ERRORS])]))
+    return RunError("\n".join([f"{name} {how}:", *(f"  {line}" for line in errors[:_SHOWN_ERRORS])]))
 
 
 @contextmanager
 def connected(host: str, port: int) -> Iterator[Any]:
     """A TraCI connection to a SUMO that is already running.
 
-    Raises
-    ------
-    InputError
-        When nothing answers there.
-    RunError
-        When SUMO ends the connection early.
+    InputError when nothing answers there; RunError when SUMO ends the connection early.
     """
     import traci
 
@@ -256,8 +236,7 @@ def _attach(process: subprocess.Popen[bytes], port: int) -> Any:
 
 
 def _connect(host: str, port: int) -> Any:
-    """A connection, or None where nobody listens. traci forgets to close the socket then, which Python would warn
-    of."""
+    """A connection, or None where nobody listens (traci forgets to close the socket then: Python would warn of it)."""
     import traci
 
     with warnings.catch_warnings():

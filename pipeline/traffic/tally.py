@@ -6,7 +6,7 @@ World frame, metres, metres per second. Vehicles that stand are followed from gr
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,8 @@ def overlapping(boxes: VehicleBoxes) -> NDArray[np.int64]:
     Exact for rectangles (separating axes). Candidates come from square cells, at least as wide as the longest diagonal:
     a pair that overlaps lies in one cell or in two that touch. Cells are numbered along y, then x, then by frame, with
     an empty row and column between, so that a box's later neighbours are two runs: its own cell and the next, and three
-    cells of the next column."""
+    cells of the next column.
+    """
     if not boxes.frame.size:
         return np.empty((0, 2), dtype=np.int64)
     half = np.hypot(boxes.length_m, boxes.width_m) / 2
@@ -75,84 +76,24 @@ def _share_space(boxes: VehicleBoxes, a: Ints, b: Ints) -> NDArray[np.bool_]:
 
 
 def _whole_pairs(boxes: VehicleBoxes, pairs: Ints) -> Ints:
-    """Pairs of parts -> pairs of vehicles, each once, as rows of the boxes that are left when only first parts are
-    kept."""
+    """Pairs of parts -> pairs of vehicles, each once, as rows of the boxes whose first parts alone are kept."""
     assert boxes.part is not None
     vehicle = np.cumsum(boxes.part == 0) - 1
     return np.unique(vehicle[pairs], axis=0).reshape(-1, 2)
 
 
-@dataclass(frozen=True)
-class UncountedKind:
-    """How many of a kind that does not count as a vehicle are in a frame, and how many different ones there are."""
-
-    fewest: int
-    most: int
-    mean: float
-    different: int
-
-
-@dataclass(frozen=True)
-class TrafficCounts:
-    """What a recording amounts to.
-
-    Attributes
-    ----------
-    fewest, most
-        Vehicles in a frame.
-    different
-        Vehicles that are in any frame.
-    rows
-        Vehicles, added up over the frames.
-    share_standing
-        Of ``rows``, slower than ``STANDING_M_S``.
-    uncounted
-        Of each kind that does not count as a vehicle; empty where all count.
-    mixed_overlaps
-        Overlapping pairs in which one at least does not count as a vehicle, by their kinds.
-    """
-
-    frames: int
-    fewest: int
-    most: int
-    different: int
-    rows: int
-    mean_speed_m_s: float
-    share_standing: float
-    longest_standing_s: float
-    overlapping_pairs: int
-    frames_with_overlap: int
-    uncounted: dict[str, UncountedKind]
-    mixed_overlaps: dict[str, int]
-
-    def to_json(self) -> dict[str, Any]:
-        """As the stage reports it; nothing about uncounted kinds where all count."""
-        values: dict[str, Any] = {
-            "frames": self.frames,
-            "vehicles": {"fewest": self.fewest, "most": self.most, "different": self.different},
-            "rows": self.rows,
-            "mean_speed_m_s": self.mean_speed_m_s,
-            "share_standing": self.share_standing,
-            "longest_standing_s": self.longest_standing_s,
-            "overlapping_pairs": self.overlapping_pairs,
-            "frames_with_overlap": self.frames_with_overlap,
-        }
-        if self.uncounted:
-            kinds = {kind: asdict(counts) for kind, counts in sorted(self.uncounted.items())}
-            values["beside_vehicles"] = kinds | {"overlapping_pairs": dict(sorted(self.mixed_overlaps.items()))}
-        return values
-
-
 @dataclass
-class _Presence:
-    """Of a kind that does not count as a vehicle: how many in each frame, and which different ones."""
+class Presence:
+    """Of a kind that does not count as a vehicle: how many are in each frame, and which different ones."""
 
     in_frame: Ints
     different: set[str] = field(default_factory=set)
 
-    def counts(self) -> UncountedKind:
+    def to_json(self) -> dict[str, Any]:
+        """As the tally reports it."""
         n = self.in_frame
-        return UncountedKind(int(n.min()), int(n.max()), round(float(n.mean()), 3), len(self.different))
+        mean, different = round(float(n.mean()), 3), len(self.different)
+        return {"fewest": int(n.min()), "most": int(n.max()), "mean": mean, "different": different}
 
 
 @dataclass
@@ -171,8 +112,9 @@ class TrafficTally:
     longest_standing_frames: int = 0
     stands_since: dict[str, int] = field(default_factory=dict)
     """Vehicles that stand in the last frame added, and the frame since when."""
-    uncounted: dict[str, _Presence] = field(default_factory=dict)
+    uncounted: dict[str, Presence] = field(default_factory=dict)
     mixed_overlaps: Counter[str] = field(default_factory=Counter)
+    """Overlapping pairs in which one at least does not count as a vehicle, by their kinds."""
 
     def __post_init__(self) -> None:
         self.vehicles = np.zeros(self.frames, dtype=np.int64)
@@ -202,7 +144,7 @@ class TrafficTally:
         end = boxes.first_frame + boxes.frames
         for kind in np.unique(boxes.kind[uncounted]):
             of_kind = uncounted & (boxes.kind == kind)
-            presence = self.uncounted.setdefault(boxes.kinds[kind], _Presence(np.zeros(self.frames, np.int64)))
+            presence = self.uncounted.setdefault(boxes.kinds[kind], Presence(np.zeros(self.frames, np.int64)))
             presence.in_frame[boxes.first_frame : end] = _in_each_frame(boxes, boxes.frame[of_kind])
             presence.different.update(boxes.names[i] for i in np.unique(boxes.code[of_kind]))
         mixed = uncounted[pairs].any(axis=1)
@@ -228,22 +170,27 @@ class TrafficTally:
                 still[name] = since
         self.stands_since = still
 
-    def counts(self, period_s: float) -> TrafficCounts:
-        """What was added up, with frames ``period_s`` apart."""
-        return TrafficCounts(
-            frames=self.frames,
-            fewest=int(self.vehicles.min()),
-            most=int(self.vehicles.max()),
-            different=len(self.different),
-            rows=self.rows,
-            mean_speed_m_s=round(self.speed_sum / self.rows, 4) if self.rows else 0.0,
-            share_standing=round(self.standing / self.rows, 4) if self.rows else 0.0,
-            longest_standing_s=round(self.longest_standing_frames * period_s, 3),
-            overlapping_pairs=self.overlapping_pairs,
-            frames_with_overlap=self.frames_with_overlap,
-            uncounted={kind: presence.counts() for kind, presence in self.uncounted.items()},
-            mixed_overlaps=dict(self.mixed_overlaps),
-        )
+    def to_json(self, period_s: float) -> dict[str, Any]:
+        """What the recording amounts to, with frames ``period_s`` apart; nothing beside vehicles where all count.
+
+        ``rows`` are vehicles, added up over the frames; ``share_standing`` is of these, slower than
+        :data:`STANDING_M_S`.
+        """
+        n, rows = self.vehicles, self.rows
+        values: dict[str, Any] = {
+            "frames": self.frames,
+            "vehicles": {"fewest": int(n.min()), "most": int(n.max()), "different": len(self.different)},
+            "rows": rows,
+            "mean_speed_m_s": round(self.speed_sum / rows, 4) if rows else 0.0,
+            "share_standing": round(self.standing / rows, 4) if rows else 0.0,
+            "longest_standing_s": round(self.longest_standing_frames * period_s, 3),
+            "overlapping_pairs": self.overlapping_pairs,
+            "frames_with_overlap": self.frames_with_overlap,
+        }
+        if self.uncounted:
+            kinds = {kind: presence.to_json() for kind, presence in sorted(self.uncounted.items())}
+            values["beside_vehicles"] = kinds | {"overlapping_pairs": dict(sorted(self.mixed_overlaps.items()))}
+        return values
 
 
 def _in_each_frame(boxes: VehicleBoxes, frame: Ints) -> Ints:

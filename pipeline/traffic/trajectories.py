@@ -8,7 +8,6 @@ metres, radians.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from pipeline.artefacts.tables import TableWriter
@@ -16,44 +15,35 @@ from pipeline.core.errors import RunError
 from pipeline.core.progress import Progress
 from pipeline.scenario.models import Scenario
 from pipeline.scenario.traffic import TrafficModel
-from pipeline.traffic import boxes, extensions, frames
+from pipeline.traffic import boxes, frames
 from pipeline.traffic.extensions import BoxChange, TrafficExtension
 from pipeline.traffic.frames import FrameGroup
 from pipeline.traffic.recording import Recording
-from pipeline.traffic.tally import TrafficCounts, TrafficTally
+from pipeline.traffic.tally import TrafficTally
 
 GROUP_FRAMES = 500
 """Frames in a row group; fixed, so that the bytes do not depend on how the rows arrive."""
 
 
-@dataclass(frozen=True)
-class Trajectories:
-    """What was written."""
-
-    counts: TrafficCounts
-    of_extensions: dict[str, Any]
-    """What extensions report, as JSON."""
-
-
 def write(
-    scenario: Scenario, recording: Recording, acting: Sequence[TrafficExtension], file: TableWriter, progress: Progress
-) -> Trajectories:
-    """Write a recording's boxes, changed by the extensions that act.
+    scenario: Scenario,
+    recording: Recording,
+    extensions: Sequence[TrafficExtension],
+    file: TableWriter,
+    progress: Progress,
+) -> tuple[TrafficTally, dict[str, Any]]:
+    """Write a recording's boxes, changed by the extensions that act; what they add up to, and what extensions report.
 
-    Raises
-    ------
-    InputError
-        When a vehicle's size is unknown, or the file has too few frames.
-    RunError
-        When N vehicles are not held, or a vehicle stands without end.
+    InputError when a vehicle's size is unknown, or the file has too few frames; RunError when N vehicles are not held,
+    or a vehicle stands without end.
     """
     tally, period_s = TrafficTally(scenario.traffic.frames), recording.window.period_ms / 1000.0
     changes: list[BoxChange] | None = None
     for group in _groups(recording):
-        uncounted = extensions.uncounted_types(acting, recording.sizes)
+        uncounted = frozenset[str]().union(*(extension.uncounted_types(recording.sizes) for extension in extensions))
         if changes is None:  # a running SUMO tells sizes with its first rows
             own = {name: size for name, size in recording.sizes.items() if name not in uncounted}
-            changes = [c for extension in acting if (c := extension.box_change(scenario, own)) is not None]
+            changes = [c for extension in extensions if (c := extension.box_change(scenario, own)) is not None]
         made = boxes.from_bumpers(group, recording.sizes, period_s, recording.place, uncounted)
         for change in changes:
             made = change.change(made)
@@ -62,8 +52,7 @@ def write(
         tally.add(made)
         progress("frames written", group.first_frame + group.frames, tally.frames)
     _check(scenario.traffic, tally, recording)
-    reports = [change.summary() for change in changes or ()]
-    return Trajectories(tally.counts(period_s), {key: value for report in reports for key, value in report.items()})
+    return tally, {key: value for change in changes or () for key, value in change.summary().items()}
 
 
 def _groups(recording: Recording) -> Iterator[FrameGroup]:

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,19 +26,20 @@ from pipeline.world.footprints import Footprint, read_geojson, read_poly_xml
 from pipeline.world.mesh import World
 from pipeline.world.terrain import Surface
 
+Floats = NDArray[np.float64]
+
 GROUND_MARGIN_M = 500.0
 """How far the ground plane goes on beyond everything; more than any sensor in the catalogue reaches."""
 
 
+@runtime_checkable
 class GroundSource(Protocol):
     """Something that lays a ground which goes up and down."""
 
     NAME: ClassVar[str]
 
-    def ground(
-        self, scenario: Scenario, low_m: NDArray[np.float64] | None = None, high_m: NDArray[np.float64] | None = None
-    ) -> Surface:
-        """The ground over a rectangle."""
+    def ground(self, scenario: Scenario, low_m: Floats | None = None, high_m: Floats | None = None) -> Surface:
+        """The ground over a rectangle; around the network when None."""
         ...
 
 
@@ -46,9 +47,9 @@ class GroundSource(Protocol):
 class BuildCounts:
     """What was built (solids a kind), mended and left out; shown to the user and kept in ``run.json``."""
 
-    built: dict[str, int]
-    mended: dict[str, int]
-    left_out: dict[str, int]
+    built: Counter[str] = field(default_factory=Counter)
+    mended: Counter[str] = field(default_factory=Counter)
+    left_out: Counter[str] = field(default_factory=Counter)
 
     def to_json(self) -> dict[str, Any]:
         """As the stage reports it."""
@@ -60,50 +61,45 @@ def build(
 ) -> tuple[World, BuildCounts]:
     """The static world of a scenario, on a flat ground where no other is given; and what went into it.
 
-    Raises
-    ------
-    InputError
-        When a file that the scenario names is not sound.
+    InputError when a file that the scenario names is not sound.
     """
     model, builder = scenario.statics, _Builder()
     read = [read_geojson(scenario.find(name, "statics.footprints")) for name in model.footprints]
     read += [read_poly_xml(scenario.find(name, "statics.polygons"), model.polygon_height_m) for name in model.polygons]
     for file in read:
-        builder.mended.update(file.mended)
-        builder.left_out.update(file.left_out)
+        builder.counts.mended.update(file.mended)
+        builder.counts.left_out.update(file.left_out)
     footprints = [footprint for file in read for footprint in file.footprints]
     surface = None if ground is None else ground.ground(scenario, *_extent_m(scenario, footprints))
     for done, footprint in enumerate(footprints):
         standing = footprint if surface is None else _on(surface, footprint)
         builder.add(*_extrude(standing), footprint.name, footprint.kind)
-        builder.built[footprint.kind] += 1
         progress("footprints", done + 1, len(footprints))
     for mesh in model.meshes:
         _add_mesh(builder, scenario.find(mesh.file, "statics.meshes"), mesh)
     if model.ground:
         laid = _plane(builder, scenario) if surface is None else (surface.vertices_m, surface.faces)
         builder.add(*laid, "ground", "ground")
-        builder.built["ground"] += 1
-    return builder.world(), BuildCounts(dict(builder.built), dict(builder.mended), dict(builder.left_out))
+    return builder.world(), builder.counts
 
 
 @dataclass
 class _Builder:
     """Collects solids into one mesh, and counts."""
 
-    vertices: list[NDArray[np.float64]] = field(default_factory=list)
+    vertices: list[Floats] = field(default_factory=list)
     faces: list[NDArray[np.int64]] = field(default_factory=list)
     solids: list[tuple[str, str]] = field(default_factory=list)
-    built: Counter[str] = field(default_factory=Counter)
-    mended: Counter[str] = field(default_factory=Counter)
-    left_out: Counter[str] = field(default_factory=Counter)
+    counts: BuildCounts = field(default_factory=BuildCounts)
     _count: int = 0
 
-    def add(self, vertices_m: NDArray[np.float64], faces: NDArray[np.int64], name: str, kind: str) -> None:
+    def add(self, vertices_m: Floats, faces: NDArray[np.int64], name: str, kind: str, form: str = "") -> None:
+        """Add one solid; counted under its kind, and its ``form`` where that is no closed one."""
         self.vertices.append(np.asarray(vertices_m, dtype=np.float64))
         self.faces.append(np.asarray(faces, dtype=np.int64) + self._count)
         self.solids.append((name, kind))
         self._count += len(vertices_m)
+        self.counts.built[kind + form] += 1
 
     def world(self) -> World:
         owner = [np.full(len(f), i, dtype=np.int32) for i, f in enumerate(self.faces)]
@@ -115,7 +111,7 @@ class _Builder:
         )
 
 
-def _extrude(footprint: Footprint) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _extrude(footprint: Footprint) -> tuple[Floats, NDArray[np.int64]]:
     """Vertices and faces (outwards) of a closed prism over the footprint."""
     import trimesh
 
@@ -124,8 +120,7 @@ def _extrude(footprint: Footprint) -> tuple[NDArray[np.float64], NDArray[np.int6
 
 
 def _add_mesh(builder: _Builder, path: Path, model: MeshModel) -> None:
-    """A mesh file: each closed piece becomes a solid of its own, so that sites inside can be told; the rest stays
-    surface."""
+    """Each closed piece of a mesh becomes a solid, so that sites inside can be told; the rest stays one surface."""
     import trimesh
 
     try:
@@ -136,10 +131,8 @@ def _add_mesh(builder: _Builder, path: Path, model: MeshModel) -> None:
         raise InputError(path, "holds no triangles", "a triangle mesh")
     near = (np.abs(mesh.vertices) <= FARTHEST_M).all(axis=1)
     if not near.all():
-        bad = int(np.flatnonzero(~near)[0])
-        raise InputError(
-            f"{path}: vertex {bad}", f"{mesh.vertices[bad].tolist()}", f"finite coordinates, at most {FARTHEST_M:g} m"
-        )
+        bad, right = int(np.flatnonzero(~near)[0]), f"finite coordinates, at most {FARTHEST_M:g} m"
+        raise InputError(f"{path}: vertex {bad}", f"{mesh.vertices[bad].tolist()}", right)
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
         raise InputError(path, f"a triangle names vertex {mesh.faces.max()} of {len(mesh.vertices)}", "a whole mesh")
     faces = len(mesh.faces)
@@ -148,7 +141,7 @@ def _add_mesh(builder: _Builder, path: Path, model: MeshModel) -> None:
     if len(mesh.faces) == 0:
         raise InputError(path, f"none of its {faces} triangles has an area", "a triangle mesh")
     if dropped := faces - len(mesh.faces):
-        builder.mended["degenerate or doubled triangles dropped"] += dropped
+        builder.counts.mended["degenerate or doubled triangles dropped"] += dropped
     pieces = trimesh.graph.connected_components(mesh.face_adjacency, nodes=np.arange(len(mesh.faces)), min_len=1)
     offset, surface = np.asarray(model.offset_m), [np.empty(0, dtype=np.int64)]
     for number, piece in enumerate(sorted((np.sort(p) for p in pieces), key=lambda p: int(p[0]))):
@@ -156,15 +149,14 @@ def _add_mesh(builder: _Builder, path: Path, model: MeshModel) -> None:
         if part.is_watertight and part.is_winding_consistent:
             part.remove_unreferenced_vertices()
             builder.add(part.vertices + offset, part.faces, f"{path.stem}_{number}", model.kind)
-            builder.built[model.kind] += 1
         else:
             surface.append(piece)
     if len(rest := np.concatenate(surface)):
-        builder.add(mesh.vertices + offset, mesh.faces[rest], f"{path.stem}_surface", model.kind)
-        builder.built[f"{model.kind} (open surface)"] += 1
+        name, form = f"{path.stem}_surface", " (open surface)"
+        builder.add(mesh.vertices + offset, mesh.faces[rest], name, model.kind, form)
 
 
-def _plane(builder: _Builder, scenario: Scenario) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _plane(builder: _Builder, scenario: Scenario) -> tuple[Floats, NDArray[np.int64]]:
     """Two triangles at z = 0, facing up, well beyond the region of interest and everything that stands."""
     box = scenario.roi.box
     corners = np.array([box.origin_m, np.add(box.origin_m, box.size_m)])
@@ -174,7 +166,7 @@ def _plane(builder: _Builder, scenario: Scenario) -> tuple[NDArray[np.float64], 
     return vertices, np.array([[0, 1, 2], [0, 2, 3]])
 
 
-def _extent_m(scenario: Scenario, footprints: Sequence[Footprint]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _extent_m(scenario: Scenario, footprints: Sequence[Footprint]) -> tuple[Floats, Floats]:
     """South-west and north-east corner (2,) of the ground: well beyond the region of interest and all footprints."""
     box = scenario.roi.box
     corners = np.array([box.origin_m, np.add(box.origin_m, box.size_m)])[:, :2]

@@ -11,7 +11,8 @@ Embree (float32) answers *which triangle*, float64 *where*:
    among all true triangles in float64.
 
 What is left to float32: where a surface stands on the middle of another (a wall on the ground), a beam within some 1e-5
-m of the line between them may be given the farther of the two, which then lies less than 1 mm behind the nearer."""
+m of the line between them may be given the farther of the two, which then lies less than 1 mm behind the nearer.
+"""
 
 from __future__ import annotations
 
@@ -28,6 +29,8 @@ from pipeline.core.grid import Roi
 from pipeline.kernels import rays
 from pipeline.world.mesh import World
 
+Floats = NDArray[np.float64]
+
 _RIM_M = 1e-4
 _RIM_SHARE = 2.0**-21  # of the triangle's largest coordinate: eight times float32's rounding
 _MAX_SHIFT_M = 1.0  # a needle whose tip would move further when it is enlarged is held as a rectangle
@@ -37,9 +40,7 @@ _PAD_M = 1e-5  # more than the rules of kernels.rays and float64's rounding ask 
 
 _TURN = np.arange(64) * (360 / 64)
 _ROUND = np.column_stack([cosdg(_TURN), sindg(_TURN), np.zeros(64)])
-_FAN = np.concatenate(
-    [_ROUND, np.roll(_ROUND, 1, axis=1), np.roll(_ROUND, 2, axis=1)]
-)  # normals of planes that part shapes
+_FAN = np.concatenate([np.roll(_ROUND, turn, axis=1) for turn in range(3)])  # normals of planes that part shapes
 
 
 @dataclass(frozen=True)
@@ -61,10 +62,10 @@ class EmptyScan:
     """
 
     beam: NDArray[np.uint32]
-    ends_m: NDArray[np.float64]
+    ends_m: Floats
     returned: NDArray[np.bool_]
     doubtful: int = 0
-    weight: NDArray[np.float64] | None = None
+    weight: Floats | None = None
 
 
 class Caster:
@@ -81,9 +82,7 @@ class Caster:
         is kept when None.
     """
 
-    def __init__(
-        self, world: World, roi: Roi, sites_m: NDArray[np.float64] | None = None, range_m: float = float("inf")
-    ) -> None:
+    def __init__(self, world: World, roi: Roi, sites_m: Floats | None = None, range_m: float = float("inf")) -> None:
         self._origin_m = np.asarray(roi.origin_m, dtype=np.float64)
         self._size_m = np.asarray(roi.size_m, dtype=np.float64)
         triangles = world.triangles_m - self._origin_m
@@ -101,9 +100,7 @@ class Caster:
         if len(met):
             self._owner, self._scene = _tree(self._triangles)
 
-    def scan(
-        self, position_m: tuple[float, float, float], directions: NDArray[np.float64], range_m: float
-    ) -> EmptyScan:
+    def scan(self, position_m: tuple[float, float, float], directions: Floats, range_m: float) -> EmptyScan:
         """Cast the beams of one sensor.
 
         Parameters
@@ -125,13 +122,12 @@ class Caster:
         ends = d * np.where(returned, ranges, range_m)[:, None]
         return EmptyScan(beam.astype(np.uint32), ends, returned, doubtful)
 
-    def first_hits(
-        self, o_roi_m: NDArray[np.float64], d: NDArray[np.float64], range_m: float = float("inf")
-    ) -> tuple[NDArray[np.float64], int]:
+    def first_hits(self, o_roi_m: Floats, d: Floats, range_m: float = float("inf")) -> tuple[Floats, int]:
         """Range of each ray's first hit (infinity for none), and how many rays had to be searched in float64.
 
         ``o_roi_m`` is the sensor in the ROI's frame, (3,); ``d`` are unit directions (n, 3); hits beyond ``range_m`` do
-        not matter."""
+        not matter.
+        """
         ranges = np.full(len(d), np.inf)
         if self._scene is None or len(d) == 0:
             return ranges, 0
@@ -144,13 +140,12 @@ class Caster:
         return ranges, int(count)
 
 
-def reachable(
-    shapes: NDArray[np.float64], roi: Roi, sites_m: NDArray[np.float64], range_m: float = float("inf")
-) -> NDArray[np.bool_]:
+def reachable(shapes: Floats, roi: Roi, sites_m: Floats, range_m: float = float("inf")) -> NDArray[np.bool_]:
     """Which shapes may be met by a beam that starts at a site, meets the region of interest, and goes on behind it.
 
     Where a normal n has all of the region at least as high as all sites, beams rise along n, and what lies lower than
-    the lowest site is not met. Corners of each shape (m, k, 3), world frame; (m,) bool, False only when certain."""
+    the lowest site is not met. Corners of each shape (m, k, 3), world frame; (m,) bool, False only when certain.
+    """
     if len(sites_m) == 0:
         return np.zeros(len(shapes), dtype=np.bool_)
     origin = np.asarray(roi.origin_m)
@@ -163,7 +158,7 @@ def reachable(
     return met
 
 
-def between(shapes: NDArray[np.float64], roi: Roi, sites_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+def between(shapes: Floats, roi: Roi, sites_m: Floats) -> NDArray[np.bool_]:
     """Which shapes may reach into the convex hull of the region of interest and any one site; as :func:`reachable`."""
     origin = np.asarray(roi.origin_m)
     heights = np.column_stack([((shapes - origin) @ normal).max(axis=1) for normal in _FAN])
@@ -174,45 +169,50 @@ def between(shapes: NDArray[np.float64], roi: Roi, sites_m: NDArray[np.float64])
     return reaching
 
 
-def _corners(roi: Roi) -> NDArray[np.float64]:
+def _corners(roi: Roi) -> Floats:
     """Corners of the region of interest in its own frame, (8, 3)."""
     return np.array(list(itertools.product(*((0.0, size) for size in roi.size_m))))
 
 
-def with_planes(triangles: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+def with_planes(triangles: Floats) -> tuple[Floats, Floats, NDArray[np.int64]]:
     """Triangles that have a plane, these planes (see :func:`pipeline.kernels.rays.planes`), and which ones they are."""
     kept = np.flatnonzero(_cross(triangles).any(axis=1))
     return triangles[kept], _planes(triangles[kept]), kept
 
 
-def standing_on(triangles: NDArray[np.float64]) -> NDArray[np.bool_]:
+def standing_on(triangles: Floats) -> NDArray[np.bool_]:
     """Which triangles (n, 3, 3), seen from a sensor, it stands on (to 1 micrometre), (n,) bool."""
-    met = np.flatnonzero(_cross(triangles).any(axis=1))
-    touched, on = np.empty(len(met), dtype=np.bool_), np.zeros(len(triangles), dtype=np.bool_)
-    rays.stands_on(triangles[met], _planes(triangles[met]), np.zeros(3), touched)
-    on[met] = touched
+    flat, planes, kept = with_planes(triangles)
+    touched, on = np.empty(len(kept), dtype=np.bool_), np.zeros(len(triangles), dtype=np.bool_)
+    rays.stands_on(flat, planes, np.zeros(3), touched)
+    on[kept] = touched
     return on
 
 
-def _cross(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
+def _cross(triangles: Floats) -> Floats:
     """Normals as long as twice the area, (n, 3); exactly zero where there is none."""
-    cross: NDArray[np.float64] = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    cross: Floats = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     return np.where(((cross**2).sum(axis=1) > 0.0)[:, None], cross, 0.0)
 
 
-def _planes(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
+def _units(vectors: Floats) -> Floats:
+    """Vectors (n, 3), each one metre long."""
+    units: Floats = vectors / np.sqrt((vectors**2).sum(axis=1))[:, None]
+    return units
+
+
+def _planes(triangles: Floats) -> Floats:
     """The four planes of each triangle, see :func:`pipeline.kernels.rays.planes`."""
     cross, planes = _cross(triangles), np.empty((len(triangles), 4, 4))
-    rays.planes(triangles, cross / np.sqrt((cross**2).sum(axis=1))[:, None], planes)
+    rays.planes(triangles, _units(cross), planes)
     return planes
 
 
-def _along_curve(points: NDArray[np.float64]) -> NDArray[np.int64]:
+def _along_curve(points: Floats) -> NDArray[np.int64]:
     """An order of the points (n, 3) in which neighbours in space lie together: along a Z-shaped curve (Morton 1966)."""
     low = points.min(axis=0, initial=np.inf)
-    cells = ((points - low) * (2.0**20 / max(float((points - low).max(initial=0.0)), _PAD_M) * (1 - 1e-9))).astype(
-        np.int64
-    )
+    scale = 2.0**20 / max(float((points - low).max(initial=0.0)), _PAD_M) * (1 - 1e-9)
+    cells = ((points - low) * scale).astype(np.int64)
     key = np.zeros(len(points), dtype=np.int64)
     for bit in range(20):
         for axis in range(3):
@@ -220,7 +220,7 @@ def _along_curve(points: NDArray[np.float64]) -> NDArray[np.int64]:
     return np.argsort(key, kind="stable")
 
 
-def _boxes(triangles: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _boxes(triangles: Floats) -> tuple[Floats, NDArray[np.int64]]:
     """Boxes round the triangles, round groups of these, and so on up to one; and where each level starts."""
     low, high = triangles.min(axis=1) - _PAD_M, triangles.max(axis=1) + _PAD_M
     levels = [np.column_stack([low, high])]
@@ -231,12 +231,13 @@ def _boxes(triangles: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray
     return np.concatenate(levels), np.cumsum([0, *map(len, levels)])
 
 
-def _tree(triangles: NDArray[np.float64]) -> tuple[NDArray[np.int64], Any]:
+def _tree(triangles: Floats) -> tuple[NDArray[np.int64], Any]:
     """Embree's tree over the enlarged triangles; and the triangle behind each of its own, FIN for a fin; the last is
     none (-1).
 
     A triangle is scaled from its incentre so that its sides move out by the rim. That moves a needle's tip far; a
-    needle is held as the two triangles of a rectangle that covers it. Then the fins."""
+    needle is held as the two triangles of a rectangle that covers it. Then the fins.
+    """
     from embreex.mesh_construction import TriangleMesh
     from embreex.rtcore_scene import EmbreeScene
 
@@ -260,12 +261,13 @@ def _tree(triangles: NDArray[np.float64]) -> tuple[NDArray[np.int64], Any]:
     return np.concatenate([np.arange(len(triangles)), needles, np.full(len(fins), rays.FIN), [-1]]), scene
 
 
-def _fins(triangles: NDArray[np.float64], cross: NDArray[np.float64], rim: NDArray[np.float64]) -> NDArray[np.float64]:
+def _fins(triangles: Floats, cross: Floats, rim: Floats) -> Floats:
     """Strips upright on the sides that no steep neighbour guards, (f, 3, 3).
 
     A rim in the triangle's plane is no guard against a beam along that plane. The rim of a neighbour that stands steep
-    on it is; elsewhere the side gets a strip as high above and below as the rim is wide."""
-    normals = cross / np.sqrt((cross**2).sum(axis=1))[:, None]
+    on it is; elsewhere the side gets a strip as high above and below as the rim is wide.
+    """
+    normals = _units(cross)
     starts, ends = triangles.reshape(-1, 3), np.roll(triangles, -1, axis=1).reshape(-1, 3)
     ahead = _before(starts, ends)
     low, high = np.where(ahead[:, None], starts, ends), np.where(ahead[:, None], ends, starts)
@@ -279,28 +281,23 @@ def _fins(triangles: NDArray[np.float64], cross: NDArray[np.float64], rim: NDArr
     steep = np.maximum.reduceat(sine, first) > _STEEP
     side = first[~steep]
     a, b, n, wide = low[side], high[side], normals[owner[side]], rim[owner[side], None]
-    along = (b - a) / np.sqrt(((b - a) ** 2).sum(axis=1))[:, None] * wide
+    along = _units(b - a) * wide
     corners = [a - along - n * wide, b + along - n * wide, b + along + n * wide, a - along + n * wide]
-    strips = [np.stack([corners[0], corners[i], corners[i + 1]], axis=1) for i in (1, 2)]
-    return np.concatenate(strips)
+    return np.concatenate([np.stack([corners[0], corners[i], corners[i + 1]], axis=1) for i in (1, 2)])
 
 
-def _before(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _before(a: Floats, b: Floats) -> NDArray[np.bool_]:
     """Whether points a (n, 3) come before points b in lexical order."""
     x, y, z = (a - b).T
     before: NDArray[np.bool_] = (x < 0) | ((x == 0) & ((y < 0) | ((y == 0) & (z < 0))))
     return before
 
 
-def _rectangles(
-    triangles: NDArray[np.float64], sides: NDArray[np.float64], cross: NDArray[np.float64], rim: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _rectangles(triangles: Floats, sides: Floats, cross: Floats, rim: Floats) -> tuple[Floats, Floats]:
     """Two triangles each, (n, 3, 3), that together cover a triangle and a rim round it; one side along its longest."""
     rows = np.arange(len(triangles))
-    u = sides[rows, (sides**2).sum(axis=2).argmax(axis=1)]
-    u = u / np.sqrt((u**2).sum(axis=1))[:, None]
-    v = np.cross(cross, u)
-    v = v / np.sqrt((v**2).sum(axis=1))[:, None]
+    u = _units(sides[rows, (sides**2).sum(axis=2).argmax(axis=1)])
+    v = _units(np.cross(cross, u))
     base = triangles[:, 0]
     along, across = (((triangles - base[:, None]) * axis[:, None]).sum(axis=2) for axis in (u, v))
     corners = [
@@ -308,6 +305,5 @@ def _rectangles(
         for at_u, turn_u in ((along.min(axis=1), -1), (along.max(axis=1), 1))
         for at_v, turn_v in ((across.min(axis=1), -1), (across.max(axis=1), 1))
     ]
-    return np.stack([corners[0], corners[2], corners[3]], axis=1), np.stack(
-        [corners[0], corners[3], corners[1]], axis=1
-    )
+    first, second = ([corners[0], corners[i], corners[j]] for i, j in ((2, 3), (3, 1)))
+    return np.stack(first, axis=1), np.stack(second, axis=1)

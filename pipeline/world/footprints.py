@@ -51,10 +51,7 @@ class FootprintFile:
 def read_geojson(path: Path) -> FootprintFile:
     """Footprints of a GeoJSON FeatureCollection in world-frame metres.
 
-    Raises
-    ------
-    InputError
-        Naming the feature that cannot be understood, has no height, or is no sound polygon.
+    InputError names the feature that cannot be understood, has no height, or is no sound polygon.
     """
     file = FootprintFile()
     try:
@@ -92,46 +89,31 @@ def _polygons(geometry: Any, properties: dict[str, Any], place: str, mended: Cou
     """The polygons of one feature: lines and points buffered, dirt mended, multi-part geometries taken apart."""
     import shapely
 
+    shape_place = f"{place}: geometry"
+    damage = (shapely.errors.ShapelyError, TypeError, ValueError, LookupError, AttributeError, RecursionError)
     try:
         with np.errstate(invalid="ignore"):  # what is no number is refused below
             shape: BaseGeometry = shapely.geometry.shape(geometry)
         coordinates = shapely.get_coordinates(shape)
-    except (
-        shapely.errors.ShapelyError,
-        TypeError,
-        ValueError,
-        KeyError,
-        AttributeError,
-        IndexError,
-        RecursionError,
-    ) as error:
-        raise InputError(f"{place}: geometry", f"cannot be understood ({error})", "a GeoJSON geometry") from None
+    except damage as error:
+        raise InputError(shape_place, f"cannot be understood ({error})", "a GeoJSON geometry") from None
     if shape.is_empty or not np.isfinite(coordinates).all():
-        raise InputError(f"{place}: geometry", "is empty or has a coordinate that is no number", "finite metres")
-    if np.abs(coordinates).max() > FARTHEST_M:
-        raise InputError(
-            f"{place}: geometry",
-            f"lies {np.abs(coordinates).max():g} m from the world's zero",
-            f"within {FARTHEST_M:g} m",
-        )
+        raise InputError(shape_place, "is empty or has a coordinate that is no number", "finite metres")
+    if (far_m := np.abs(coordinates).max()) > FARTHEST_M:
+        raise InputError(shape_place, f"lies {far_m:g} m from the world's zero", f"within {FARTHEST_M:g} m")
     if shapely.has_z(shape) and np.any(shapely.get_coordinates(shape, include_z=True)[:, 2] != 0):
-        raise InputError(
-            f"{place}: geometry", "has z coordinates", "two coordinates a point; heights go into base_m, height_m"
-        )
+        raise InputError(shape_place, "has z coordinates", "two coordinates a point; heights go into base_m, height_m")
     if shape.geom_type.endswith(("Point", "LineString")):
         radius = _metres(properties, "radius_m", place)
         if radius <= 0:
             raise InputError(f"{place}: radius_m", f"{radius:g}", "above 0")
-        shape = shape.buffer(
-            radius, quad_segs=_QUARTER_SIDES, cap_style="flat" if "Line" in shape.geom_type else "round"
-        )
+        cap = "flat" if "Line" in shape.geom_type else "round"
+        shape = shape.buffer(radius, quad_segs=_QUARTER_SIDES, cap_style=cap)
     elif "Polygon" not in shape.geom_type:
-        raise InputError(
-            f"{place}: geometry", f"is a {shape.geom_type}", "a Polygon, LineString or Point, or their Multi forms"
-        )
-    parts = [p for p in shapely.get_parts(_sound(shape, place, mended)) if "Polygon" in p.geom_type]
+        raise InputError(shape_place, f"is a {shape.geom_type}", "a Polygon, LineString or Point, or their Multi forms")
+    parts = [p for p in shapely.get_parts(_sound(shape, shape_place, mended)) if "Polygon" in p.geom_type]
     if not parts:
-        raise InputError(f"{place}: geometry", "encloses no area", "a polygon with three corners that are not in line")
+        raise InputError(shape_place, "encloses no area", "a polygon with three corners that are not in line")
     return parts
 
 
@@ -142,9 +124,7 @@ def _sound(shape: BaseGeometry, place: str, mended: Counter[str]) -> BaseGeometr
     if not shapely.is_valid(shape):
         reason = shapely.is_valid_reason(shape)
         if not reason.startswith("Ring Self-intersection"):
-            raise InputError(
-                f"{place}: geometry", f"is not a sound polygon ({reason})", "rings that do not cross, holes inside"
-            )
+            raise InputError(place, f"is not a sound polygon ({reason})", "rings that do not cross, holes inside")
         shape = shapely.make_valid(shape)
         mended["rings that touched themselves"] += 1
     clean = shapely.remove_repeated_points(shape)
@@ -156,10 +136,7 @@ def _sound(shape: BaseGeometry, place: str, mended: Counter[str]) -> BaseGeometr
 def read_poly_xml(path: Path, height_m: float) -> FootprintFile:
     """Footprints of a SUMO .poly.xml; a ``height`` parameter overrides the default height.
 
-    Raises
-    ------
-    InputError
-        Naming the polygon that is not in metres, or not sound.
+    InputError names the polygon that is not in metres, or not sound.
     """
     file = FootprintFile()
     for number, element in enumerate(safe_xml.children(path, "additional")):
@@ -174,9 +151,8 @@ def read_poly_xml(path: Path, height_m: float) -> FootprintFile:
             points = [tuple(float(v) for v in pair.split(",")[:2]) for pair in element.get("shape", "").split()]
             top = next((float(p.get("value", "")) for p in element if p.get("key") == "height"), height_m)
         except ValueError as error:
-            raise InputError(
-                place, f"has a value that is no number ({error})", "shape='x,y x,y ...' in metres"
-            ) from None
+            what = f"has a value that is no number ({error})"
+            raise InputError(place, what, "shape='x,y x,y ...' in metres") from None
         if element.get("fill", "false").lower() not in ("true", "1") or len(points) < 3:
             file.left_out["lines of .poly.xml"] += 1
             continue

@@ -5,7 +5,8 @@ face has an extra ``int solid``; the header's comments name the solids, so that 
 stands in.
 
 PLY is read and written here by hand: the layout, with ``solid`` a face, is exact to the byte, which plyfile and trimesh
-do not promise, and reading is one view of the file's bytes."""
+do not promise, and reading is one view of the file's bytes.
+"""
 
 from __future__ import annotations
 
@@ -76,8 +77,7 @@ class World:
 
     @cached_property
     def signs(self) -> NDArray[np.int64]:
-        """+1 for solids whose triangles face outwards, -1 where they face inwards (negative volume). (solids,)
-        int64."""
+        """+1 for solids whose triangles face outwards, -1 for inwards (negative volume); (solids,) int64."""
         t = self.triangles_m - (self.vertices_m.mean(axis=0) if len(self.vertices_m) else 0.0)
         volume = np.einsum("ij,ij->i", t[:, 0], np.cross(t[:, 1], t[:, 2]))
         total = np.zeros(len(self.solids))

@@ -75,7 +75,8 @@ class Surface:
 
         A walk from the nearest vertex to the neighbour across the side that the point lies beyond; on a Delaunay
         triangulation it ends. (Qhull's own search asks LAPACK for thousands of 2 x 2 matrices, whose threads may take
-        seconds on a busy machine.)"""
+        seconds on a busy machine.)
+        """
         net, points = self._triangulation, self.vertices_m[:, :2] - self.low_m
         face = np.maximum(net.vertex_to_simplex[_nearest(points, at)], 0).astype(np.int64)
         shares, active = _shares(points[net.simplices[face]], at), np.arange(len(at))
@@ -99,23 +100,14 @@ class Surface:
         return float(self.height_m(*np.concatenate(points).T).min())
 
 
-@dataclass(frozen=True)
-class Relief:
-    """How far a network's lanes differ in height, and their height furthest off z = 0, metres."""
-
-    span_m: float
-    off_m: float
-
-
-def relief(roads: Network) -> Relief:
-    """Of all lanes, those inside junctions and people's too."""
+def relief_m(roads: Network) -> tuple[float, float]:
+    """How far a network's lanes (all of them) differ in height, and their height furthest off z = 0."""
     heights = np.concatenate([lane.shape_m[:, 2] for edge in roads.all_edges for lane in edge.lanes])
-    return Relief(float(np.ptp(heights)), float(heights[np.abs(heights).argmax()]))
+    return float(np.ptp(heights)), float(heights[np.abs(heights).argmax()])
 
 
 def ground(roads: Network, low_m: Floats | None = None, high_m: Floats | None = None) -> Surface:
-    """The surface through a network's lanes, over the rectangle from ``low_m`` to ``high_m``; around the network when
-    None."""
+    """The surface through a network's lanes, from ``low_m`` to ``high_m``; around the network when None."""
     lanes = [_strewn(lane, _width_m(edge, lane)) for edge in roads.all_edges for lane in edge.lanes]
     points = _thinned(np.concatenate(lanes))
     low = points[:, :2].min(axis=0) - _MARGIN_M if low_m is None else low_m
@@ -155,9 +147,8 @@ def _triangulated(vertices: Floats, low: Floats, high: Floats) -> Surface:
     (ax, ay), (bx, by), (cx, cy) = (vertices[faces[:, i], :2].T for i in range(3))
     down = (bx - ax) * (cy - ay) < (by - ay) * (cx - ax)
     faces[down] = faces[down][:, [0, 2, 1]]
-    first = np.argmin(
-        faces, axis=1
-    )  # each face from its lowest vertex, faces in order: the bytes do not depend on Qhull's order
+    # each face from its lowest vertex, faces in order: the bytes do not depend on Qhull's order
+    first = np.argmin(faces, axis=1)
     faces = np.take_along_axis(faces, (first[:, None] + np.arange(3)) % 3, axis=1)
     return Surface(vertices, faces[np.lexsort(faces.T[::-1])], low, high)
 
@@ -198,11 +189,6 @@ def _thinned(points: Floats) -> Floats:
 def _rim(low: Floats, high: Floats) -> Floats:
     """Points (n, 2) along the edges of a rectangle."""
     xs, ys = (np.linspace(a, b, int(np.ceil((b - a) / _RING_M)) + 1) for a, b in zip(low, high, strict=True))
-    return np.concatenate(
-        [
-            np.column_stack([xs, np.full(xs.size, low[1])]),
-            np.column_stack([xs, np.full(xs.size, high[1])]),
-            np.column_stack([np.full(ys.size - 2, low[0]), ys[1:-1]]),
-            np.column_stack([np.full(ys.size - 2, high[0]), ys[1:-1]]),
-        ]
-    )
+    along = [np.column_stack([xs, np.full(xs.size, y)]) for y in (low[1], high[1])]
+    across = [np.column_stack([np.full(ys.size - 2, x), ys[1:-1]]) for x in (low[0], high[0])]
+    return np.concatenate([*along, *across])

@@ -61,20 +61,21 @@ def recorded(scene, out, *acting):
         recording.record(scene, out / "sumo", acting, silent, None) as rows,
         tables.writer(out / "trajectories.parquet", "trajectories") as file,
     ):
-        written = trajectories.write(scene, rows, acting, file, silent)
+        tally, reports = trajectories.write(scene, rows, acting, file, silent)
         file.describe({"schema": 1, "frames": 1})
-        return written, rows.summary()
+        return tally.to_json(rows.window.period_ms / 1000.0), reports, rows.summary()
 
 
 def test_an_extension_adds_traffic_that_does_not_count_and_changes_boxes(town, tmp_path):
     scene = scenario(town, network="net.xml", **SMALL)
-    written, summary = recorded(scene, tmp_path, Guests(EffectParameters()))
+    counts, reports, summary = recorded(scene, tmp_path, Guests(EffectParameters()))
     plain = run_stage(traffic, scene, tmp_path / "plain")
-    assert (written.counts.fewest, written.counts.most) == (12, 12)
-    assert set(written.counts.uncounted) == {"tram"} and written.counts.uncounted["tram"].most == 1
-    assert written.of_extensions["kinds"] == sorted({"car", "van", "truck", "bus"})
-    assert written.of_extensions["raised"] == plain["rows"] + written.counts.uncounted["tram"].mean * 240
-    assert summary.notes == ("a guest from 0 to 120 s",)
+    assert (counts["vehicles"]["fewest"], counts["vehicles"]["most"]) == (12, 12)
+    beside = counts["beside_vehicles"]
+    assert set(beside) == {"tram", "overlapping_pairs"} and beside["tram"]["most"] == 1
+    assert reports["kinds"] == sorted({"car", "van", "truck", "bus"})
+    assert reports["raised"] == plain["rows"] + beside["tram"]["mean"] * 240
+    assert summary.notes == ["a guest from 0 to 120 s"]
     flags = " ".join(summary.flags)
     assert "trips.rou.xml,others.rou.xml" in flags and "--max-num-vehicles 13" in flags
 
@@ -85,10 +86,10 @@ def test_two_extensions_have_a_route_file_each_and_change_boxes_one_after_anothe
             return TrafficPlan("<routes/>", 0)
 
     scene = scenario(town, network="net.xml", **SMALL)
-    written, summary = recorded(scene, tmp_path, Guests(EffectParameters()), Others(EffectParameters()))
+    counts, _, summary = recorded(scene, tmp_path, Guests(EffectParameters()), Others(EffectParameters()))
     flags = " ".join(summary.flags)
     assert "trips.rou.xml,others.rou.xml,others1.rou.xml" in flags and "--max-num-vehicles 13" in flags
-    assert written.counts.most == 12
+    assert counts["vehicles"]["most"] == 12
     lifted = tables.read(tmp_path / "trajectories.parquet", "trajectories")[0]["z_m"].to_numpy()
     assert lifted.min() > 200 and lifted.max() < 202
 

@@ -98,7 +98,7 @@ def test_standing_is_followed_across_groups():
         counted.add(boxes.from_bumpers(group_of(rows), SIZES, 1.0, "place"))
     assert counted.stands_since == {"still": 0, "goes": 5}
     assert counted.longest_standing_frames == 5
-    result = counted.counts(0.5).to_json()
+    result = counted.to_json(0.5)
     assert result["vehicles"] == {"fewest": 2, "most": 2, "different": 2}
     assert result["longest_standing_s"] == 2.5
     assert result["share_standing"] == round(11 / 12, 4)

@@ -25,7 +25,8 @@ assumed.
 
 Calls for it: buses and trucks of 16 m and more that turn in the region of interest. Limits: no tyre slip, no steered
 rear axle, no limit to the angle at the joint; SUMO itself leaves room for a stiff vehicle only, so a rear part may cut
-into a neighbour's lane."""
+into a neighbour's lane.
+"""
 
 from __future__ import annotations
 
@@ -74,36 +75,25 @@ class Articulated(Traffic[ArticulatedParameters]):
     Model: ClassVar[type[EffectParameters]] = ArticulatedParameters
 
     def acts(self, scenario: Scenario) -> tuple[bool, str]:
-        """Where each known kind is one part, nothing changes; of a user's own SUMO demand the kinds are not known
-        beforehand.
+        """Where each kind is one part, nothing changes. InputError when parts do not fit the kinds.
 
-        Raises
-        ------
-        InputError
-            When parts do not fit the scenario's kinds.
+        Of a user's own SUMO demand the kinds are not known beforehand.
         """
-        sizes = known_sizes(scenario)
-        if sizes is not None and not self.geometries(sizes, place_of(scenario)):
+        own = scenario.traffic.sumocfg is not None or scenario.traffic.routes
+        if not own and not self.geometries(kind_sizes(scenario), self.place(scenario)):
             return False, "no kind of vehicle has more than one part"
         return True, "named"
 
     def box_change(self, scenario: Scenario, sizes: Mapping[str, Size]) -> Follower:
         """Each box of several parts becomes one box a part."""
-        return Follower(self.geometries(sizes, place_of(scenario)))
+        return Follower(self.geometries(sizes, self.place(scenario)))
 
     def geometries(self, sizes: Mapping[str, Size], place: str) -> dict[str, Geometry]:
-        """Kind -> its parts, for kinds of more than one.
-
-        Raises
-        ------
-        InputError
-            When a kind is not there, or its parts are longer than it is.
-        """
+        """Kind -> its parts, for kinds of more than one; InputError when one is missing, or shorter than its parts."""
         for name in self.parameters.kinds:
             if name not in sizes:
-                raise InputError(
-                    f"{place}.kinds", f"there is no kind of vehicle {name!r}", f"one of {', '.join(sorted(sizes))}"
-                )
+                known = ", ".join(sorted(sizes))
+                raise InputError(f"{place}.kinds", f"there is no kind of vehicle {name!r}", f"one of {known}")
         geometries = {}
         for name, size in sizes.items():
             parts = self.parameters.kinds.get(name) or (_by_class(size) if self.parameters.auto else None)
@@ -114,19 +104,6 @@ class Articulated(Traffic[ArticulatedParameters]):
         return geometries
 
 
-def place_of(scenario: Scenario) -> str:
-    """Where messages point to."""
-    return f"{scenario.file}: effects.articulated"
-
-
-def known_sizes(scenario: Scenario) -> dict[str, Size] | None:
-    """The kinds that can occur, where the scenario says so itself; None where a user's SUMO files do."""
-    traffic = scenario.traffic
-    if traffic.sumocfg is not None or traffic.routes:
-        return None
-    return kind_sizes(scenario)
-
-
 def _by_class(size: Size) -> VehicleParts | None:
     """Parts of a kind that is long for its vClass."""
     if size.length_m < _LONG_M:
@@ -135,9 +112,8 @@ def _by_class(size: Size) -> VehicleParts | None:
         return VehicleParts(parts_m=tuple(share * size.length_m for share in _BUS_SHARES))
     if size.vclass in _TRAILERS:
         axle = _BOGIE_SHARE * (size.length_m - _FIFTH_WHEEL_M)
-        return VehicleParts(
-            parts_m=(_TRACTOR_M, size.length_m - _TRACTOR_M), hinges_m=(_FIFTH_WHEEL_M,), axles_m=(axle,)
-        )
+        parts_m = (_TRACTOR_M, size.length_m - _TRACTOR_M)
+        return VehicleParts(parts_m=parts_m, hinges_m=(_FIFTH_WHEEL_M,), axles_m=(axle,))
     return None
 
 
@@ -153,9 +129,8 @@ def _geometry(parts: VehicleParts, length_m: float, place: str) -> Geometry:
     gap = max(0.0, left) / joints if joints else 0.0
     starts = [sum(lengths[:i]) + i * gap for i in range(joints + 1)]
     hinges = parts.hinges_m or tuple(start - gap / 2 for start in starts[1:])
-    return Geometry(
-        tuple(starts), lengths, hinges, parts.axles_m or tuple(_AXLE_SHARE * length for length in lengths[1:])
-    )
+    axles = parts.axles_m or tuple(_AXLE_SHARE * length for length in lengths[1:])
+    return Geometry(tuple(starts), lengths, hinges, axles)
 
 
 @dataclass
@@ -179,23 +154,20 @@ class Follower:
     def change(self, boxes: VehicleBoxes) -> VehicleBoxes:
         """The boxes with each articulated vehicle's row replaced by one row a part."""
         shapes = [self.geometries.get(name) for name in boxes.types]
-        parts = np.array([1 if shape is None else len(shape.lengths_m) for shape in shapes], dtype=np.int64)[
-            boxes.type_code
-        ]
-        rows = np.repeat(np.arange(parts.size), parts)
-        part = np.arange(rows.size) - np.repeat(np.cumsum(parts) - parts, parts)
+        of_type = np.array([1 if shape is None else len(shape.lengths_m) for shape in shapes], dtype=np.int64)
+        parts = of_type[boxes.type_code]
+        rows, first = np.repeat(np.arange(parts.size), parts), np.cumsum(parts) - parts
+        part = np.arange(rows.size) - np.repeat(first, parts)
         whole = replace(boxes, **boxes.rows(rows), part=part)
         columns = {name: getattr(whole, name) for name in ("x_m", "y_m", "z_m", "yaw_rad", "length_m")}
-        first = np.cumsum(parts) - parts
         for row in np.flatnonzero(parts > 1).tolist():
             shape = shapes[boxes.type_code[row]]
             assert shape is not None
             for i, values in enumerate(self._follow(boxes, row, shape)):
                 for name, value in zip(columns, values, strict=True):
                     columns[name][first[row] + i] = value
-        self._states = {
-            name: state for name, state in self._states.items() if state.frame == boxes.first_frame + boxes.frames - 1
-        }
+        last_frame = boxes.first_frame + boxes.frames - 1
+        self._states = {name: state for name, state in self._states.items() if state.frame == last_frame}
         for name in ("x_m", "y_m", "z_m"):
             columns[name] = np.where(parts[rows] > 1, tidy_m(columns[name]), columns[name])
         columns["yaw_rad"] = np.where(part > 0, tidy_rad(columns["yaw_rad"]), columns["yaw_rad"])
@@ -220,9 +192,8 @@ class Follower:
                 x, y = x - reach * math.cos(headings[-1]), y - reach * math.sin(headings[-1])
                 hinges.append((x, y))
                 pulled_m = shape.hinges_m[i - 1]
-                headings.append(
-                    headings[-1] if last is None else _pulled(last, headings[-1], (x, y), i, shape.axles_m[i - 1])
-                )
+                axle = shape.axles_m[i - 1]
+                headings.append(yaw if last is None else _pulled(last, headings[-1], (x, y), i, axle))
                 self.largest_rad = max(self.largest_rad, abs(_wrapped(headings[-1] - headings[-2])))
             back = start + size / 2
             away = (back - pulled_m) * flat

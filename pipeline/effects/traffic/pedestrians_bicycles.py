@@ -25,14 +25,15 @@ Intermodal Transport (the striping model).
 
 Calls for it: sites that must see people. Limits: pedestrians' boxes may overlap where SUMO lets people pass closely,
 and on crossings that they share with turning traffic; nobody walks in groups; bicycles do not use sidewalks; sizes do
-not vary."""
+not vary.
+"""
 
 from __future__ import annotations
 
 import heapq
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -54,8 +55,7 @@ PEDESTRIAN, BICYCLE = "egvs_pedestrian", "egvs_bicycle"
 TYPES = frozenset((PEDESTRIAN, BICYCLE))
 
 _RIDES_M_S = 4.0
-"""A bicycle's mean speed over a trip, stops left out, at the least; SUMO's own bicycles ride 5.56 m/s on a free
-road."""
+"""A bicycle's least mean speed over a trip, without stops; SUMO's own ride 5.56 m/s on a free road."""
 
 _WAITS_S = 30.0
 _BEYOND_S = 3600.0
@@ -83,11 +83,10 @@ class PedestriansBicycles(Traffic[PedestriansBicyclesParameters]):
         if scenario.traffic.fcd is None or not self.acts(scenario)[0]:
             return None
         reason = "the scenario names a finished FCD file, so nobody can be added"
-        return InputError(f"{scenario.file}: effects.{self.NAME}", reason, "network or sumocfg in [traffic]")
+        return InputError(self.place(scenario), reason, "network or sumocfg in [traffic]")
 
     def acts(self, scenario: Scenario) -> tuple[bool, str]:
         """Rates of 0 bring nobody."""
-        del scenario
         both = self.parameters.pedestrians_per_h == 0 and self.parameters.bicycles_per_h == 0
         return (False, "both rates are 0") if both else (True, "named")
 
@@ -104,14 +103,8 @@ class PedestriansBicycles(Traffic[PedestriansBicyclesParameters]):
     def plan(
         self, scenario: Scenario, roads: Network, begin_s: float, end_s: float, rng: np.random.Generator
     ) -> TrafficPlan:
-        """Draw everybody's trips between two times.
-
-        Raises
-        ------
-        InputError
-            When the network has no place for them.
-        """
-        place, hours = f"{scenario.file}: effects.pedestrians_bicycles", (end_s - begin_s) / 3600.0
+        """Draw everybody's trips between two times; InputError when the network has no place for them."""
+        place, hours = self.place(scenario), (end_s - begin_s) / 3600.0
         walkers, riders = rng.spawn(2)
         times = [
             np.sort(begin_s + draw.random(round(rate * hours)) * (end_s - begin_s))
@@ -125,10 +118,10 @@ class PedestriansBicycles(Traffic[PedestriansBicyclesParameters]):
 
     def _types(self) -> Iterator[str]:
         for name, size in self.sizes().items():
-            upright = demand.UPRIGHT if name == BICYCLE else {}
-            values: dict[str, Any] = {"id": name, "vClass": size.vclass, "length": size.length_m, "width": size.width_m}
-            values |= {"height": size.height_m} | upright
-            yield f"    <vType {' '.join(f'{key}={quoteattr(str(value))}' for key, value in values.items())}/>"
+            yield demand.vtype_xml(name, size, demand.UPRIGHT if name == BICYCLE else {})
+
+
+SidewalkPlace = tuple[Sidewalk, float]
 
 
 # ---- on foot
@@ -144,11 +137,7 @@ def _walks(
     pairs = _ends(ways.sidewalks) or _anywhere(ways.sidewalks)
     if not pairs:
         raise InputError(f"{place}.pedestrians_per_h", "no sidewalk leads to another", _MAKES_WALKS)
-    notes = (
-        []
-        if ways.crossings
-        else ["pedestrians_bicycles: the network has no crossings, so people stay on their side of the road"]
-    )
+    note = "pedestrians_bicycles: the network has no crossings, so people stay on their side of the road"
     chosen, people = rng.integers(len(pairs), size=times_s.size), []
     for number, (depart, pair) in enumerate(zip(times_s, chosen, strict=True)):
         (start, start_m), (end, end_m) = pairs[pair]
@@ -157,15 +146,11 @@ def _walks(
             f' departPos="{start_m:.2f}"><walk from={quoteattr(start.edge)} to={quoteattr(end.edge)}'
             f' arrivalPos="{end_m:.2f}"/></person>'
         )
-    return people, notes
-
-
-SidewalkPlace = tuple[Sidewalk, float]
+    return people, [] if ways.crossings else [note]
 
 
 def _ends(sidewalks: tuple[Sidewalk, ...]) -> list[tuple[SidewalkPlace, SidewalkPlace]]:
-    """Pairs of sidewalk ends at two nodes of the fringe (which lead to one neighbour only) that people can walk
-    between."""
+    """Pairs of sidewalk ends at two nodes of the fringe (with one neighbour only) that people can walk between."""
     neighbours: dict[str, set[str]] = {}
     for walk in sidewalks:
         neighbours.setdefault(walk.from_node, set()).add(walk.to_node)
@@ -178,9 +163,8 @@ def _ends(sidewalks: tuple[Sidewalk, ...]) -> list[tuple[SidewalkPlace, Sidewalk
 
 def _anywhere(sidewalks: tuple[Sidewalk, ...]) -> list[tuple[SidewalkPlace, SidewalkPlace]]:
     """From the middle of any sidewalk to that of any other that hangs together with it."""
-    return [
-        ((a, a.length_m / 2), (b, b.length_m / 2)) for a in sidewalks for b in sidewalks if a != b and a.part == b.part
-    ]
+    pairs = [(a, b) for a in sidewalks for b in sidewalks if a != b and a.part == b.part]
+    return [((a, a.length_m / 2), (b, b.length_m / 2)) for a, b in pairs]
 
 
 # ---- on bicycles
@@ -188,8 +172,7 @@ def _anywhere(sidewalks: tuple[Sidewalk, ...]) -> list[tuple[SidewalkPlace, Side
 
 @dataclass(frozen=True)
 class _Ride:
-    """One trip: when it starts, over which edges, how long it takes at most (mostly), and the last edge's lane and
-    length."""
+    """One trip; ``takes_s`` at most (mostly). ``first`` and ``last`` are its first and last edge's lane and length."""
 
     depart_s: float
     edges: tuple[str, ...]
@@ -212,9 +195,8 @@ def _rides(
         way = router.way(int(pairs.origin[pair]), int(pairs.target[pair]))
         length = sum(router.lengths_m[edge] for edge in way)
         takes = length / _RIDES_M_S + _WAITS_S * len(way)
-        rides.append(
-            _Ride(depart, tuple(roads.edges[i].id for i in way), takes, router.lane(way[0]), router.lane(way[-1]))
-        )
+        edges = tuple(roads.edges[i].id for i in way)
+        rides.append(_Ride(depart, edges, takes, router.lane(way[0]), router.lane(way[-1])))
     return rides
 
 
@@ -251,10 +233,10 @@ class _Router:
 
 
 def _on_few_vehicles(rides: list[_Ride], begin_s: float, end_s: float) -> Iterator[str]:
-    """One ``<vehicle>`` for trips one after another: each trip goes to the vehicle that has been free for longest, or
-    to a new one.
+    """One ``<vehicle>`` for trips one after another; each goes to the one that is free for longest, or to a new one.
 
-    A vehicle starts at once, jumps to its first trip, from trip to trip, and at last beyond the simulation's end."""
+    A vehicle starts at once, jumps to its first trip, from trip to trip, and at last beyond the simulation's end.
+    """
     free: list[tuple[float, int]] = []
     strings: list[list[_Ride]] = []
     for ride in rides:

@@ -21,7 +21,8 @@ Source: SUMO's networks with elevation (https://sumo.dlr.de/docs/Networks/Elevat
 Delaunay triangulation: Barber, Dobkin, Huhdanpaa 1996, ACM TOMS 22(4), 469-483 (Qhull).
 
 Limits: those of one surface (a box more than 1 m off it, on a bridge, keeps SUMO's own slope); no camber; vehicles'
-speeds do not depend on the grade in SUMO's car-following."""
+speeds do not depend on the grade in SUMO's car-following.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +55,6 @@ class Slope(Traffic[SlopeParameters]):
     SOURCE: ClassVar[str] = "SUMO networks with elevation; Delaunay surface (Barber et al. 1996, Qhull)"
     Model: ClassVar[type[EffectParameters]] = SlopeParameters
     SELF_ACTING: ClassVar[bool] = True
-    LAYS_GROUND: ClassVar[bool] = True
 
     def acts(self, scenario: Scenario) -> tuple[bool, str]:
         """Where the network has relief, whoever names it."""
@@ -63,16 +63,15 @@ class Slope(Traffic[SlopeParameters]):
             return False, "a finished FCD file names no network; its own heights and slopes are taken as they are"
         if not network.may_have_heights(path):
             return False, "the network is flat"
-        relief = terrain.relief(network.read(path))
-        if relief.span_m > LEAST_M:
-            return True, f"the network has {relief.span_m:.1f} m of relief"
-        if abs(relief.off_m) > LEAST_M:
-            return True, f"the network lies at z = {relief.off_m:.1f} m"
-        return False, f"the network has {relief.span_m:.2g} m of relief, no more than {LEAST_M:g} m"
+        span_m, off_m = terrain.relief_m(network.read(path))
+        if span_m > LEAST_M:
+            return True, f"the network has {span_m:.1f} m of relief"
+        if abs(off_m) > LEAST_M:
+            return True, f"the network lies at z = {off_m:.1f} m"
+        return False, f"the network has {span_m:.2g} m of relief, no more than {LEAST_M:g} m"
 
     def box_change(self, scenario: Scenario, sizes: Mapping[str, Size]) -> Seating:
         """Boxes are seated on the ground around the network."""
-        del sizes
         return Seating(self.ground(scenario))
 
     def ground(
@@ -112,10 +111,7 @@ class Seating:
         }
         upright = np.array([kind == _UPRIGHT for kind in boxes.kinds], dtype=np.bool_)[boxes.kind]
         stays = upright | ~(np.abs(above) <= _OFF_M)
-        settled: dict[str, Any] = {
-            name: np.where(stays, getattr(boxes, name), values) for name, values in seated.items()
-        }
-        return replace(boxes, **settled)
+        return replace(boxes, **{name: np.where(stays, getattr(boxes, name), new) for name, new in seated.items()})
 
     def summary(self) -> dict[str, Any]:
         """Nothing beside the note that it acts."""
