@@ -23,6 +23,11 @@ def names(group: str) -> list[str]:
     return sorted(_declared(group))
 
 
+def module_of(group: str, name: str) -> str:
+    """The module that an entry point names; it is not imported. KeyError when the group declares no such name."""
+    return _declared(group)[name].module
+
+
 @cache
 def load(group: str, name: str) -> Any:
     """The object that an entry point names; its module is imported at the first call.

@@ -25,8 +25,10 @@ _ROOT = Path(__file__).resolve().parent.parent
 
 LIBRARIES = {
     "embreex": ("embreex",),
+    "laspy": ("laspy", "lazrs"),
     "numba": ("numba", "llvmlite"),
     "numpy": ("numpy",),
+    "osmium": ("osmium",),
     "pyarrow": ("pyarrow",),
     "scipy": ("scipy",),
     "shapely": ("shapely",),

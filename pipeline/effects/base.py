@@ -28,7 +28,7 @@ import numpy as np
 
 from pipeline.core.errors import InputError
 from pipeline.scenario.effects import EffectParameters
-from pipeline.sensing.scene import BeamCutter, BeamExpander
+from pipeline.sensing.beam_effects import BeamCutter, BeamExpander
 from pipeline.traffic.extensions import TrafficExtension
 
 if TYPE_CHECKING:
@@ -141,7 +141,7 @@ class Detect(Effect[P]):
 
 
 class Traffic(Effect[P], TrafficExtension):
-    """Who moves, and how boxes are made of it. With ``ground``: a :class:`pipeline.world.building.GroundSource`."""
+    """Who moves, and how boxes are made of it. With ``ground``: a :class:`pipeline.world.ground.GroundSource`."""
 
     STAGE: ClassVar[str] = "traffic"
     KIND: ClassVar[str] = "traffic"

@@ -9,7 +9,7 @@ from pipeline.effects import registry
 from pipeline.effects.base import Traffic
 from pipeline.scenario.models import Scenario
 from pipeline.traffic import configuration
-from pipeline.world.building import GroundSource
+from pipeline.world.ground import GroundSource
 
 SELF_ACTING: dict[str, Callable[[Scenario], bool]] = {"slope": configuration.may_have_heights}
 """Effects that switch themselves on where leaving them out would be wrong; a quick look tells where they may."""

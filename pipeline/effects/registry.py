@@ -42,6 +42,11 @@ def named(scenario: Scenario, *stages: str) -> tuple[Effect[Any], ...]:
     return tuple(effect for effect in effects if effect.STAGE in stages)
 
 
+def modules(effects: Iterable[Effect[Any]]) -> tuple[str, ...]:
+    """The modules of effects, whose source a stage depends on."""
+    return tuple(type(effect).__module__ for effect in effects)
+
+
 def settings(effects: Iterable[Effect[Any]]) -> dict[str, Any]:
     """What a stage's inputs say of its effects: empty when there is none."""
     return {effect.NAME: effect.parameters.model_dump(mode="json") for effect in effects}

@@ -81,6 +81,11 @@ def read_points(path: Path, place: str) -> tuple[NDArray[np.float64], int]:
     return (points[finite] if dropped else points), dropped
 
 
+def reader_of(path: Path, place: str) -> str:
+    """The module that reads files of this kind; InputError at ``place`` when none does."""
+    return plugins.module_of(GROUP, _kind(place, path, plugins.names(GROUP)))
+
+
 def write_points(path: Path, points_m: NDArray[np.float64]) -> None:
     """Write a point cloud, whole or not at all; the same points give the same bytes.
 

@@ -94,7 +94,7 @@ def artefacts_of(stage: str) -> tuple[str, ...]:
 def inputs(stage: str, work: Workspace) -> Inputs:
     """Everything that a stage's artefacts depend on; ``work`` holds those of the stages before."""
     read: StageInputs = module_of(stage).inputs(work)
-    about = {"stage": stage, "inputs": read.to_json(), "program": program(stage, work.scenario, read.code)}
+    about = {"stage": stage, "inputs": read.to_json(), "program": program(stage, work.scenario, read.modules)}
     return Inputs(files.hash_of(about), read)
 
 
@@ -118,19 +118,19 @@ def _companions(module: ModuleType, out: Path) -> dict[str, tuple[int, int, int]
     return {name: (stat.st_mtime_ns, stat.st_ino, stat.st_size) for name, stat in stats.items()}
 
 
-def program(stage: str, scenario: Scenario, more_effects: tuple[type, ...] = ()) -> dict[str, Any]:
+def program(stage: str, scenario: Scenario, loaded: tuple[str, ...] = ()) -> dict[str, Any]:
     """What a stage's artefacts depend on beside its inputs.
 
-    Its source, that of the effects that act in it (and, since its summary names them, of those that turn out to change
-    nothing), its schemas and templates, and the libraries.
+    Its source, that of the modules that it loads by name (effects that act in it and, since its summary names them,
+    those that turn out to change nothing; readers of files), its schemas and templates, and the libraries.
     """
     named = registry.named(scenario, *_ASKS.get(stage, (stage,)))
-    effects = sorted({*more_effects, *(type(effect) for effect in named)}, key=lambda effect: effect.__module__)
-    own, theirs = source.of(module_of(stage).__name__), [source.of(effect.__module__) for effect in effects]
-    libraries = own.libraries.union(*(effect.libraries for effect in theirs))
+    modules = sorted({*loaded, *registry.modules(named)})
+    own, theirs = source.of(module_of(stage).__name__), [source.of(module) for module in modules]
+    libraries = own.libraries.union(*(part.libraries for part in theirs))
     return {
         "source": own.digest,
-        "effects": [effect.digest for effect in theirs],
+        "loaded": [part.digest for part in theirs],
         "named": registry.settings(named),
         "files": {path.name: files.sha256_of(path) for path in _data(stage)},
         "libraries": source.versions(libraries),

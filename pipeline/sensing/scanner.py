@@ -20,7 +20,8 @@ from pipeline.core.errors import InputError
 from pipeline.formats import point_clouds
 from pipeline.kernels import rays
 from pipeline.sensing import placing
-from pipeline.sensing.scene import BeamCutter, BeamExpander, Scene
+from pipeline.sensing.beam_effects import BeamCutter, BeamExpander
+from pipeline.sensing.scene import Scene
 from pipeline.sensing.sensors import Sensor
 from pipeline.sensing.sites import Pose, ScannedSite, Site
 from pipeline.world.casting import Caster, EmptyScan

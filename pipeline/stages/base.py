@@ -41,14 +41,14 @@ class StageInputs:
         Files by sha256.
     more
         What else counts, e.g. SUMO's version.
-    code
-        Effects that act in the stage: their modules' sources count too.
+    modules
+        Modules whose source counts too, being loaded by name: those of effects that act, of readers of measured scans.
     """
 
     settings: Json
     files: Mapping[str, str]
     more: Json = field(default_factory=dict)
-    code: tuple[type, ...] = ()
+    modules: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """As it is hashed."""

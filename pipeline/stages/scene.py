@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from pathlib import Path
 
 from pipeline.core import files
 from pipeline.effects import registry, scenes
 from pipeline.effects.base import Effect
+from pipeline.formats import point_clouds
 from pipeline.scenario.models import Scenario
 from pipeline.sensing.scene import Scene
 from pipeline.sensing.sites import Site
@@ -35,7 +37,8 @@ def scan_inputs(work: Workspace) -> StageInputs:
     if live:
         settings["effects"] = registry.settings(live)
     hashes = work.digests(STATICS) | site_digests(scenario, scene.sites)
-    return StageInputs(settings, hashes, code=tuple(type(effect) for effect in live))
+    readers = {point_clouds.reader_of(Path(s.points), f"site {s.name}: points") for s in scene.sites if s.points}
+    return StageInputs(settings, hashes, modules=(*registry.modules(live), *sorted(readers)))
 
 
 def site_digests(scenario: Scenario, sites: Iterable[Site]) -> dict[str, str]:

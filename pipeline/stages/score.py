@@ -62,11 +62,12 @@ def inputs(work: Workspace) -> StageInputs:
         settings["effects"] = registry.settings(live)
         settings["sensors"] = {name: model.model_dump(mode="json") for name, model in scenario.sensors.items()}
     hashes = work.digests("tpog.parquet", *(name for effect in live for name in effect.reads))
-    code = tuple(type(effect) for effect in live)
+    modules = registry.modules(live)
     if scenario.scan.keep:
-        return StageInputs(settings, hashes | work.digests(SCANS), code=code)
+        return StageInputs(settings, hashes | work.digests(SCANS), modules=modules)
     cast = scan_inputs(work)
-    return StageInputs({**settings, "scan": cast.settings}, {**hashes, **cast.files}, code=code + cast.code)
+    read = {**hashes, **cast.files}
+    return StageInputs({**settings, "scan": cast.settings}, read, modules=modules + cast.modules)
 
 
 def run(

@@ -27,7 +27,7 @@ def inputs(work: Workspace) -> StageInputs:
     if ground is not None and (path := configuration.network_path(scenario)) is not None:
         hashes["surface"] = files.sha256_of(path)
     settings = {"name": scenario.name, "statics": model.model_dump(mode="json"), "roi": [box.origin_m, box.size_m]}
-    return StageInputs(settings, hashes, code=() if ground is None else (type(ground),))
+    return StageInputs(settings, hashes, modules=() if ground is None else (type(ground).__module__,))
 
 
 def run(work: Workspace, inputs: StageInputs) -> Summary:

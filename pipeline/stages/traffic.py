@@ -46,7 +46,7 @@ def inputs(work: Workspace) -> StageInputs:
         settings["effects"] = named
     hashes = {_label(path, scenario): files.sha256_of(path) for path in sources}
     version = None if traffic.fcd is not None else sumo.version()
-    return StageInputs(settings, hashes, {"sumo": version}, tuple(type(effect) for effect in effects))
+    return StageInputs(settings, hashes, {"sumo": version}, registry.modules(effects))
 
 
 def _label(path: Path, scenario: Scenario) -> str:

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from pipeline.core.progress import Progress, silent
 from pipeline.scenario.models import MeshModel, Scenario
 from pipeline.scenario.types import FARTHEST_M
 from pipeline.world.footprints import Footprint, read_geojson, read_poly_xml
+from pipeline.world.ground import GroundSource
 from pipeline.world.mesh import World
 from pipeline.world.terrain import Surface
 
@@ -30,17 +31,6 @@ Floats = NDArray[np.float64]
 
 GROUND_MARGIN_M = 500.0
 """How far the ground plane goes on beyond everything; more than any sensor in the catalogue reaches."""
-
-
-@runtime_checkable
-class GroundSource(Protocol):
-    """Something that lays a ground which goes up and down."""
-
-    NAME: ClassVar[str]
-
-    def ground(self, scenario: Scenario, low_m: Floats | None = None, high_m: Floats | None = None) -> Surface:
-        """The ground over a rectangle; around the network when None."""
-        ...
 
 
 @dataclass(frozen=True)

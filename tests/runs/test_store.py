@@ -318,10 +318,13 @@ CHANGED_LINES = {
     "kernels/march.py": {"score", "report"},
     "kernels/rays.py": {"scan", "score", "report"},
     "kernels/solids.py": {"scan", "tpog", "score", "report"},
+    "sensing/sensors.py": {"scan", "score"},
     "stages/traffic.py": {"traffic"},
     "world/mesh.py": {"statics", "scan", "tpog", "score", "report"},
     "effects/score/rain.py": {"score", "report"},
     "effects/score/fog.py": set(),
+    "formats/csv_points.py": {"scan"},
+    "formats/pcd.py": set(),
     "studies/accuracy.py": set(),
     "data_schemas/tpog.schema.json": {"tpog"},
 }
@@ -349,6 +352,8 @@ def test_one_changed_line_makes_what_depends_on_it_again(
         assert set(found.values()) <= {"done", "skipped"}
         return {stage for stage, state in found.items() if state == "done"}
 
+    (mini / "sites.csv").write_text("site,x_m,y_m,z_m,points\npole_a,10,12,3,\npole_b,30.5,-12,3,measured.csv\n")
+    (mini / "measured.csv").write_text("x_m,y_m,z_m\n30.5,0,0\n")
     scenario = pipeline.load(mini, ["effects.rain.rate_mm_h=20"])
     assert made() == set(STAGES)
     assert made() == set()
