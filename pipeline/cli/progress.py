@@ -1,10 +1,8 @@
-"""How far a run is: a progress bar on a terminal, plain lines elsewhere. All of it goes to standard error; standard
-output carries results."""
+"""How far a run is: a progress bar on a terminal, plain lines elsewhere; all of it on standard error."""
 
 from __future__ import annotations
 
 import sys
-from types import TracebackType
 from typing import Any
 
 from rich.console import Console
@@ -38,9 +36,7 @@ class Screen:
             self._bar.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._has_bar:
             self._bar.stop()
 
@@ -68,8 +64,7 @@ class Screen:
         self._print(f"{stage:<8} {took:>10}   {in_words(summary)}")
 
     def setting_event(self, name: str, state: str, about: dict[str, Any]) -> None:
-        """A setting of an accuracy study is "done", "kept" or "skipped": one line. What the budget leaves out is
-        printed at the end."""
+        """A setting of a study is "done", "kept" or "skipped": one line, but for what the budget leaves out."""
         if about.get("beyond"):
             return
         took = f"{about['seconds']:.2f} s" if "seconds" in about else state

@@ -4,6 +4,8 @@
 - :func:`site_map`: the sites, coloured by score, numbered by rank;
 - :func:`site_view`: what one site sees or misses; :func:`pipeline.report.plan.shared_scale` is the colour scale that
   such figures share.
+
+Names of sites are placed so that they hide little.
 """
 
 from __future__ import annotations

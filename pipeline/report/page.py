@@ -53,17 +53,7 @@ def inputs(work: Workspace) -> StageInputs:
     """The artefacts by hash, the summaries and costs of the earlier stages, and the settings that are shown."""
     scenario, stages = work.scenario, _recorded(work.folder)
     read = ["trajectories.parquet", "tpog.parquet", "statics.ply", "scores.parquet"]
-    shown = {
-        "name": scenario.name,
-        "description": scenario.description,
-        "seed": scenario.seed,
-        "roi": scenario.roi.model_dump(mode="json"),
-        "frame_period_s": scenario.traffic.frame_period_s,
-        "vehicles": scenario.traffic.vehicles,
-        "gamma": repr(scenario.score.gamma),
-        "effects": scenario.effects.model_dump(mode="json"),
-    }
-    settings: dict[str, Any] = {"shown": shown, "keep": scenario.scan.keep}
+    settings: dict[str, Any] = {"shown": _shown(scenario), "keep": scenario.scan.keep}
     hashes: dict[str, str] = {}
     if scenario.scan.keep:
         read.append("scans.parquet")
@@ -79,6 +69,19 @@ def inputs(work: Workspace) -> StageInputs:
     }
     costs = {name: [stage.cost.seconds, stage.cost.peak_mb] for name, stage in stages.items()}
     return StageInputs(settings, hashes, {"costs": costs, "summaries": summaries})
+
+
+def _shown(scenario: Scenario) -> dict[str, Any]:
+    return {
+        "name": scenario.name,
+        "description": scenario.description,
+        "seed": scenario.seed,
+        "roi": scenario.roi.model_dump(mode="json"),
+        "frame_period_s": scenario.traffic.frame_period_s,
+        "vehicles": scenario.traffic.vehicles,
+        "gamma": repr(scenario.score.gamma),
+        "effects": scenario.effects.model_dump(mode="json"),
+    }
 
 
 def _recorded(folder: Path) -> dict[str, StageRecord]:

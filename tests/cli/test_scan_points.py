@@ -31,12 +31,12 @@ def clouds(out: Path) -> dict[str, bytes]:
 def test_the_cloud_is_what_the_scan_returned(mini: Path, egvs: Call, out: Path, format_: str) -> None:
     assert egvs("scan", mini, "--out", out, "--points", "pole_b", "--cloud", format_)[0] == 0
     assert list(clouds(out)) == [f"scan_pole_b.{format_}"]
-    found, dropped = read_points(out / f"scan_pole_b.{format_}", "here")
+    points_m, dropped = read_points(out / f"scan_pole_b.{format_}", "here")
     rows = [row for row in pipeline.read_scans(out / "scans.parquet").to_pylist() if row["site"] == "pole_b"]
     returns = np.array([[row["dx_m"], row["dy_m"], row["dz_m"]] for row in rows if row["returned"]])
     assert dropped == 0
     assert 100 < len(returns) < len(rows)
-    assert np.array_equal(found, returns + POSITION_M["pole_b"])
+    assert np.array_equal(points_m, returns + POSITION_M["pole_b"])
 
 
 def test_ply_is_the_default_and_sites_may_be_several(mini: Path, egvs: Call, out: Path) -> None:

@@ -302,8 +302,8 @@ def test_what_sites_see_agrees_with_their_scores(made):
     rows = {row["site"]: row for row in read_scores(out / "scores.parquet").to_pylist()}
     work = Workspace(about, out)
     scorer = Scorer(scene_of(work), tpog)
-    for found in scans(work, ["north", "west"]):
-        name, crossed = found.site.name, scorer.hits(found.beams).ravel()[field.cells] > 0
+    for site_scan in scans(work, ["north", "west"]):
+        name, crossed = site_scan.site.name, scorer.hits(site_scan.beams).ravel()[field.cells] > 0
         assert field.per_cell_bit[crossed].sum() / field.per_cell_bit.sum() == pytest.approx(rows[name]["entropy_seen"])
         if rows[name]["rank"] in (1, 4):
             assert f"sees {crossed.sum():,} of {len(crossed):,} uncertain voxels" in text
@@ -410,16 +410,16 @@ def decoded(png):
     """Palette indices of an indexed PNG in a data URI, rows from the top."""
     data = base64.b64decode(png.partition(",")[2])
     assert data[:8] == b"\x89PNG\r\n\x1a\n"
-    at, found = 8, {}
+    at, chunks = 8, {}
     while at < len(data):
         size, name = int.from_bytes(data[at : at + 4], "big"), data[at + 4 : at + 8]
         body, check = data[at + 8 : at + 8 + size], data[at + 8 + size : at + 12 + size]
         assert zlib.crc32(name + body) == int.from_bytes(check, "big")
-        found[name] = body
+        chunks[name] = body
         at += 12 + size
-    width, height = (int.from_bytes(found[b"IHDR"][i : i + 4], "big") for i in (0, 4))
-    rows = np.frombuffer(zlib.decompress(found[b"IDAT"]), dtype=np.uint8).reshape(height, width + 1)
-    assert not rows[:, 0].any() and len(found[b"PLTE"]) <= 768
+    width, height = (int.from_bytes(chunks[b"IHDR"][i : i + 4], "big") for i in (0, 4))
+    rows = np.frombuffer(zlib.decompress(chunks[b"IDAT"]), dtype=np.uint8).reshape(height, width + 1)
+    assert not rows[:, 0].any() and len(chunks[b"PLTE"]) <= 768
     return rows[:, 1:]
 
 
@@ -516,8 +516,8 @@ def test_the_accuracy_study_is_shown_where_there_is_one(mini, tmp_path, egvs, mo
 
     assert egvs("run", mini, "--out", out)[0] == 0
     assert not shown()
-    code, printed, said = egvs("accuracy", mini, "--out", out)
-    assert code == 0, said
+    code, printed, error = egvs("accuracy", mini, "--out", out)
+    assert code == 0, error
     assert printed.splitlines()[-1] == str(out / "report.html")
     text = (out / "report.html").read_text()
     assert f"data:image/png;base64,{base64.b64encode((out / 'accuracy.png').read_bytes()).decode()}" in text
@@ -562,6 +562,6 @@ def test_a_damaged_study_is_named(mini, tmp_path, egvs):
         {name: [] for name in tables.schemas.arrow_schema("scores").names},
         {"schema": 1},
     )
-    code, _, said = egvs("run", mini, "--out", out)
+    code, _, error = egvs("run", mini, "--out", out)
     assert code == 2
-    assert "accuracy.parquet: is no accuracy study; remove it, or run egvs accuracy again" in said
+    assert "accuracy.parquet: is no accuracy study; remove it, or run egvs accuracy again" in error
