@@ -1,6 +1,7 @@
 """The plain scene, the scene with one named effect at a time, and with all of them: what each changes, and costs.
 
-Each is a run like any other, in a folder of its own; stages that an effect does not touch come from the store."""
+Each is a run like any other, in a folder of its own; stages that an effect does not touch come from the store.
+"""
 
 from __future__ import annotations
 
@@ -36,20 +37,17 @@ class Change:
 
 
 def ablation(scenario: Scenario, out: Path, *, jobs: int | None = None, progress: Progress = silent) -> list[Change]:
-    """Run the plain scene, each named effect alone, and all together, under ``out / "ablation"``; a run is resumed as
-    any other."""
+    """Run the plain scene, each effect alone, and all together, under ``out / "ablation"``; resumed as any run."""
     every = scenario.effects
     variants = {"none": every.only(), **{name: every.only(name) for name in every.named}}
     if len(every.named) > 1:
         variants["all"] = every
     changes = []
-    for name, named in variants.items():
+    for name, effects in variants.items():
         folder = out / "ablation" / name
-        record = workflow.run(scenario.with_effects(named), folder, jobs=jobs, progress=progress)
+        record = workflow.run(scenario.with_effects(effects), folder, jobs=jobs, progress=progress)
         seconds = sum(record.stages[stage].cost.seconds for stage in RANKING)
         scores = read_scores(folder / "scores.parquet")
-        names = tuple(scores["site"].to_pylist())
-        changes.append(
-            Change(name, seconds, names, tuple(scores["egvs"].to_pylist()), tuple(scores["rank"].to_pylist()))
-        )
+        sites, egvs, ranks = (tuple(scores[column].to_pylist()) for column in ("site", "egvs", "rank"))
+        changes.append(Change(name, seconds, sites, egvs, ranks))
     return changes

@@ -3,12 +3,14 @@
 Steps: run the scenario, then a reference whose traffic is watched many times as long, then one setting after another
 (:mod:`pipeline.studies.settings`), within a budget of seconds; repeat every stage of every setting, all settings in
 turn, so that a drift of the machine hits all alike; compare (:mod:`pipeline.studies.comparison`); recommend; write
-``accuracy.parquet`` and ``accuracy.png``. Errors are deterministic; seconds are measured."""
+``accuracy.parquet`` and ``accuracy.png``. Errors are deterministic; seconds are measured.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from time import perf_counter
@@ -74,18 +76,6 @@ class AccuracyStudy:
     empty: bool = False
 
 
-@dataclass
-class _Budget:
-    """The budget."""
-
-    budget_s: float
-    start: float = field(default_factory=perf_counter)
-
-    @property
-    def left_s(self) -> float:
-        return self.budget_s - (perf_counter() - self.start)
-
-
 def _unheard(_setting: str, _state: str, _about: dict[str, Any]) -> None:
     """A :data:`SettingListener` that says nothing."""
 
@@ -124,106 +114,161 @@ def study(
         runner = SettingRunner(path, sets, out, jobs, progress)
         scenario = runner.scenario(OWN)
         _check(scenario, seeds)
-        result = _study(runner, scenario, out, float(tolerance), _Budget(budget_s), progress, listener)
+        result = _Work(runner, scenario, budget_s, progress, listener).study(out, float(tolerance))
         report = refresh_report(out)
         written = result.files if report is None else (*result.files, report)
-        checked = between_seeds(runner, scenario, seeds, listener) if seeds else None
-        return replace(result, files=written, seeds=checked)
+        checked_seeds = between_seeds(runner, scenario, seeds, listener) if seeds else None
+        return replace(result, files=written, seeds=checked_seeds)
 
 
 def _check(scenario: Scenario, seeds: int) -> None:
     if seeds and scenario.traffic.fcd is not None:
-        raise InputError(
-            "--seeds", "the traffic is a finished file, the same for each seed", "network or sumocfg in [traffic]"
-        )
+        found = "the traffic is a finished file, the same for each seed"
+        raise InputError("--seeds", found, "network or sumocfg in [traffic]")
     if seeds == 1:
         raise InputError("--seeds", "1", "at least 2")
     if scenario.traffic.fcd is None and scenario.tpog.blocks == 1:
-        place = f"{scenario.file}: tpog.blocks"
-        raise InputError(
-            place, "1, so that nothing tells how far a score may be off", "10, or another divisor of traffic.frames"
+        found = "1, so that nothing tells how far a score may be off"
+        raise InputError(f"{scenario.file}: tpog.blocks", found, "10, or another divisor of traffic.frames")
+
+
+@dataclass
+class _Work:
+    """A study at work: ``scores`` are those of the settings that were run, ``skipped`` says why others were not."""
+
+    runner: SettingRunner
+    scenario: Scenario
+    budget_s: float
+    progress: Progress
+    listener: SettingListener
+    scores: dict[str, SettingScores] = field(default_factory=dict)
+    skipped: dict[str, str] = field(default_factory=dict)
+    start: float = field(default_factory=perf_counter)
+
+    @property
+    def left_s(self) -> float:
+        """What is left of the budget."""
+        return self.budget_s - (perf_counter() - self.start)
+
+    def study(self, out: Path, tolerance: float) -> AccuracyStudy:
+        """All of it but the seeds, written into ``out``."""
+        runner, scenario, scores = self.runner, self.scenario, self.scores
+        settings = []
+        for setting in study_settings.settings(scenario):
+            if (fault := _fault(runner, setting)) is None:
+                settings.append(setting)
+            else:
+                self._skip(setting, fault)
+        self._warm_up(settings)
+        own = scores[SCENARIO] = runner.run(OWN)
+        times = _times(runner, scenario, own, self.budget_s)
+        longest = [study_settings.reference(scenario, times)] if times > 1 else []
+        settings = [s for s in settings if not longest or _is_shorter(runner, s, longest[0])]
+        compared = self._run_all([*longest, *settings])
+        repeated = self._repeat(compared)
+        could_last_longer = scenario.traffic.fcd is None
+        rows = [comparison.compare(runner, s, scores, could_last_longer=could_last_longer) for s in compared]
+        rows = comparison.judge(rows, tolerance)
+        best = next((row for row in rows if row.recommended), None)
+        written = (out / "accuracy.parquet", out / "accuracy.png")
+        times = times if REFERENCE in scores else 1
+        _write(written[0], scenario, rows, own, times, tolerance)
+        front_figure.draw_figure(rows, tolerance, scenario.name, written[1])
+        neighbours = scores.get(REFERENCE, own).neighbours
+        return AccuracyStudy(
+            rows,
+            self.skipped,
+            tolerance,
+            best,
+            times,
+            neighbours,
+            written,
+            repeated=repeated,
+            empty=not any(own.shares),
         )
 
+    def _skip(self, setting: Setting, why: str) -> None:
+        self.skipped[setting.name] = why
+        self.listener(setting.name, "skipped", {"why": why})
 
-def _study(
-    runner: SettingRunner,
-    scenario: Scenario,
-    out: Path,
-    tolerance: float,
-    budget: _Budget,
-    progress: Progress,
-    listener: SettingListener,
-) -> AccuracyStudy:
-    settings, skipped = _sound(runner, study_settings.settings(scenario), listener)
-    _warm_up(runner, settings, budget)
-    scores = {SCENARIO: runner.run(OWN)}
-    times = _times(runner, scenario, scores[SCENARIO], budget.budget_s)
-    longest = [study_settings.reference(scenario, times)] if times > 1 else []
-    settings = [s for s in settings if not longest or _is_shorter(runner, s, longest[0])]
-    compared, more = _run_all(runner, [*longest, *settings], scores, budget, listener)
-    repeated = _repeat(runner, compared, scores, budget, progress)
-    could_last_longer = scenario.traffic.fcd is None
-    rows = comparison.judge(
-        [comparison.compare(runner, s, scores, could_last_longer=could_last_longer) for s in compared], tolerance
-    )
-    best = next((row for row in rows if row.recommended), None)
-    written = (out / "accuracy.parquet", out / "accuracy.png")
-    if REFERENCE not in scores:
-        times = 1
-    _write(written[0], scenario, rows, scores[SCENARIO], times, tolerance)
-    front_figure.draw_figure(rows, tolerance, scenario.name, written[1])
-    neighbours = scores.get(REFERENCE, scores[SCENARIO]).neighbours
-    empty = not any(scores[SCENARIO].shares)
-    return AccuracyStudy(
-        rows, skipped | more, tolerance, best, times, neighbours, written, repeated=repeated, empty=empty
-    )
+    def _warm_up(self, settings: list[Setting]) -> None:
+        """Compile what the settings still to be run need: on the shortest traffic, and with each effect switched on."""
+        wanted = [setting for setting in settings if self.runner.known(setting) is None]
+        if (own := self.runner.known(OWN)) is not None:
+            expected = _Expected(self.runner, own)
+            wanted = [setting for setting in wanted if expected.seconds(setting) <= self.left_s]
+        if not wanted:
+            return
+        shortest = min((s for s in settings if s.kind != MEASURES), key=lambda s: _steps(self.runner.scenario(s)))
+        switched_on = (s for s in wanted if s.name.startswith(study_settings.WITH))
+        for setting in (shortest, *(replace(s, overrides=(*shortest.overrides, *s.overrides)) for s in switched_on)):
+            with suppress(EgvsError):  # named when it is run
+                self.runner.warm_up(setting)
+
+    def _run_all(self, settings: list[Setting]) -> list[Setting]:
+        """Run one setting after another as long as the budget lasts, and return those; what is known costs nothing.
+
+        Cheap ones go first; of those that cost about the same (within a factor of two), approximations.
+        """
+        runner, compared, expected = self.runner, [], _Expected(self.runner, self.scores[SCENARIO])
+        known = {s.name: runner.known(s) for s in settings}
+        free = {SCENARIO, REFERENCE, *(name for name, scores in known.items() if scores)}
+        needs_s = {s.name: 0.0 if s.name in free else expected.seconds(s) for s in settings}
+        in_turn = sorted(settings, key=lambda s: (math.frexp(needs_s[s.name])[1], s.kind == MEASURES, needs_s[s.name]))
+        for setting in in_turn:
+            name = setting.name
+            if needs_s[name] > max(self.left_s, 0.0):
+                self.skipped[name] = BEYOND
+                self.listener(name, "skipped", {"why": f"about {needs_s[name]:.0f} s, {BEYOND}", "beyond": True})
+                continue
+            try:
+                self.scores[name] = known[name] or runner.run(setting)
+            except EgvsError as error:
+                self._skip(setting, str(error))
+                continue
+            compared.append(setting)
+            seconds = sum(runner.medians(self.scores[name]).values())
+            self.listener(name, "kept" if known[name] else "done", {"seconds": seconds})
+        return compared
+
+    def _repeat(self, settings: list[Setting]) -> int:
+        """Time every stage again, all in turn, cheap ones first, while the budget lasts; returns how many were.
+
+        One that was fetched has not been timed yet.
+        """
+        stages: dict[tuple[str, str], Setting] = {}
+        for setting in settings:
+            for name in RANKING:
+                stages.setdefault((name, self.scores[setting.name].stages[name]), setting)
+        took = {task: min(self.runner.times(*task).seconds) for task in stages}
+        done = 0
+        for turn in range(1, REPEATS + 1):
+            for (name, key), setting in sorted(stages.items(), key=lambda item: took[item[0]]):
+                if self.runner.times(name, key).repeats < turn and 1.2 * took[name, key] + 0.2 < self.left_s:
+                    self.runner.again(name, setting, self.scores[setting.name])
+                    done += 1
+                    self.progress("repeats", done, 0)
+        return done
+
+
+def _fault(runner: SettingRunner, setting: Setting) -> str | None:
+    """Why a setting is no scenario; None where it is one."""
+    try:
+        runner.scenario(setting)
+    except InputError as error:
+        return str(error)
+    return None
 
 
 def _is_shorter(runner: SettingRunner, setting: Setting, longest: Setting) -> bool:
     """Whether a setting is worth comparing with the reference: not the same, and not watched for longer."""
-    ours_s, its_s = (
-        traffic.frames * traffic.frame_period_s for traffic in (runner.scenario(s).traffic for s in (setting, longest))
-    )
-    return setting.overrides != longest.overrides and ours_s <= its_s * (1 + 1e-9)
-
-
-def _sound(
-    runner: SettingRunner, settings: list[Setting], listener: SettingListener
-) -> tuple[list[Setting], dict[str, str]]:
-    """The settings that are scenarios, and why others are none."""
-    sound, skipped = [], {}
-    for setting in settings:
-        try:
-            runner.scenario(setting)
-        except InputError as error:
-            skipped[setting.name] = str(error)
-            listener(setting.name, "skipped", {"why": str(error)})
-        else:
-            sound.append(setting)
-    return sound, skipped
-
-
-def _warm_up(runner: SettingRunner, settings: list[Setting], budget: _Budget) -> None:
-    """Compile what the settings still to be run need: once on the shortest traffic, and with each effect that they
-    switch on."""
-    wanted = [setting for setting in settings if runner.known(setting) is None]
-    if (base := runner.known(OWN)) is not None:
-        expected = _Expected(runner, base)
-        wanted = [setting for setting in wanted if expected.seconds(setting) <= budget.left_s]
-    if not wanted:
-        return
-    shortest = min((s for s in settings if s.kind != MEASURES), key=lambda s: _steps(runner.scenario(s)))
-    switched_on = (s for s in wanted if s.name.startswith(study_settings.WITH))
-    for setting in (shortest, *(replace(s, overrides=(*shortest.overrides, *s.overrides)) for s in switched_on)):
-        try:
-            runner.warm_up(setting)
-        except EgvsError:
-            continue  # named when it is run
+    ours, its = (runner.scenario(s).traffic for s in (setting, longest))
+    watched_s = ours.frames * ours.frame_period_s
+    return setting.overrides != longest.overrides and watched_s <= its.frames * its.frame_period_s * (1 + 1e-9)
 
 
 def _times(runner: SettingRunner, scenario: Scenario, own: SettingScores, budget_s: float) -> int:
-    """How long the reference watches: a power of two that fits a share of the budget; as before, when a study is
-    repeated."""
+    """How long the reference watches: a power of two that fits a share of the budget; as before in a repeated study."""
     if scenario.traffic.fcd is not None:
         return 1
     kept = runner.note("study")
@@ -232,46 +277,11 @@ def _times(runner: SettingRunner, scenario: Scenario, own: SettingScores, budget
     once_s = sum(min(runner.times(name, own.stages[name]).seconds) for name in ("traffic", "tpog"))
     times = LONGEST
     while times > 1 and (
-        times * once_s > SHARE * budget_s or _sound(runner, [study_settings.reference(scenario, times)], _unheard)[1]
+        times * once_s > SHARE * budget_s or _fault(runner, study_settings.reference(scenario, times))
     ):
         times //= 2
     runner.keep_note("study", {"scenario": own.stages, "budget_s": budget_s, "times": times})
     return times
-
-
-def _run_all(
-    runner: SettingRunner,
-    settings: list[Setting],
-    scores: dict[str, SettingScores],
-    budget: _Budget,
-    listener: SettingListener,
-) -> tuple[list[Setting], dict[str, str]]:
-    """Run one setting after another as long as the budget lasts; those that are known cost nothing.
-
-    Cheap ones go first; of those that cost about the same (within a factor of two), approximations.
-    """
-    compared, skipped, expected = [], {}, _Expected(runner, scores[SCENARIO])
-    known = {setting.name: runner.known(setting) for setting in settings}
-    needs_s = {
-        s.name: 0.0 if known[s.name] or s.name in (SCENARIO, REFERENCE) else expected.seconds(s) for s in settings
-    }
-    for setting in sorted(
-        settings, key=lambda s: (math.frexp(needs_s[s.name])[1], s.kind == MEASURES, needs_s[s.name])
-    ):
-        if needs_s[setting.name] > max(budget.left_s, 0.0):
-            skipped[setting.name] = BEYOND
-            listener(setting.name, "skipped", {"why": f"about {needs_s[setting.name]:.0f} s, {BEYOND}", "beyond": True})
-            continue
-        try:
-            scores[setting.name] = known[setting.name] or runner.run(setting)
-        except EgvsError as error:
-            skipped[setting.name] = str(error)
-            listener(setting.name, "skipped", {"why": str(error)})
-            continue
-        compared.append(setting)
-        seconds = sum(runner.medians(scores[setting.name]).values())
-        listener(setting.name, "kept" if known[setting.name] else "done", {"seconds": seconds})
-    return compared, skipped
 
 
 class _Expected:
@@ -307,30 +317,6 @@ def _traffic(scenario: Scenario) -> tuple[object, ...]:
 def _steps(scenario: Scenario) -> float:
     traffic = scenario.traffic
     return (traffic.warmup_s + traffic.frames * traffic.frame_period_s) / traffic.step_s
-
-
-def _repeat(
-    runner: SettingRunner,
-    settings: list[Setting],
-    scores: dict[str, SettingScores],
-    budget: _Budget,
-    progress: Progress,
-) -> int:
-    """Time every stage again, all in turn, cheap ones first, while the budget lasts; returns how many were. One that
-    was fetched has not been timed yet."""
-    stages: dict[tuple[str, str], Setting] = {}
-    for setting in settings:
-        for name in RANKING:
-            stages.setdefault((name, scores[setting.name].stages[name]), setting)
-    took = {task: min(runner.times(*task).seconds) for task in stages}
-    done = 0
-    for turn in range(1, REPEATS + 1):
-        for (name, key), setting in sorted(stages.items(), key=lambda item: took[item[0]]):
-            if runner.times(name, key).repeats < turn and 1.2 * took[name, key] + 0.2 < budget.left_s:
-                runner.again(name, setting, scores[setting.name])
-                done += 1
-                progress("repeats", done, 0)
-    return done
 
 
 def _write(path: Path, scenario: Scenario, rows: list[Row], own: SettingScores, times: int, tolerance: float) -> None:

@@ -8,7 +8,8 @@ where b is the setting's best site. A setting of little traffic may be right by 
 its error and its own standard error (:mod:`pipeline.scoring.uncertainty`), and the recommendation is the cheapest
 setting that is judged to be within the tolerance. Where the traffic is a finished file, nothing longer is to be had,
 and the error alone is judged. A setting that measures something else (voxel, gamma, effects) has no error: it is
-compared with the scenario itself, on the same traffic, by ranking and regret."""
+compared with the scenario itself, on the same traffic, by ranking and regret.
+"""
 
 from __future__ import annotations
 
@@ -65,7 +66,8 @@ def compare(
 ) -> Row:
     """Compare one setting with the others, whose ``scores`` are given by name.
 
-    ``could_last_longer``: so could the traffic, so that its shortness is an error that time can mend."""
+    ``could_last_longer``: so could the traffic, so that its shortness is an error that time can mend.
+    """
     its, own = scores[setting.name], scores[SCENARIO]
     against = own if setting.kind == MEASURES else scores.get(REFERENCE, own)
     beside = scores.get(setting.beside, own)
@@ -104,8 +106,7 @@ def compare(
 
 
 def _largest_se(scores: SettingScores) -> float:
-    """Largest standard error over the sites, as a share of the site's score; not a number where the TPOG has one
-    block."""
+    """Largest standard error, as a share of the site's score; not a number where the TPOG has one block."""
     shares = np.array(scores.shares)
     return float((np.array(scores.share_ses) / np.where(shares > 0, shares, np.inf)).max(initial=0.0))
 
@@ -118,8 +119,7 @@ def relative(found: NDArray[np.float64], reference: NDArray[np.float64]) -> NDAr
 
 
 def agreement(found: NDArray[np.float64], reference: NDArray[np.float64], kind: str) -> float:
-    """Kendall's tau-b or Spearman's rho with ties shared; 1 where both tell nothing apart, 0 where one alone does
-    not."""
+    """Kendall's tau-b or Spearman's rho, ties shared; 1 where both tell nothing apart, 0 where one alone does not."""
     from scipy.stats import kendalltau, spearmanr
 
     flat = [len(np.unique(values)) < 2 for values in (found, reference)]
@@ -155,8 +155,5 @@ def judge(rows: list[Row], tolerance: float) -> list[Row]:
 
 def _beats(one: Row, other: Row) -> bool:
     """Whether ``one`` is as good in time and in error, and better in one of them."""
-    return (
-        (one.seconds, one.judged) != (other.seconds, other.judged)
-        and one.seconds <= other.seconds
-        and one.judged <= other.judged
-    )
+    its, others = (one.seconds, one.judged), (other.seconds, other.judged)
+    return its != others and its[0] <= others[0] and its[1] <= others[1]

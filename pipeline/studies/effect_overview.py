@@ -1,7 +1,8 @@
 """Which effects exist, which of them a scenario calls for, and what an accuracy study says that each costs.
 
 Steps of :func:`called`: build the static world in memory; ask every named effect whether it can change the result; say
-for each effect whether it is on, and why."""
+for each effect whether it is on, and why.
+"""
 
 from __future__ import annotations
 
@@ -67,8 +68,7 @@ def called(scenario: Scenario) -> list[Call]:
 
 
 def prices(scenario: Scenario, out: Path) -> dict[str, Price] | None:
-    """What ``egvs accuracy`` found of each effect, from ``out / "accuracy.parquet"``; None when it was not run on this
-    scenario."""
+    """What ``egvs accuracy`` left in ``out`` of each effect; None where it was not run on this scenario."""
     study = read_accuracy(out / "accuracy.parquet")
     if study is None or study[1]["inputs"] != files.hash_of(inputs_of(scenario)):
         return None
@@ -84,21 +84,21 @@ def prices(scenario: Scenario, out: Path) -> dict[str, Price] | None:
 def _call(name: str, scene: Scene) -> Call:
     kind, named = registry.effect_class(name), scene.scenario.effects.named
 
-    def is_(state: str, why: str) -> Call:
+    def call(state: str, why: str) -> Call:
         return Call(name, kind.STAGE, kind.KIND, state, why, kind.SOURCE)
 
     if issubclass(kind, Traffic) and kind.SELF_ACTING:
         on, why = kind(kind.Model()).acts(scene.scenario)
-        return is_("on" if on else "off", why)
+        return call("on" if on else "off", why)
     if name not in named:
-        return is_("off", "not named")
+        return call("off", "not named")
     effect = kind(named[name])
     if (idle := effect.why_idle(scene)) is not None:
-        return is_("skipped", f"named, but {idle}: the result is the same without it")
+        return call("skipped", f"named, but {idle}: the result is the same without it")
     if (refusal := effect.refusal(scene)) is not None:
-        return is_("refused", str(refusal))
+        return call("refused", str(refusal))
     values = ", ".join(f"{key} = {value}" for key, value in effect.parameters.model_dump(mode="json").items())
-    return is_("on", f"named, with {values}" if values else "named")
+    return call("on", f"named, with {values}" if values else "named")
 
 
 def _first_line(kind: type) -> str:

@@ -155,15 +155,12 @@ class SettingRunner:
 
     def again(self, name: str, setting: Setting, scores: SettingScores) -> None:
         """Run one stage of a known setting once more, for its time; RunError when it writes other bytes."""
-        with self._workshop(self.scenario(setting)) as work:
-            for before in RANKING[: RANKING.index(name)]:
-                self._bring(before, work)
+        with self._workshop(self.scenario(setting), RANKING[: RANKING.index(name)]) as work:
             made = self._make(name, work, stages.inputs(name, work))
             self._note_times(name, scores.stages[name], work, made, measured=True)
 
     def warm_up(self, setting: Setting) -> None:
-        """Run all stages once, with a single site, and forget it: what is compiled or loaded first is compiled and
-        loaded then."""
+        """Run all stages once, with a single site, and forget it, so that nothing is compiled or loaded later."""
         with self._workshop(_with_one_site(self.scenario(setting))) as work:
             for name in RANKING:
                 stages.make(name, work, stages.inputs(name, work))
@@ -184,16 +181,12 @@ class SettingRunner:
 
     def tpog(self, setting: Setting) -> Tpog:
         """The TPOG of a setting."""
-        with self._workshop(self.scenario(setting)) as work:
-            for name in RANKING[: RANKING.index("tpog") + 1]:
-                self._bring(name, work)
+        with self._workshop(self.scenario(setting), RANKING[: RANKING.index("tpog") + 1]) as work:
             return read_tpog(work.path("tpog.parquet"))
 
     def scores_against(self, setting: Setting, tpog: Tpog) -> list[float]:
         """What the scans of a setting score against another TPOG on its grid, in the order of the sites."""
-        with self._workshop(self.scenario(setting)) as work:
-            for name in RANKING:
-                self._bring(name, work)
+        with self._workshop(self.scenario(setting), RANKING) as work:
             scorer = Scorer(scene_of(work), tpog, work.path("trajectories.parquet"))
             return [scorer.score(scan.beams).egvs for scan in scans(work)]
 
@@ -210,7 +203,8 @@ class SettingRunner:
     def _bring(self, name: str, work: Workspace, observe: Callable[[ScoredSite], None] | None = None) -> str:
         """A stage's artefacts into a workshop that holds those before, from the store where it has them; its key.
 
-        ``observe`` hears of each site where the score stage had to be made."""
+        ``observe`` hears of each site where the score stage had to be made.
+        """
         inputs = stages.inputs(name, work)
         made, fetched = fetch_or_make(
             name, work, inputs.key, self._store, lambda: self._make(name, work, inputs, observe), link=True
@@ -229,20 +223,18 @@ class SettingRunner:
     def _note_times(self, name: str, key: str, work: Workspace, made: Made, *, measured: bool) -> None:
         """Add what a stage cost: measured here, or by whoever made it."""
         path = self._times(name, key)
-        size = sum(work.path(artefact).stat().st_size for artefact in made.artefacts)
-        kept: dict[str, Any] = {
-            "made": asdict(made.cost), "measured": [], "bytes": size, "sha256": made.artefacts
-        }  # fmt: skip
+        size, cost = sum(work.path(name).stat().st_size for name in made.artefacts), asdict(made.cost)
         with _as_kept(path):
-            kept = _read(path) if path.is_file() else kept
+            first: dict[str, Any] = {"made": cost, "measured": [], "bytes": size, "sha256": made.artefacts}
+            kept = _read(path) if path.is_file() else first
             if kept["sha256"] != made.artefacts:
                 raise RunError(f"{name}: a repeat wrote other bytes than the first run; see {path}")
             if measured:
-                kept["measured"].append(asdict(made.cost))
+                kept["measured"].append(cost)
         files.write_text(path, json.dumps(kept) + "\n")
 
     def _result(self, setting: Setting) -> Path:
-        """Where a setting's result is kept; its files are read once."""
+        """Where a setting's result is kept; the scenario's files are read once for it."""
         if setting not in self._results:
             read = {**inputs_of(self.scenario(setting)), "weight": setting.weight}
             self._results[setting] = self._kept / f"{files.hash_of(read)[:16]}.json"
@@ -252,9 +244,13 @@ class SettingRunner:
         return self._kept / "times" / f"{name}-{key[:16]}.json"
 
     @contextmanager
-    def _workshop(self, scenario: Scenario) -> Iterator[Workspace]:
+    def _workshop(self, scenario: Scenario, ready: Sequence[str] = ()) -> Iterator[Workspace]:
+        """A folder to run a scenario in, where the artefacts of the stages ``ready`` lie."""
         with tempfile.TemporaryDirectory(prefix=".work-", dir=self._kept) as folder:
-            yield Workspace(scenario, Path(folder), jobs=self._jobs, progress=self._progress)
+            work = Workspace(scenario, Path(folder), jobs=self._jobs, progress=self._progress)
+            for name in ready:
+                self._bring(name, work)
+            yield work
 
 
 @contextmanager
@@ -263,14 +259,12 @@ def _as_kept(path: Path) -> Iterator[None]:
     try:
         yield
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(
-            path, f"is not as the study wrote it ({error})", "remove it, and run the study again"
-        ) from None
+        found = f"is not as the study wrote it ({error})"
+        raise InputError(path, found, "remove it, and run the study again") from None
 
 
 def _read(path: Path) -> Any:
-    with _as_kept(path):
-        return json.loads(path.read_text(encoding="utf-8"))
+    return json.loads(path.read_text(encoding="utf-8"))
 
 
 def _sound(scores: SettingScores) -> SettingScores:
@@ -303,8 +297,7 @@ def _with_one_site(scenario: Scenario) -> Scenario:
 
 
 def _scores(work: Workspace, keys: dict[str, str], weight: float, scored: list[ScoredSite]) -> SettingScores:
-    """What came of all stages in a workspace; ``scored`` are the sites as the score stage scored them, none where it
-    was fetched."""
+    """What came of all stages; ``scored`` are the sites as the score stage scored them, none where it was fetched."""
     table = tables.read(work.path("scores.parquet"), "scores")[0].to_pydict()
     tpog, gamma = read_tpog(work.path("tpog.parquet")), work.scenario.score.gamma
     names, scores = table["site"], np.array(table["egvs"])
@@ -333,8 +326,6 @@ def _scores(work: Workspace, keys: dict[str, str], weight: float, scored: list[S
 
 def _neighbours(estimate: Estimate, names: list[str], frames: int) -> list[tuple[str, str, float, float]]:
     ranked = order(estimate.scores)
-    chances = estimate.beats(ranked[:-1], ranked[1:])
-    found = []
-    for (a, b), chance in zip(pairwise(ranked.tolist()), chances.tolist(), strict=True):
-        found.append((names[a], names[b], chance, frames * estimate.times_needed(a, b)))
-    return found
+    chances = estimate.beats(ranked[:-1], ranked[1:]).tolist()
+    pairs = zip(pairwise(ranked.tolist()), chances, strict=True)
+    return [(names[a], names[b], chance, frames * estimate.times_needed(a, b)) for (a, b), chance in pairs]

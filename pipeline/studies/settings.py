@@ -98,12 +98,11 @@ def is_default(scenario: Scenario, own: Scenario) -> bool:
 
 def settings(scenario: Scenario) -> list[Setting]:
     """All settings but the reference, the scenario's own first; the cheap and telling ones before the others."""
-    found = [OWN]
+    distinct: dict[tuple[object, ...], Setting] = {}
     watched = sorted(_watched(scenario), key=lambda setting: setting.steps)
-    for setting in (*_measures(scenario), *_quality(scenario), *_thinned(scenario), *watched):
-        if setting.overrides not in [other.overrides for other in found if other.without == setting.without]:
-            found.append(setting)
-    return found
+    for setting in (OWN, *_measures(scenario), *_quality(scenario), *_thinned(scenario), *watched):
+        distinct.setdefault((setting.overrides, setting.without), setting)
+    return list(distinct.values())
 
 
 def _watched(scenario: Scenario) -> Iterator[Setting]:
@@ -135,8 +134,7 @@ def _period_with(step_s: float, period_s: float) -> float | None:
 def _traffic(
     scenario: Scenario, knob: str, times: int, step_s: float | None, period_s: float | None
 ) -> Iterator[Setting]:
-    """Traffic ``times`` as long as the scenario's, stepped and watched so; nothing where times do not divide one
-    another."""
+    """Traffic ``times`` as long as the scenario's, so stepped and watched; nothing where times do not divide."""
     own, blocks = scenario.traffic, scenario.tpog.blocks
     step, period = step_s or own.step_s, period_s or own.frame_period_s
     frames = round(own.frames * own.frame_period_s * times / period / blocks) * blocks
@@ -163,13 +161,11 @@ def _divides(part: float, whole: float) -> bool:
 
 def _thinned(scenario: Scenario) -> Iterator[Setting]:
     """Every second and fourth azimuth, every second channel; weighted up."""
-    where = sites.of(scenario)
-    if any(site.points is not None for site in where):
+    candidates = sites.of(scenario)
+    if any(site.points is not None for site in candidates):
         return
-    used = [
-        resolve(name, scenario.sensors, f"{scenario.file}: sensors")
-        for name in dict.fromkeys(site.sensor for site in where)
-    ]
+    names = dict.fromkeys(site.sensor for site in candidates)
+    used = [resolve(name, scenario.sensors, f"{scenario.file}: sensors") for name in names]
     for factor in THINNED:
         if all(sensor.azimuths % factor == 0 for sensor in used):
             changes = [o for s in used for o in _sensor(scenario, s, factor, range(s.channels))]
@@ -202,11 +198,8 @@ def _sensor(scenario: Scenario, sensor: Sensor, factor: int, rings: range | list
     if own is None:
         values["range_m"] = sensor.range_m
     if own is None and scenario.effects.named:
-        optics = {
-            name: getattr(sensor, name)
-            for name in ("wavelength_nm", "divergence_mrad", "rated_range_m", "rated_reflectivity")
-        }
-        values |= {name: list(v) if isinstance(v, tuple) else v for name, v in optics.items() if v is not None}
+        names = ("wavelength_nm", "divergence_mrad", "rated_range_m", "rated_reflectivity")
+        values |= {name: value for name in names if (value := getattr(sensor, name)) is not None}
     for key, value in values.items():
         yield f"sensors.{sensor.name}.{key}={json.dumps(value)}"
 
@@ -261,8 +254,7 @@ def _takes(name: str, parameters: dict[str, object]) -> bool:
 
 
 def _quality(scenario: Scenario) -> Iterator[Setting]:
-    """Each named effect's own knobs, which its class lists from cheap to fine as ``QUALITY``: a value for each
-    parameter."""
+    """Each named effect's own knobs, whose values its class lists from cheap to fine as ``QUALITY``."""
     for name, named in scenario.effects.named.items():
         effect, parameters = registry.make(name, named), named.model_dump(mode="json", exclude_unset=True)
         for key, values in effect.QUALITY.items():
