@@ -69,11 +69,8 @@ def read(path: Path, artefact: str, columns: list[str] | None = None) -> tuple[p
     InputError
         When the file is missing, corrupt, or does not have the artefact's columns and types.
     """
-    with reader(path, artefact) as (file, metadata):
-        try:
-            return file.read(columns=columns, use_threads=False), metadata
-        except (pa.ArrowInvalid, OSError) as error:
-            raise _corrupt(path, error) from None
+    with reader(path, artefact) as (file, metadata), _whole(path):
+        return file.read(columns=columns, use_threads=False), metadata
 
 
 @contextmanager
@@ -81,10 +78,8 @@ def reader(path: Path, artefact: str) -> Iterator[tuple[pq.ParquetFile, dict[str
     """Open an artefact to read its row groups one by one; checks as :func:`read` does."""
     if not path.is_file():
         raise InputError(path, "no such file", f"run the stage that makes {path.name} first")
-    try:
+    with _whole(path):
         file = pq.ParquetFile(path)
-    except (pa.ArrowInvalid, OSError) as error:
-        raise _corrupt(path, error) from None
     with file:
         _check_columns(path, artefact, file.schema_arrow)
         raw = (file.metadata.metadata or {}).get(_KEY)
@@ -95,10 +90,8 @@ def reader(path: Path, artefact: str) -> Iterator[tuple[pq.ParquetFile, dict[str
 
 def read_group(file: pq.ParquetFile, group: int, path: Path, columns: list[str] | None = None) -> pa.Table:
     """Read one row group of an open artefact."""
-    try:
+    with _whole(path):
         return file.read_row_group(group, columns=columns, use_threads=False)
-    except (pa.ArrowInvalid, OSError) as error:
-        raise _corrupt(path, error) from None
 
 
 def read_metadata(path: Path, artefact: str) -> dict[str, Any]:
@@ -107,16 +100,16 @@ def read_metadata(path: Path, artefact: str) -> dict[str, Any]:
         return metadata
 
 
-def _check_columns(path: Path, artefact: str, found: pa.Schema) -> None:
+def _check_columns(path: Path, artefact: str, schema: pa.Schema) -> None:
     needed = schemas.arrow_schema(artefact).names
     known = schemas.arrow_schema(artefact, schemas.optional_columns(artefact))
     for field in known:
-        if (index := found.get_field_index(field.name)) >= 0:
-            if found.field(index).type != field.type:
-                raise InputError(path, f"column '{field.name}' is {found.field(index).type}", f"{field.type}")
+        if (index := schema.get_field_index(field.name)) >= 0:
+            if schema.field(index).type != field.type:
+                raise InputError(path, f"column '{field.name}' is {schema.field(index).type}", f"{field.type}")
         elif field.name in needed:
             raise InputError(path, f"column '{field.name}' is missing", f"the columns {', '.join(needed)}")
-    if extra := sorted(set(found.names) - set(known.names)):
+    if extra := sorted(set(schema.names) - set(known.names)):
         raise InputError(path, f"unknown columns {', '.join(extra)}", f"the columns {', '.join(needed)}")
 
 
@@ -167,5 +160,11 @@ def _is_sound(key: str, value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and value > 0
 
 
-def _corrupt(path: Path, error: Exception) -> InputError:
-    return InputError(path, f"cannot be read as Parquet ({str(error).splitlines()[0]})", "a whole file; make it again")
+@contextmanager
+def _whole(path: Path) -> Iterator[None]:
+    """What is read is a whole Parquet file; else InputError."""
+    try:
+        yield
+    except (pa.ArrowInvalid, OSError) as error:
+        found = f"cannot be read as Parquet ({str(error).splitlines()[0]})"
+        raise InputError(path, found, "a whole file; make it again") from None

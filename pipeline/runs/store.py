@@ -177,11 +177,11 @@ class Store:
 
     def entries(self) -> list[Entry]:
         """All that are sound, the one used last first."""
-        found = []
+        sound = []
         for folder in self._folders():
             with suppress(_Damaged):
-                found.append(_read(folder))
-        return sorted(found, key=lambda entry: entry.last_used, reverse=True)
+                sound.append(_read(folder))
+        return sorted(sound, key=lambda entry: entry.last_used, reverse=True)
 
     def prune(self, most_bytes: float) -> list[Entry]:
         """Remove those used longest ago until the others take at most ``most_bytes`` (below 0: all); those gone."""

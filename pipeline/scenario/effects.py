@@ -8,7 +8,6 @@ points ``egvs.effects``) bring models of their own, which are asked only when a 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import (
@@ -158,10 +157,8 @@ class VehicleParts(EffectParameters):
     def _fits(self) -> VehicleParts:
         joints = len(self.parts_m) - 1
         for key in ("hinges_m", "axles_m"):
-            if len(values := getattr(self, key)) not in (0, joints):
-                raise ValueError(
-                    f"{key} has {len(values)} values for {joints + 1} parts, {joints} are needed (or none)"
-                )
+            if (count := len(getattr(self, key))) not in (0, joints):
+                raise ValueError(f"{key} has {count} values for {joints + 1} parts, {joints} are needed (or none)")
         if list(self.hinges_m) != sorted(self.hinges_m):
             raise ValueError("hinges_m run back; they count from the front bumper")
         return self
@@ -218,21 +215,17 @@ class EffectsModel(StrictModel):
 
     @property
     def named(self) -> dict[str, EffectParameters]:
-        """The effects that the scenario names, in the order in which they are composed: this program's, then
-        others'."""
+        """The effects that the scenario names, in the order of their composition: this program's, then others'."""
         own = {name: getattr(self, name) for name in self.OWN}
         return {name: value for name, value in own.items() if value is not None} | self.__pydantic_extra__
 
     def only(self, *names: str) -> Self:
         """Of the named effects, these."""
-        return self._of({name: value for name, value in self.named.items() if name in names})
+        return self.model_validate({name: value for name, value in self.named.items() if name in names})
 
     def without(self, name: str) -> Self:
         """The named effects but one."""
-        return self._of({other: value for other, value in self.named.items() if other != name})
-
-    def _of(self, named: Mapping[str, EffectParameters]) -> Self:
-        return self.model_validate(dict(named))
+        return self.only(*(other for other in self.named if other != name))
 
     @model_validator(mode="after")
     def _check_others(self) -> Self:

@@ -41,27 +41,22 @@ def load(path: str | Path, overrides: Iterable[str] = ()) -> Scenario:
     values = _read(file, ())
     for override in overrides:
         if override.partition("=")[0].strip() == "extends":
-            raise InputError(
-                f"--set {override}", "a scenario is extended by its file alone", "extends = ... in a scenario.toml"
-            )
+            found = "a scenario is extended by its file alone"
+            raise InputError(f"--set {override}", found, "extends = ... in a scenario.toml")
         _lay_over(values, override)
     scenario = from_values(values, file.parent, str(file))
     source, idle = scenario.traffic.idle_keys()
     if idle:
-        raise InputError(
-            f"{file}: traffic", f"{', '.join(sorted(idle))} would act on nothing beside {source}", "remove it"
-        )
+        found = f"{', '.join(sorted(idle))} would act on nothing beside {source}"
+        raise InputError(f"{file}: traffic", found, "remove it")
     return scenario
 
 
 def _read(file: Path, heirs: tuple[Path, ...]) -> dict[str, Any]:
     """The values of a scenario file, laid over those of the scenario that it extends."""
     if not file.is_file():
-        raise InputError(
-            file.parent if file.name == FILE else file,
-            f"no {FILE} there",
-            f"a folder with a {FILE}, or the file itself",
-        )
+        place = file.parent if file.name == FILE else file
+        raise InputError(place, f"no {FILE} there", f"a folder with a {FILE}, or the file itself")
     if file.resolve() in heirs:
         raise InputError(f"{file}: extends", "leads back to itself", "a scenario that does not extend this one")
     try:

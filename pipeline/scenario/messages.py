@@ -21,8 +21,7 @@ def explain(error: ValidationError, place: str) -> InputError:
 
 
 def _lines(error: ValidationError, model: type[BaseModel], above: tuple[str, ...]) -> Iterator[tuple[str, str, str]]:
-    """Key, what stands there, and what would be right, of everything that is wrong in ``model``, found under
-    ``above``."""
+    """Key, what stands there, and what would be right, of all that is wrong in ``model``, found under ``above``."""
     for item in error.errors():
         key = ".".join(str(part) for part in (*above, *item["loc"]))
         context = item.get("ctx", {})

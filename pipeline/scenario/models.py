@@ -10,11 +10,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from pydantic import (
-    Field,
-    PrivateAttr,
-    model_validator,
-)
+from pydantic import Field, PrivateAttr, model_validator
 
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Grid, Roi
@@ -182,6 +178,5 @@ class Scenario(StrictModel):
             if (path := folder / name.removeprefix(_SUMO)).is_file():
                 return path
         shown = folders[0] / name.removeprefix(_SUMO)
-        raise InputError(
-            f"{self.file}: {key} = {name!r}", f"no such file ({shown})", "a path relative to the scenario's folder"
-        )
+        found = f"no such file ({shown})"
+        raise InputError(f"{self.file}: {key} = {name!r}", found, "a path relative to the scenario's folder")

@@ -34,7 +34,8 @@ _FLEET = (
 
 class TrafficModel(StrictModel):
     """Where vehicles come from: a network (with drawn or given demand), a SUMO configuration, or a finished FCD
-    file."""
+    file.
+    """
 
     network: str | None = Field(
         None, description="A .net.xml(.gz) or an OpenStreetMap file; may start with $SUMO_HOME/"
@@ -78,10 +79,8 @@ class TrafficModel(StrictModel):
                 f"exactly one of network, sumocfg and fcd is needed, found {' and '.join(given) or 'none'}"
             )
         names = [kind.name for kind in self.kinds]
-        if len(set(names)) != len(names):
-            raise ValueError(
-                f"two kinds have the same name: {', '.join(sorted({n for n in names if names.count(n) > 1}))}"
-            )
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"two kinds have the same name: {', '.join(twice)}")
         return self
 
     @model_validator(mode="after")

@@ -175,17 +175,8 @@ class _Work:
         _write(written[0], scenario, rows, own, times, tolerance)
         front_figure.draw_figure(rows, tolerance, scenario.name, written[1])
         neighbours = scores.get(REFERENCE, own).neighbours
-        return AccuracyStudy(
-            rows,
-            self.skipped,
-            tolerance,
-            best,
-            times,
-            neighbours,
-            written,
-            repeated=repeated,
-            empty=not any(own.shares),
-        )
+        empty = not any(own.shares)
+        return AccuracyStudy(rows, self.skipped, tolerance, best, times, neighbours, written, None, repeated, empty)
 
     def _skip(self, setting: Setting, why: str) -> None:
         self.skipped[setting.name] = why

@@ -63,8 +63,6 @@ class SettingScores:
         Scores as shares of ``egvs_limit`` (of the TPOG's entropy where gamma is infinite), (n,) float64.
     share_ses
         Their standard errors, (n,); not a number where the TPOG has one block.
-    frames
-        T.
     scores, ses, biases
         In bits, (n,); the last two not a number where the TPOG has one block.
     quantile
@@ -79,7 +77,6 @@ class SettingScores:
     sites: list[str]
     shares: list[float]
     share_ses: list[float]
-    frames: int
     scores: list[float]
     ses: list[float]
     biases: list[float]
@@ -307,9 +304,7 @@ def _scores(work: Workspace, keys: dict[str, str], weight: float, scored: list[S
     leave_out = LeaveOut.of(work.path("tpog.parquet"), tpog)
     if leave_out is None:
         unknown = [math.nan] * len(names)
-        return SettingScores(
-            names, shares.tolist(), unknown, tpog.frames, scores.tolist(), unknown, unknown, math.nan, [], keys
-        )
+        return SettingScores(names, shares.tolist(), unknown, scores.tolist(), unknown, unknown, math.nan, [], keys)
     worths = [site.score for site in scored]
     if not worths or worths[0].left_out is None:  # fetched, or the scenario wants no errors
         scorer = Scorer(scene_of(work), tpog, work.path("trajectories.parquet"), leave_out)
@@ -319,7 +314,7 @@ def _scores(work: Workspace, keys: dict[str, str], weight: float, scored: list[S
     raw = Estimate.of(left_out, leave_out.frames)
     normal = Estimate.of(left_out / np.where(limits > 0, limits, 1.0), leave_out.frames)
     return SettingScores(
-        names, shares.tolist(), normal.se.tolist(), tpog.frames, scores.tolist(), raw.se.tolist(), raw.bias.tolist(),
+        names, shares.tolist(), normal.se.tolist(), scores.tolist(), raw.se.tolist(), raw.bias.tolist(),
         raw.quantile(), _neighbours(raw, names, tpog.frames), keys,
     )  # fmt: skip
 

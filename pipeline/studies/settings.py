@@ -138,8 +138,7 @@ def _traffic(
     own, blocks = scenario.traffic, scenario.tpog.blocks
     step, period = step_s or own.step_s, period_s or own.frame_period_s
     frames = round(own.frames * own.frame_period_s * times / period / blocks) * blocks
-    simulated = own.fcd is None
-    if frames == 0 or (simulated and not (_divides(step, period) and _divides(step, own.warmup_s))):
+    if frames == 0 or (own.fcd is None and not (_divides(step, period) and _divides(step, own.warmup_s))):
         return
     name, overrides = f"{frames} frames", []
     if frames != own.frames:
@@ -169,7 +168,8 @@ def _thinned(scenario: Scenario) -> Iterator[Setting]:
     for factor in THINNED:
         if all(sensor.azimuths % factor == 0 for sensor in used):
             changes = [o for s in used for o in _sensor(scenario, s, factor, range(s.channels))]
-            yield _weighted(scenario, f"every {_ordinal(factor)} azimuth", "azimuth", changes, float(factor))
+            ordinal = "2nd" if factor == 2 else f"{factor}th"
+            yield _weighted(scenario, f"every {ordinal} azimuth", "azimuth", changes, float(factor))
     kept = [sorted(range(s.channels), key=lambda ring, s=s: s.elevations_deg[ring])[::2] for s in used]  # type: ignore[misc]
     weights = {s.channels / len(rings) for s, rings in zip(used, kept, strict=True)}
     if len(weights) == 1 and weights != {1.0}:
@@ -180,10 +180,6 @@ def _thinned(scenario: Scenario) -> Iterator[Setting]:
 def _weighted(scenario: Scenario, name: str, knob: str, changes: list[str], weight: float) -> Setting:
     gamma = f"score.gamma={scenario.score.gamma / weight}"
     return Setting(name, APPROXIMATES, knob, (*changes, gamma), weight=weight)
-
-
-def _ordinal(factor: int) -> str:
-    return "2nd" if factor == 2 else f"{factor}th"
 
 
 def _sensor(scenario: Scenario, sensor: Sensor, factor: int, rings: range | list[int]) -> Iterator[str]:

@@ -1,7 +1,8 @@
 """The digest of the program's source: it sees what a module imports, and nothing else.
 
 Evidence: the syntax tree of every module of the package against the pattern that reads imports; copies of the package
-with one line changed."""
+with one line changed.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """Runs in processes of their own, forked from one that has imported everything, that can be killed at a chosen step.
 
 A step is something that a run does to the files of its folder or of the store: it opens one to write, renames, links,
-copies, removes or makes one. So a kill falls on a moment of the work, whatever the clock says."""
+copies, removes or makes one. So a kill falls on a moment of the work, whatever the clock says.
+"""
 
 from __future__ import annotations
 

@@ -2,7 +2,8 @@
 
 Evidence: settings that are run again by themselves, from the ``--set`` line that the study prints; plain twins of what
 is compared (tau from pairs, hits weighted up by hand); a study that is repeated, resumed and cut short. Seconds are
-never asserted."""
+never asserted.
+"""
 
 from __future__ import annotations
 
@@ -245,7 +246,7 @@ def test_a_reference_that_would_be_endless_is_made_shorter(
     """A reference that is no scenario is halved until it is one."""
     runner = SettingRunner(junction, [], tmp_path, 1, lambda *_: None)
     own = runner.scenario(study_settings.OWN)
-    trial = measuring.SettingScores([], [], [], 200, [], [], [], 1.0, [], {"traffic": "t", "tpog": "t"})
+    trial = measuring.SettingScores([], [], [], [], [], [], 1.0, [], {"traffic": "t", "tpog": "t"})
     monkeypatch.setattr(SettingRunner, "times", lambda *_: measuring.StageTimes((0.1,), (0.1,), 1.0, 1, 1))
     assert accuracy._times(runner, own, trial, 1e6) == accuracy.LONGEST
     frames = {32: 0, 16: 0, 8: 0, 4: 800}

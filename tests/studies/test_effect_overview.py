@@ -100,8 +100,7 @@ def test_a_scenario_may_extend_another(mini: Path, tmp_path: Path, egvs) -> None
 
 
 def test_what_an_effect_costs_is_with_less_without(mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where it is named, the scenario's seconds less those without it; where it is not, those with it less the
-    scenario's."""
+    """Where it is named, the scenario's seconds less those without it; else those with it less the scenario's."""
     scenario = pipeline.load(mini, ["effects.rain.rate_mm_h=20"])
     rows = [
         {"setting": name, "seconds": seconds, "error": 0.1, "tau": 0.9, "regret": 0.0}
