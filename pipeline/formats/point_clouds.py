@@ -66,7 +66,7 @@ def read_points(path: Path, place: str) -> tuple[NDArray[np.float64], int]:
     InputError
         When the file is missing, of an unknown kind, damaged, or without one finite point.
     """
-    place = place if path.name in place else ": ".join(filter(None, (place, str(path))))
+    place = _with_path(place, path)
     point_format: PointFormat = plugins.load(GROUP, _kind(place, path, plugins.names(GROUP)))
     try:
         points = point_format.read(path, place)
@@ -83,7 +83,7 @@ def read_points(path: Path, place: str) -> tuple[NDArray[np.float64], int]:
 
 def reader_of(path: Path, place: str) -> str:
     """The module that reads files of this kind; InputError at ``place`` when none does."""
-    return plugins.module_of(GROUP, _kind(place, path, plugins.names(GROUP)))
+    return plugins.module_of(GROUP, _kind(_with_path(place, path), path, plugins.names(GROUP)))
 
 
 def write_points(path: Path, points_m: NDArray[np.float64]) -> None:
@@ -110,6 +110,10 @@ def write_points(path: Path, points_m: NDArray[np.float64]) -> None:
         raise ValueError(f"points_m has the shape {points_m.shape}, not (n, 3)")
     with aside(path) as partial:
         writable[kind].write(partial, points_m)
+
+
+def _with_path(place: str, path: Path) -> str:
+    return place if path.name in place else ": ".join(filter(None, (place, str(path))))
 
 
 def _kind(place: object, path: Path, kinds: list[str]) -> str:
