@@ -27,7 +27,7 @@ from benchmarks import casting, others, savings, stability
 from benchmarks.scenes import run_stage
 from pipeline.artefacts.readers import read_tpog
 from pipeline.core.parallel import in_order
-from pipeline.effects import scenes
+from pipeline.effects import scene_resolving
 from pipeline.kernels import march
 from pipeline.scoring.scorer import Scorer
 from pipeline.scoring.visibility import Beams, Visibility, in_voxels
@@ -119,7 +119,7 @@ def occupancy(folder: Path, sumo: float) -> list[tuple[str, str, str, bool]]:
 def sites(folder: Path) -> list[tuple[str, str, str, bool]]:
     """Scan and score, site by site: from the static world and the TPOG in memory to a score."""
     scenario, run = pipeline.load(SCENARIO), folder / "run"
-    scene = scenes.resolve(scenario, read_ply(run / "statics.ply")[0])
+    scene = scene_resolving.resolve(scenario, read_ply(run / "statics.ply")[0])
     counted = read_tpog(run / "tpog.parquet")
     scanner, scorer, visibility = Scanner(scene), Scorer(scene, counted), Visibility(scene, counted)
     beams = {site: Beams.of(scanner.scan_site(site)) for site in scene.sites}

@@ -19,7 +19,7 @@ import numpy as np
 import pipeline
 from pipeline.kernels import rays
 from pipeline.sensing import sensors, sites
-from pipeline.world import building
+from pipeline.world import static_world
 from pipeline.world.casting import Caster
 
 _SCENARIOS = Path(__file__).resolve().parent.parent / "scenarios"
@@ -32,7 +32,7 @@ def _work(name: str) -> tuple[dict[str, Callable[[], Any]], int, int]:
     from embreex.rtcore_scene import EmbreeScene
 
     scenario = pipeline.load(_SCENARIOS / name)
-    world = building.build(scenario)[0]
+    world = static_world.build(scenario)[0]
     caster, origin = Caster(world, scenario.roi.box), np.asarray(scenario.roi.box.origin_m)
     bare = EmbreeScene()
     TriangleMesh(bare, caster._triangles.astype(np.float32))

@@ -26,9 +26,9 @@ from pipeline.scenario.effects import EffectsModel
 from pipeline.scenario.models import Scenario
 from pipeline.scoring.scorer import Scorer
 from pipeline.stages.base import Workspace
-from pipeline.stages.scan_source import scans
-from pipeline.stages.scene import scene_of
 from pipeline.stages.score import ranks
+from pipeline.stages.shared.scans import scans
+from pipeline.stages.shared.scene import scene_of
 
 Compared = dict[str, Any]
 

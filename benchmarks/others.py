@@ -27,7 +27,7 @@ import numpy as np
 import pipeline
 from benchmarks.scenes import recorded_boxes
 from benchmarks.stability import medians, textbook, touching
-from pipeline.artefacts.boxes import FrameBoxes
+from pipeline.artefacts.recorded_boxes import FrameBoxes
 from pipeline.core.grid import Grid
 from pipeline.kernels import boxes, march
 from pipeline.scoring.egvs import EntropyField

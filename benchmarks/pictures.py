@@ -20,9 +20,9 @@ import pipeline
 from pipeline.artefacts.readers import read_scores, read_tpog, read_trajectories
 from pipeline.effects import registry
 from pipeline.effects.on_traffic import SELF_ACTING
+from pipeline.report.map_frame import extent, standalone
 from pipeline.report.maps import SiteView, site_view
 from pipeline.report.outlines import outlines_of
-from pipeline.report.plan import extent, standalone
 from pipeline.report.ranking import ScoredSite
 from pipeline.runs import workflow
 from pipeline.scenario.effects import EffectsModel
@@ -30,8 +30,8 @@ from pipeline.scenario.models import Scenario
 from pipeline.scoring.egvs import EntropyField
 from pipeline.scoring.scorer import Scorer
 from pipeline.stages.base import Workspace
-from pipeline.stages.scan_source import scans
-from pipeline.stages.scene import scene_of
+from pipeline.stages.shared.scans import scans
+from pipeline.stages.shared.scene import scene_of
 from pipeline.world.mesh import read_ply
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 import pipeline
-from pipeline.artefacts.boxes import FrameBoxes
+from pipeline.artefacts.recorded_boxes import FrameBoxes
 from pipeline.scoring.occupancy import count
 from pipeline.world.casting import Caster
 from pipeline.world.mesh import World

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.artefacts.boxes import FrameBoxes, read_boxes
+from pipeline.artefacts.recorded_boxes import FrameBoxes, read_boxes
 from pipeline.scenario.models import Scenario
 from pipeline.scoring.occupancy import near_grid
 from pipeline.stages import traffic

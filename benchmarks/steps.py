@@ -21,7 +21,7 @@ import numpy as np
 from pipeline.core.parallel import threads
 from pipeline.core.progress import silent
 from pipeline.studies.measuring import SettingRunner
-from pipeline.studies.settings import Setting
+from pipeline.studies.variants import Setting
 
 SCENARIO = Path(__file__).resolve().parent.parent / "scenarios" / "nishishinjuku"
 WATCHED = ("traffic.frames=5000", "traffic.frame_period_s=1.0")

@@ -35,7 +35,7 @@ from pipeline.core.version import __version__
 if TYPE_CHECKING:
     from pipeline.artefacts.readers import Tpog, read_scans, read_scores, read_tpog, read_trajectories, read_visibility
     from pipeline.core.errors import EgvsError, InputError, RunError
-    from pipeline.effects.built_scene import build_scene
+    from pipeline.effects.scene_building import build_scene
     from pipeline.runs.workflow import run, verify
     from pipeline.scenario.loading import load
     from pipeline.scenario.models import Scenario
@@ -59,7 +59,7 @@ _HOME = {
     "Site": "sensing.sites",
     "Tpog": "artefacts.readers",
     "World": "world.mesh",
-    "build_scene": "effects.built_scene",
+    "build_scene": "effects.scene_building",
     "load": "scenario.loading",
     "read_scans": "artefacts.readers",
     "read_scores": "artefacts.readers",

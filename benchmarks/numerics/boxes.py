@@ -17,7 +17,7 @@ import numpy as np
 import pipeline
 from benchmarks.numerics.row import Row
 from benchmarks.scenes import recorded_boxes
-from pipeline.artefacts.boxes import FrameBoxes
+from pipeline.artefacts.recorded_boxes import FrameBoxes
 from pipeline.kernels import boxes
 from pipeline.scoring.occupancy import count
 from tests.oracles import boxes as oracle

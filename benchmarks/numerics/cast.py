@@ -19,7 +19,7 @@ from benchmarks.numerics.row import Row
 from pipeline.core.grid import Roi
 from pipeline.scenario.models import Scenario
 from pipeline.sensing import sensors, sites
-from pipeline.world import building
+from pipeline.world import static_world
 from pipeline.world.casting import Caster
 from pipeline.world.mesh import World
 from tests.oracles import cast
@@ -235,7 +235,7 @@ def _scenes(rng: np.random.Generator, scale: float, lattice: bool) -> Row:
 
 def _scene(name: str) -> tuple[Scenario, Caster, Floats]:
     scenario = pipeline.load(_SCENARIOS / name)
-    world = building.build(scenario)[0]
+    world = static_world.build(scenario)[0]
     return scenario, Caster(world, scenario.roi.box), world.triangles_m - np.asarray(scenario.roi.box.origin_m)
 
 

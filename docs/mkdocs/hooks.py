@@ -16,8 +16,8 @@ from mkdocs.structure.pages import Page
 from mkdocs.utils import get_relative_url
 
 sys.path.insert(0, str(Path(__file__).parent))
+import package_diagram
 import tables
-import wings
 from formulas import mathml
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -28,7 +28,7 @@ _INSERT = re.compile(r"<!-- (columns of|keys of|names of|picture of) (\w+) -->")
 
 def on_config(config: MkDocsConfig) -> None:
     """The entry ``API`` of the navigation: the public API, then the packages from low to high."""
-    pages = ["api/index.md", *(f"api/{name}.md" for name in wings.packages())]
+    pages = ["api/index.md", *(f"api/{name}.md" for name in package_diagram.packages())]
     for entry in config.nav or []:
         if "API" in entry:
             entry["API"] = pages
@@ -36,7 +36,7 @@ def on_config(config: MkDocsConfig) -> None:
 
 def on_files(files: Files, config: MkDocsConfig) -> None:
     """One page a package, with every module that says something."""
-    for name in wings.packages():
+    for name in package_diagram.packages():
         folder = ROOT / "pipeline" / name
         modules = [".".join(p.relative_to(ROOT).with_suffix("").parts) for p in sorted(folder.rglob("*.py"))]
         text = f"# {name}\n\n{_first_line(folder / '__init__.py')}\n"
@@ -85,5 +85,5 @@ _MAKE = {
     "columns of": tables.columns,
     "keys of": tables.keys,
     "names of": tables.names,
-    "picture of": lambda _: wings.picture(),
+    "picture of": lambda _: package_diagram.picture(),
 }

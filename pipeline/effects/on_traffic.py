@@ -8,10 +8,10 @@ from typing import Any
 from pipeline.effects import registry
 from pipeline.effects.base import Traffic
 from pipeline.scenario.models import Scenario
-from pipeline.traffic import configuration
+from pipeline.traffic import sumo_folder
 from pipeline.world.ground import GroundSource
 
-SELF_ACTING: dict[str, Callable[[Scenario], bool]] = {"slope": configuration.may_have_heights}
+SELF_ACTING: dict[str, Callable[[Scenario], bool]] = {"slope": sumo_folder.may_have_heights}
 """Effects that switch themselves on where leaving them out would be wrong; a quick look tells where they may."""
 
 

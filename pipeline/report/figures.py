@@ -14,17 +14,17 @@ from numpy.typing import NDArray
 
 from pipeline.artefacts.readers import Tpog
 from pipeline.report import maps
+from pipeline.report.map_frame import extent, shared_scale
 from pipeline.report.maps import SiteView
 from pipeline.report.outlines import Outlines, outlines_of
-from pipeline.report.plan import extent, shared_scale
 from pipeline.report.ranking import Ranking, ScoredSite
 from pipeline.report.raster import ColumnValues
 from pipeline.scoring.egvs import EntropyField
 from pipeline.scoring.scorer import Scorer
 from pipeline.stages.base import Workspace
-from pipeline.stages.scan_source import scans
-from pipeline.stages.scene import scene_of
-from pipeline.stages.world import world_of
+from pipeline.stages.shared.scans import scans
+from pipeline.stages.shared.scene import scene_of
+from pipeline.stages.shared.world import world_of
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,8 @@
 
 - :func:`occupancy`: a field over the region, summed along z, with the static outlines and the sites;
 - :func:`site_map`: the sites, coloured by score, numbered by rank;
-- :func:`site_view`: what one site sees or misses; :func:`pipeline.report.plan.shared_scale` is the colour scale that
-  such figures share.
+- :func:`site_view`: what one site sees or misses; such figures share the colour scale
+  :func:`pipeline.report.map_frame.shared_scale`.
 
 Names of sites are placed so that they hide little.
 """
@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from pipeline.core.grid import Grid
 from pipeline.report import colours, raster
+from pipeline.report.map_frame import Box, ColourBar, MapSite, Plan, extent
 from pipeline.report.outlines import Outlines
-from pipeline.report.plan import Box, ColourBar, MapSite, Plan, extent
 from pipeline.report.raster import ColumnValues
 
 Place = list[MapSite]

@@ -26,7 +26,7 @@ from pipeline.report.ranking import Ranking
 from pipeline.report.study import ACCURACY, StudySummary
 from pipeline.scenario.models import Scenario
 from pipeline.stages.base import StageInputs, Summary, Workspace
-from pipeline.stages.scene import scan_inputs
+from pipeline.stages.shared.scene import scan_inputs
 
 NAME = "report"
 ARTEFACTS = ("report.html",)

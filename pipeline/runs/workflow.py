@@ -23,9 +23,10 @@ from pipeline.core import files
 from pipeline.core.errors import InputError
 from pipeline.core.progress import Progress, silent
 from pipeline.core.version import __version__
-from pipeline.runs import stages
+from pipeline.runs import stage_keys, stages
 from pipeline.runs.locking import alone
-from pipeline.runs.stages import Inputs, Made
+from pipeline.runs.stage_keys import Inputs
+from pipeline.runs.stages import Made
 from pipeline.runs.store import Store
 from pipeline.scenario.loading import from_values
 from pipeline.scenario.models import Scenario
@@ -159,7 +160,7 @@ class _Run:
         A stage with ``options`` is always run, and its artefacts are not kept in the store; ``again``: always run.
         """
         work, out = self.work, self.work.folder
-        inputs = stages.inputs(name, work)
+        inputs = stage_keys.inputs(name, work)
         last = record.stages.get(name)
         if last and not (again or options) and last.inputs == inputs.key and _intact(work, last.artefacts):
             self.listener(name, "skipped", last)
@@ -167,7 +168,7 @@ class _Run:
         record = replace(record.having(name, None), scenario=work.scenario.model_dump(mode="json"))
         record.write(out)
         made, fetched = self._made(name, inputs, again, options)
-        done = made.record(inputs)
+        done = inputs.record(made)
         record = record.having(name, done)
         record.write(out)
         self.listener(name, "fetched" if fetched else "done", done)
@@ -178,7 +179,7 @@ class _Run:
 
         def make() -> Made:
             self.listener(name, "runs", None)
-            return stages.make(name, work, inputs, **options)
+            return stages.make(name, work, inputs.read, **options)
 
         if not (again or options):
             return fetch_or_make(name, work, inputs.key, self.store, make)
@@ -200,7 +201,7 @@ def _record_so_far(scenario: Scenario, folder: Path) -> RunRecord:
 def _is_of(name: str, work: Workspace, record: RunRecord) -> bool:
     """Whether a stage's last run is what this scenario, and the artefacts as they are now, would give."""
     try:
-        return record.stages[name].inputs == stages.inputs(name, work).key
+        return record.stages[name].inputs == stage_keys.inputs(name, work).key
     except InputError:
         return False
 
@@ -248,13 +249,13 @@ def verify(
             for file in beside:  # an accuracy study, which the report shows
                 if Path(file).name == file and _holds(folder, file, before.files):
                     shutil.copyfile(folder / file, elsewhere / file)
-            inputs = stages.inputs(name, work)
+            inputs = stage_keys.inputs(name, work)
             for file in sorted(file for file in beside if inputs.read.files.get(file) != before.files[file]):
                 made_of_it = " and ".join(before.artefacts) or f"the stage {name}"
                 wrong.append(f"{made_of_it} shows {file}, which was replaced since; egvs {name} makes it anew")
             listener(name, "runs", None)
-            made = stages.make(name, work, inputs)
-            after = made.record(inputs)
+            made = stages.make(name, work, inputs.read)
+            after = inputs.record(made)
             listener(name, "done", after)
             again = again.having(name, replace(after, cost=before.cost))  # which the report shows
             again.write(elsewhere)

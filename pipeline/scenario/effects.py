@@ -23,7 +23,7 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from pipeline.core import plugins
-from pipeline.core.models import StrictModel
+from pipeline.core.strict_model import StrictModel
 from pipeline.scenario.types import Positive
 
 GROUP = "egvs.effects"

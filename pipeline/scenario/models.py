@@ -14,7 +14,7 @@ from pydantic import Field, PrivateAttr, model_validator
 
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Grid, Roi
-from pipeline.core.models import StrictModel
+from pipeline.core.strict_model import StrictModel
 from pipeline.core.sumo_home import sumo_home
 from pipeline.scenario.effects import EffectsModel
 from pipeline.scenario.sensors import SensorModel

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from pipeline.core.models import StrictModel
+from pipeline.core.strict_model import StrictModel
 from pipeline.scenario.types import NotNegative, Positive
 
 _OPTICS = ("wavelength_nm", "divergence_mrad", "rated_range_m", "rated_reflectivity")

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from pipeline.core.models import StrictModel
+from pipeline.core.strict_model import StrictModel
 from pipeline.scenario.types import Name, Positive
 
 

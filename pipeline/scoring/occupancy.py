@@ -15,7 +15,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.artefacts.boxes import FrameBoxes
+from pipeline.artefacts.recorded_boxes import FrameBoxes
 from pipeline.core.grid import Grid
 from pipeline.kernels import boxes, solids
 from pipeline.world.mesh import World

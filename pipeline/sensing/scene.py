@@ -1,7 +1,7 @@
 """What is scanned and scored, resolved once: the static world, the candidate sites, their sensors, the live effects.
 
-A scene is built by :func:`pipeline.effects.scenes.resolve` and passed on; whoever needs one of its parts takes it
-from here instead of reading a file again. It can be sent to another process.
+A scene is built by :func:`pipeline.effects.scene_resolving.resolve` and passed on; whoever needs one of its parts takes
+it from here instead of reading a file again. It can be sent to another process.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from pipeline.sensing.scanner import Scan, Scanner
 from pipeline.sensing.scene import Scene
 from pipeline.sensing.sites import ScannedSite, Site
 from pipeline.stages.base import StageInputs, Summary, Workspace
-from pipeline.stages.scene import SCANS, scan_inputs, scene_of
+from pipeline.stages.shared.scene import SCANS, scan_inputs, scene_of
 
 NAME = "scan"
 ARTEFACTS = (SCANS,)

@@ -1,6 +1,6 @@
 """The score stage: which site sees most of what is uncertain, as ``scores.parquet``.
 
-Steps: read ``tpog.parquet``; take the scans site by site (:mod:`pipeline.stages.scan_source`); score each
+Steps: read ``tpog.parquet``; take the scans site by site (:mod:`pipeline.stages.shared.scans`); score each
 (:mod:`pipeline.scoring.scorer`); rank; say how far each score may be off because the traffic was short. Another gamma,
 voxel size or TPOG needs this stage alone.
 """
@@ -26,8 +26,8 @@ from pipeline.scoring.scorer import Scorer, SiteScore
 from pipeline.scoring.visibility import Beams, in_voxels
 from pipeline.sensing.sites import ScannedSite
 from pipeline.stages.base import StageInputs, Summary, Workspace
-from pipeline.stages.scan_source import SiteBeams, scans
-from pipeline.stages.scene import SCANS, scan_inputs, scene_of
+from pipeline.stages.shared.scans import SiteBeams, scans
+from pipeline.stages.shared.scene import SCANS, scan_inputs, scene_of
 
 NAME = "score"
 ARTEFACTS = ("scores.parquet", "visibility.parquet")

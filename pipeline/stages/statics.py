@@ -1,7 +1,7 @@
 """The statics stage: everything that stands at the junction, as triangles in ``statics.ply``.
 
 Steps: find what lays the ground where the network has relief; read, mend and build footprints and meshes
-(:mod:`pipeline.world.building`); write one mesh in the world frame, in metres.
+(:mod:`pipeline.world.static_world`); write one mesh in the world frame, in metres.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from __future__ import annotations
 from pipeline.core import files
 from pipeline.effects import on_traffic
 from pipeline.stages.base import StageInputs, Summary, Workspace
-from pipeline.traffic import configuration
-from pipeline.world import building
+from pipeline.traffic import sumo_folder
+from pipeline.world import static_world
 from pipeline.world.mesh import write_ply
 
 NAME = "statics"
@@ -24,7 +24,7 @@ def inputs(work: Workspace) -> StageInputs:
              *(("meshes", m.file) for m in model.meshes)]  # fmt: skip
     hashes = {name: files.sha256_of(scenario.find(name, f"statics.{key}")) for key, name in named}
     ground = on_traffic.ground(scenario)
-    if ground is not None and (path := configuration.network_path(scenario)) is not None:
+    if ground is not None and (path := sumo_folder.network_path(scenario)) is not None:
         hashes["surface"] = files.sha256_of(path)
     settings = {"name": scenario.name, "statics": model.model_dump(mode="json"), "roi": [box.origin_m, box.size_m]}
     return StageInputs(settings, hashes, modules=() if ground is None else (type(ground).__module__,))
@@ -40,7 +40,7 @@ def run(work: Workspace, inputs: StageInputs) -> Summary:
         needed).
     """
     ground = on_traffic.ground(work.scenario)
-    world, counts = building.build(work.scenario, ground, work.progress)
+    world, counts = static_world.build(work.scenario, ground, work.progress)
     write_ply(work.path(ARTEFACTS[0]), world, work.metadata(inputs, seeded=False))
     notes = {} if ground is None else {"notes": [f"{ground.NAME}: on, the ground follows the network's roads"]}
     return {"triangles": len(world.faces), "solids": len(world.solids), **counts.to_json(), **notes}

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.artefacts import tables
-from pipeline.artefacts.boxes import read_boxes
+from pipeline.artefacts.recorded_boxes import read_boxes
 from pipeline.core.errors import InputError
 from pipeline.scoring.occupancy import count_blocks, static_voxels
 from pipeline.stages.base import StageInputs, Summary, Workspace
-from pipeline.stages.world import world_of
+from pipeline.stages.shared.world import world_of
 
 NAME = "tpog"
 ARTEFACTS = ("tpog.parquet",)

@@ -23,7 +23,7 @@ from pipeline.core.sumo_home import sumo_home
 from pipeline.effects import on_traffic, registry
 from pipeline.scenario.models import Scenario
 from pipeline.stages.base import StageInputs, Summary, Workspace
-from pipeline.traffic import configuration, recording, sumo, trajectories
+from pipeline.traffic import recording, sumo, sumo_folder, trajectories
 
 NAME = "traffic"
 ARTEFACTS = ("trajectories.parquet",)
@@ -36,7 +36,7 @@ def inputs(work: Workspace) -> StageInputs:
     if traffic.fcd is not None:
         sources = [scenario.find(traffic.fcd, "traffic.fcd")]
     else:
-        sources = configuration.sources(scenario).all()
+        sources = sumo_folder.sources(scenario).all()
         if traffic.sumocfg is not None:
             sources.insert(0, scenario.find(traffic.sumocfg, "traffic.sumocfg"))
     effects, _ = on_traffic.live(scenario)

@@ -1,7 +1,7 @@
 """A study of what accuracy costs in time, and the cheapest setting within a tolerance.
 
 Steps: run the scenario, then a reference whose traffic is watched many times as long, then one setting after another
-(:mod:`pipeline.studies.settings`), within a budget of seconds; repeat every stage of every setting, all settings in
+(:mod:`pipeline.studies.variants`), within a budget of seconds; repeat every stage of every setting, all settings in
 turn, so that a drift of the machine hits all alike; compare (:mod:`pipeline.studies.comparison`); recommend; write
 ``accuracy.parquet`` and ``accuracy.png``. Errors are deterministic; seconds are measured.
 """
@@ -26,12 +26,12 @@ from pipeline.runs.locking import alone
 from pipeline.runs.stages import RANKING
 from pipeline.runs.workflow import refresh_report
 from pipeline.scenario.models import Scenario
-from pipeline.studies import comparison, front_figure
-from pipeline.studies import settings as study_settings
+from pipeline.studies import comparison, pareto_figure
+from pipeline.studies import variants as study_settings
 from pipeline.studies.comparison import Row
 from pipeline.studies.measuring import SettingListener, SettingRunner, SettingScores, inputs_of
 from pipeline.studies.seeds import Seeds, between_seeds
-from pipeline.studies.settings import MEASURES, OWN, REFERENCE, SCENARIO, Setting
+from pipeline.studies.variants import MEASURES, OWN, REFERENCE, SCENARIO, Setting
 
 REPEATS = 3
 LONGEST = 32
@@ -173,7 +173,7 @@ class _Work:
         written = (out / "accuracy.parquet", out / "accuracy.png")
         times = times if REFERENCE in scores else 1
         _write(written[0], scenario, rows, own, times, tolerance)
-        front_figure.draw_figure(rows, tolerance, scenario.name, written[1])
+        pareto_figure.draw_figure(rows, tolerance, scenario.name, written[1])
         neighbours = scores.get(REFERENCE, own).neighbours
         empty = not any(own.shares)
         return AccuracyStudy(rows, self.skipped, tolerance, best, times, neighbours, written, None, repeated, empty)

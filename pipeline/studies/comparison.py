@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from pipeline.runs.stages import RANKING
 from pipeline.studies.measuring import SettingRunner, SettingScores
-from pipeline.studies.settings import APPROXIMATES, MEASURES, OWN, REFERENCE, SCENARIO, Setting, is_default
+from pipeline.studies.variants import APPROXIMATES, MEASURES, OWN, REFERENCE, SCENARIO, Setting, is_default
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,11 @@ from pipeline.artefacts.readers import read_accuracy
 from pipeline.core import files
 from pipeline.effects import registry
 from pipeline.effects.base import Traffic
-from pipeline.effects.built_scene import build_scene
+from pipeline.effects.scene_building import build_scene
 from pipeline.scenario.models import Scenario
 from pipeline.sensing.scene import Scene
 from pipeline.studies.measuring import inputs_of
-from pipeline.studies.settings import SCENARIO, WITH, WITHOUT
+from pipeline.studies.variants import SCENARIO, WITH, WITHOUT
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,9 @@ from pipeline.core import files
 from pipeline.core.cost import Cost, let_go
 from pipeline.core.errors import InputError, RunError
 from pipeline.core.progress import Progress
-from pipeline.runs import stages
-from pipeline.runs.stages import RANKING, Inputs, Made
+from pipeline.runs import stage_keys, stages
+from pipeline.runs.stage_keys import Inputs
+from pipeline.runs.stages import RANKING, Made
 from pipeline.runs.store import Store
 from pipeline.runs.workflow import fetch_or_make
 from pipeline.scenario.loading import load
@@ -42,10 +43,10 @@ from pipeline.scoring.scorer import Scorer
 from pipeline.scoring.uncertainty import Estimate, LeaveOut, order
 from pipeline.sensing import sites
 from pipeline.stages.base import Workspace
-from pipeline.stages.scan_source import scans
-from pipeline.stages.scene import scene_of, site_digests
 from pipeline.stages.score import ScoredSite
-from pipeline.studies.settings import Setting
+from pipeline.stages.shared.scans import scans
+from pipeline.stages.shared.scene import scene_of, site_digests
+from pipeline.studies.variants import Setting
 
 SettingListener = Callable[[str, str, dict[str, Any]], None]
 """Called with (setting, "done" | "kept" | "skipped", its seconds, or why it was skipped) as a study goes on."""
@@ -153,14 +154,14 @@ class SettingRunner:
     def again(self, name: str, setting: Setting, scores: SettingScores) -> None:
         """Run one stage of a known setting once more, for its time; RunError when it writes other bytes."""
         with self._workshop(self.scenario(setting), RANKING[: RANKING.index(name)]) as work:
-            made = self._make(name, work, stages.inputs(name, work))
+            made = self._make(name, work, stage_keys.inputs(name, work))
             self._note_times(name, scores.stages[name], work, made, measured=True)
 
     def warm_up(self, setting: Setting) -> None:
         """Run all stages once, with a single site, and forget it, so that nothing is compiled or loaded later."""
         with self._workshop(_with_one_site(self.scenario(setting))) as work:
             for name in RANKING:
-                stages.make(name, work, stages.inputs(name, work))
+                stages.make(name, work, stage_keys.inputs(name, work).read)
 
     def times(self, name: str, key: str) -> StageTimes:
         """What one stage cost so far."""
@@ -202,7 +203,7 @@ class SettingRunner:
 
         ``observe`` hears of each site where the score stage had to be made.
         """
-        inputs = stages.inputs(name, work)
+        inputs = stage_keys.inputs(name, work)
         made, fetched = fetch_or_make(
             name, work, inputs.key, self._store, lambda: self._make(name, work, inputs, observe), link=True
         )
@@ -215,7 +216,7 @@ class SettingRunner:
     ) -> Made:
         let_go()
         extra = {"observe": observe} if name == "score" and observe is not None else {}
-        return stages.make(name, work, inputs, **extra)
+        return stages.make(name, work, inputs.read, **extra)
 
     def _note_times(self, name: str, key: str, work: Workspace, made: Made, *, measured: bool) -> None:
         """Add what a stage cost: measured here, or by whoever made it."""
@@ -277,9 +278,9 @@ def inputs_of(scenario: Scenario) -> dict[str, Any]:
     work = Workspace(scenario, scenario.folder)
     return {
         "scenario": scenario.model_dump(mode="json"),
-        "stages": {name: stages.inputs(name, work).key for name in ("statics", "traffic")},
+        "stages": {name: stage_keys.inputs(name, work).key for name in ("statics", "traffic")},
         "sites": site_digests(scenario, sites.of(scenario)),
-        "program": {name: stages.program(name, scenario) for name in RANKING},
+        "program": {name: stage_keys.program(name, scenario) for name in RANKING},
     }
 
 

@@ -11,7 +11,7 @@ from pipeline.artefacts.readers import Tpog
 from pipeline.core.errors import EgvsError
 from pipeline.scenario.models import Scenario
 from pipeline.studies.measuring import SettingListener, SettingRunner, SettingScores
-from pipeline.studies.settings import Setting
+from pipeline.studies.variants import Setting
 
 
 @dataclass(frozen=True)

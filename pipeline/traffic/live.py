@@ -17,7 +17,7 @@ import pyarrow as pa
 from pipeline.core.errors import InputError, RunError
 from pipeline.traffic import fcd, sumo
 from pipeline.traffic.boxes import Size
-from pipeline.traffic.configuration import FCD_DIGITS, Timing
+from pipeline.traffic.sumo_folder import FCD_DIGITS, Timing
 
 
 @dataclass

@@ -18,11 +18,11 @@ from pipeline.core.errors import InputError
 from pipeline.core.progress import Progress
 from pipeline.formats import safe_xml
 from pipeline.scenario.models import Scenario
-from pipeline.traffic import configuration, fcd, live, network, sumo
+from pipeline.traffic import fcd, live, network, sumo, sumo_folder
 from pipeline.traffic.boxes import Size
-from pipeline.traffic.configuration import COLLISIONS, CONFIG, FCD, LOG, PERSONS, STOPS, Prepared, as_flags
 from pipeline.traffic.extensions import TrafficExtension
 from pipeline.traffic.frames import Window
+from pipeline.traffic.sumo_folder import COLLISIONS, CONFIG, FCD, LOG, PERSONS, STOPS, Prepared, as_flags
 
 _LEAST_PATIENCE_S = 180.0
 
@@ -91,11 +91,11 @@ def record(
 @contextmanager
 def _finished(scenario: Scenario) -> Iterator[Recording]:
     """From a file; nothing is simulated, so nothing is promised about it."""
-    traffic, place = scenario.traffic, configuration.place_of(scenario)
+    traffic, place = scenario.traffic, sumo_folder.place_of(scenario)
     assert traffic.fcd is not None
     path = scenario.find(traffic.fcd, "traffic.fcd")
-    period_ms = max(1, configuration.milliseconds(traffic.frame_period_s, f"{place}.frame_period_s"))
-    skip_ms = configuration.milliseconds(traffic.warmup_s, f"{place}.warmup_s")
+    period_ms = max(1, sumo_folder.milliseconds(traffic.frame_period_s, f"{place}.frame_period_s"))
+    skip_ms = sumo_folder.milliseconds(traffic.warmup_s, f"{place}.warmup_s")
     window = Window(traffic.frames, period_ms, skip_ms=skip_ms)
     yield Recording(fcd.read(path), window, kind_sizes(scenario), place)
 
@@ -105,7 +105,7 @@ def _simulated(
     scenario: Scenario, folder: Path, progress: Progress, extensions: Sequence[TrafficExtension]
 ) -> Iterator[Recording]:
     """From SUMO as a subprocess; its FCD file is removed once it is read."""
-    prepared = configuration.prepare(scenario, folder, extensions)
+    prepared = sumo_folder.prepare(scenario, folder, extensions)
     sizes = kind_sizes(scenario) if prepared.drawn else type_sizes(prepared)
     for extension in extensions:
         sizes |= extension.sizes()
@@ -117,7 +117,7 @@ def _simulated(
             fcd.read(path) if _has_rows(path) else (),
             prepared.timing.window(),
             sizes,
-            configuration.place_of(scenario),
+            sumo_folder.place_of(scenario),
             patience_s(prepared.roads.cycle_s),
             _stopped_on_purpose(prepared),
             None if not prepared.adds_traffic else (fcd.read(persons, "person") if _has_rows(persons) else ()),
@@ -131,8 +131,8 @@ def _simulated(
 @contextmanager
 def _running(scenario: Scenario, host: str, port: int, extensions: Sequence[TrafficExtension]) -> Iterator[Recording]:
     """From a SUMO that somebody else started."""
-    given = configuration.sources(scenario)
-    when = configuration.timing(scenario.traffic, given.begin_s, configuration.place_of(scenario))
+    given = sumo_folder.sources(scenario)
+    when = sumo_folder.timing(scenario.traffic, given.begin_s, sumo_folder.place_of(scenario))
     net_file = given.files["net-file"][0]
     cycle_s = 0.0 if network.is_osm(net_file) else network.read(net_file).cycle_s
     observations = live.LiveObservations()
@@ -143,7 +143,7 @@ def _running(scenario: Scenario, host: str, port: int, extensions: Sequence[Traf
             live.poll(connection, when, observations, f"{host}:{port}", persons=persons),
             when.window(),
             observations.sizes,
-            configuration.place_of(scenario),
+            sumo_folder.place_of(scenario),
             patience_s(cycle_s),
             observations.stopped_on_purpose,
             summary=lambda: RecordingSummary(version, None, None, len(observations.collided)),

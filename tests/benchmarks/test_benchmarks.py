@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from benchmarks import others, scaling, steps
-from pipeline.artefacts.boxes import FrameBoxes
+from pipeline.artefacts.recorded_boxes import FrameBoxes
 from pipeline.core.grid import Grid
 
 SHAPE = np.array([12, 6, 4], np.int64)
@@ -89,14 +89,14 @@ def test_the_slope_is_that_of_the_larger_half() -> None:
 def test_a_synthetic_junction_is_as_large_as_asked(tmp_path) -> None:
     import pipeline
     from pipeline.sensing import sensors, sites
-    from pipeline.world import building
+    from pipeline.world import static_world
 
     scenario = pipeline.load(
         scaling.prepare(scaling.Size(sites=7, frames=10, vehicles=3, beams=960, triangles=600), tmp_path / "s")
     )
     assert len(sites.of(scenario)) == 7
     assert sensors.resolve("own", scenario.sensors, "").beams == pytest.approx(960, rel=0.1)
-    assert len(building.build(scenario)[0].faces) == pytest.approx(600, abs=10)
+    assert len(static_world.build(scenario)[0].faces) == pytest.approx(600, abs=10)
     assert len((scenario.folder / "fcd.csv").read_text().splitlines()) == 1 + 10 * 3
 
 

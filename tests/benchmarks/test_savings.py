@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 import pipeline
-from pipeline.artefacts.boxes import FrameBoxes
+from pipeline.artefacts.recorded_boxes import FrameBoxes
 from pipeline.kernels import rays
 from pipeline.scoring.occupancy import count
 from pipeline.sensing.scanner import Scanner

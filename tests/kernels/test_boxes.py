@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 import pipeline
 from benchmarks.numerics import boxes as hunt
 from pipeline.artefacts import tables
-from pipeline.artefacts.boxes import FrameBoxes, read_boxes
+from pipeline.artefacts.recorded_boxes import FrameBoxes, read_boxes
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Grid
 from pipeline.kernels import boxes

@@ -20,11 +20,11 @@ import pytest
 from pipeline.artefacts import tables
 from pipeline.artefacts.readers import read_scores, read_tpog
 from pipeline.core.grid import Grid
-from pipeline.report import maps, plan, raster
+from pipeline.report import map_frame, maps, raster
 from pipeline.report import page as report
 from pipeline.report.figures import Figures
+from pipeline.report.map_frame import MapSite
 from pipeline.report.outlines import outlines_of
-from pipeline.report.plan import MapSite
 from pipeline.report.ranking import Ranking
 from pipeline.scenario.effects import EffectsModel
 from pipeline.scenario.loading import from_values
@@ -32,10 +32,10 @@ from pipeline.scoring.egvs import EntropyField
 from pipeline.scoring.scorer import Scorer
 from pipeline.stages import scan, score
 from pipeline.stages.base import Workspace
-from pipeline.stages.scan_source import scans
-from pipeline.stages.scene import scene_of
+from pipeline.stages.shared.scans import scans
+from pipeline.stages.shared.scene import scene_of
 from pipeline.studies import accuracy, comparison
-from pipeline.studies import settings as study_settings
+from pipeline.studies import variants as study_settings
 from pipeline.world.mesh import World, write_ply
 from tests.stages import inputs_of, run_stage
 
@@ -220,7 +220,7 @@ def test_every_figure_says_what_it_shows(made):
 
 def test_the_figures_are_files_of_their_own(made):
     for figure in re.findall(r"<svg.*?</svg>", made[2], re.DOTALL):
-        root = ET.fromstring(plan.standalone(figure))
+        root = ET.fromstring(map_frame.standalone(figure))
         assert root.tag == "{http://www.w3.org/2000/svg}svg"
 
 
@@ -382,7 +382,7 @@ def test_no_record_no_costs(tmp_path):
 
 def test_a_far_site_is_on_the_map(tmp_path):
     about, out = finished(tmp_path, sites=[*SITES, ("far", 40, 30, 5)])
-    x0, y0, x1, y1 = plan.extent(about.roi.grid, [MapSite("far", 40, 30, 5, 1.0, 1)])
+    x0, y0, x1, y1 = map_frame.extent(about.roi.grid, [MapSite("far", 40, 30, 5, 1.0, 1)])
     assert x0 < 0 and y0 < 0 and x1 > 40 and y1 > 30
     assert "far" in Reader(page(about, out)).text
 
@@ -491,7 +491,7 @@ def test_outlines_are_cut_to_what_is_shown():
     ],
 )
 def test_ticks_are_round(low, high, texts):
-    assert [text for _, text in plan.round_values(low, high, 5)] == texts
+    assert [text for _, text in map_frame.round_values(low, high, 5)] == texts
 
 
 def test_the_accuracy_study_is_shown_where_there_is_one(mini, tmp_path, egvs, monkeypatch):

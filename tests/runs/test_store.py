@@ -17,7 +17,7 @@ import pytest
 
 import pipeline
 from pipeline.artefacts import schemas
-from pipeline.core import files, source
+from pipeline.core import code_digest, files
 from pipeline.core.errors import InputError
 from pipeline.runs import stages, workflow
 from pipeline.runs.stages import STAGES
@@ -338,11 +338,11 @@ def test_one_changed_line_makes_what_depends_on_it_again(
     copy = tmp_path / "pipeline"
     shutil.copytree(ROOT / "pipeline", copy, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copytree(ROOT / "data_schemas", copy / "data_schemas")
-    monkeypatch.setattr(source, "_ROOT", copy)
+    monkeypatch.setattr(code_digest, "_ROOT", copy)
     monkeypatch.setattr(schemas, "folder", lambda: copy / "data_schemas")
 
     def forget() -> None:
-        for remembered in (source.of, source._read, source._path):
+        for remembered in (code_digest.of, code_digest._read, code_digest._path):
             remembered.cache_clear()
 
     def made() -> set[str]:

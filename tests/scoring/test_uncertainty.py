@@ -25,8 +25,8 @@ from pipeline.scoring.egvs import EntropyField, binary_entropy
 from pipeline.scoring.scorer import Scorer
 from pipeline.scoring.uncertainty import Estimate, LeaveOut
 from pipeline.stages.base import Workspace
-from pipeline.stages.scan_source import scans
-from pipeline.stages.scene import scene_of
+from pipeline.stages.shared.scans import scans
+from pipeline.stages.shared.scene import scene_of
 
 GRID = Grid.from_json({"origin_m": [0.0, 0.0, 0.0], "voxel_m": 1.0, "shape": [6, 5, 2]})
 CELLS = np.arange(60)

@@ -28,10 +28,10 @@ from pipeline.runs.locking import alone
 from pipeline.runs.store import Store
 from pipeline.scoring.scorer import Scorer
 from pipeline.stages.base import Workspace
-from pipeline.stages.scan_source import scans
-from pipeline.stages.scene import scene_of
+from pipeline.stages.shared.scans import scans
+from pipeline.stages.shared.scene import scene_of
 from pipeline.studies import accuracy, comparison, measuring
-from pipeline.studies import settings as study_settings
+from pipeline.studies import variants as study_settings
 from pipeline.studies.accuracy import AccuracyStudy
 from pipeline.studies.comparison import Row
 from pipeline.studies.measuring import SettingRunner
@@ -520,13 +520,13 @@ def test_what_runs_made_is_not_made_again_but_timed(
 
 
 def test_a_result_of_another_program_is_not_taken(mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from pipeline.core import source
+    from pipeline.core import code_digest
 
     runner = SettingRunner(mini, [], tmp_path / "out", 1, lambda *_: None)
     runner.run(study_settings.OWN)
     assert runner.known(study_settings.OWN) is not None
-    own = source.of
-    monkeypatch.setattr(source, "of", lambda *names: replace(own(*names), digest="another"))
+    own = code_digest.of
+    monkeypatch.setattr(code_digest, "of", lambda *names: replace(own(*names), digest="another"))
     changed = SettingRunner(mini, [], tmp_path / "out", 1, lambda *_: None)
     assert changed.known(study_settings.OWN) is None
 

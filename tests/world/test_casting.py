@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Roi
-from pipeline.effects.built_scene import build_scene
+from pipeline.effects.scene_building import build_scene
 from pipeline.kernels import rays
 from pipeline.scenario import loading
 from pipeline.sensing.scanner import Scanner

@@ -10,11 +10,11 @@ import pytest
 import trimesh
 
 from pipeline.core.errors import InputError
-from pipeline.effects import scenes
+from pipeline.effects import scene_resolving
 from pipeline.scenario import loading
 from pipeline.scenario.loading import from_values
 from pipeline.sensing.scanner import Scanner
-from pipeline.world import building
+from pipeline.world import static_world
 from pipeline.world.mesh import World, read_ply, write_ply
 from tests.conftest import collection, feature
 
@@ -40,7 +40,7 @@ def load(folder, **settings):
 def built(folder, *features):
     """The world and the counts of a GeoJSON file."""
     (folder / "s.geojson").write_text(collection(*features))
-    return building.build(load(folder, footprints=["s.geojson"]))
+    return static_world.build(load(folder, footprints=["s.geojson"]))
 
 
 def volumes(world):
@@ -53,7 +53,7 @@ def volumes(world):
 def mesh_of(folder, mesh, **settings):
     """The world and the counts of a mesh file."""
     mesh.export(folder / "m.ply")
-    return building.build(load(folder, meshes=[{"file": "m.ply", **settings}]))
+    return static_world.build(load(folder, meshes=[{"file": "m.ply", **settings}]))
 
 
 @pytest.mark.parametrize(
@@ -173,13 +173,13 @@ def test_poly_xml(tmp_path):
         '<additional><poly id="a" type="building" fill="1" shape="{a}"><param key="height" value="3"/></poly>'
         '<poly id="c" fill="0" shape="{c}"/><poi id="p" x="0" y="0"/></additional>'.format(**shapes)
     )
-    world, counts = building.build(load(tmp_path, polygons=["s.poly.xml"]))
+    world, counts = static_world.build(load(tmp_path, polygons=["s.poly.xml"]))
     assert volumes(world) == pytest.approx([48], rel=1e-12)
     assert sum(counts.left_out.values()) == 2
     for name in "bd":
         (tmp_path / "s.poly.xml").write_text(f'<additional><poly id="x" fill="1" shape="{shapes[name]}"/></additional>')
         with pytest.raises(InputError, match="poly x"):
-            building.build(load(tmp_path, polygons=["s.poly.xml"]))
+            static_world.build(load(tmp_path, polygons=["s.poly.xml"]))
 
 
 BOX = trimesh.creation.box((4, 6, 8))
@@ -231,28 +231,28 @@ def test_a_soup_of_separate_triangles_is_sewn(tmp_path):
 def test_a_vertex_that_is_no_number_is_refused(tmp_path, value):
     (tmp_path / "m.obj").write_text(f"v 0 0 0\nv 1 0 0\nv 0 {value} 0\nf 1 2 3\n")
     with pytest.raises(InputError, match=r"m\.obj: vertex 2"):
-        building.build(load(tmp_path, meshes=[{"file": "m.obj"}]))
+        static_world.build(load(tmp_path, meshes=[{"file": "m.obj"}]))
 
 
 def test_a_mesh_without_triangles_is_refused(tmp_path):
     (tmp_path / "m.obj").write_text("v 0 0 0\nv 1 0 0\n")
     with pytest.raises(InputError, match=r"m\.obj"):
-        building.build(load(tmp_path, meshes=[{"file": "m.obj"}]))
+        static_world.build(load(tmp_path, meshes=[{"file": "m.obj"}]))
 
 
 def test_a_mesh_of_nothing_but_degenerate_triangles_is_refused(tmp_path):
     (tmp_path / "m.obj").write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 1 2\nf 1 2 3\n")
     with pytest.raises(InputError, match=r"m\.obj"):
-        building.build(load(tmp_path, meshes=[{"file": "m.obj"}]))
+        static_world.build(load(tmp_path, meshes=[{"file": "m.obj"}]))
 
 
 def test_ground_reaches_beyond_everything(tmp_path):
     (tmp_path / "s.geojson").write_text(collection(polygon([[p[0] + 300, p[1]] for p in SQUARE])))
     loaded = load(tmp_path, footprints=["s.geojson"], ground=True)
-    world, _ = building.build(loaded)
+    world, _ = static_world.build(loaded)
     ground = world.triangles_m[world.solid_of_face == 1]
     assert (ground[..., 2] == 0).all()
-    assert ground[..., 0].max() == 304 + building.GROUND_MARGIN_M
+    assert ground[..., 0].max() == 304 + static_world.GROUND_MARGIN_M
     assert world.closed.tolist() == [True, False]
     assert (np.cross(ground[:, 1] - ground[:, 0], ground[:, 2] - ground[:, 0])[:, 2] > 0).all()
 
@@ -286,12 +286,12 @@ def checked_at(folder, *sites, features, ground=True):
         "site,x_m,y_m,z_m\n" + "".join(f"s{i},{x!r},{y!r},{z!r}\n" for i, (x, y, z) in enumerate(sites))
     )
     loaded = load(folder, footprints=["s.geojson"], ground=ground)
-    return checked(loaded, building.build(loaded)[0])
+    return checked(loaded, static_world.build(loaded)[0])
 
 
 def checked(loaded, world):
     """The scene, once all of its sites are checked."""
-    scene = scenes.resolve(loaded, world)
+    scene = scene_resolving.resolve(loaded, world)
     Scanner(scene).check(scene.sites)
     return scene
 
@@ -392,7 +392,7 @@ def test_closed_means_each_side_met_by_its_opposite():
 
 def test_shipped_statics_are_closed_and_clean():
     for name in ("nishishinjuku", "ingolstadt"):
-        world, counts = building.build(loading.load(f"scenarios/{name}"))
+        world, counts = static_world.build(loading.load(f"scenarios/{name}"))
         kinds = [kind for _, kind in world.solids]
         assert [k for k, closed in zip(kinds, world.closed, strict=True) if not closed] == ["ground"]
         assert (world.signs[world.closed] == 1).all()

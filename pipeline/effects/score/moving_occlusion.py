@@ -45,8 +45,8 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
 
 from pipeline.artefacts import tables
-from pipeline.artefacts.boxes import FrameBoxes, read_boxes
 from pipeline.artefacts.readers import Tpog
+from pipeline.artefacts.recorded_boxes import FrameBoxes, read_boxes
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Grid
 from pipeline.effects.base import TransmitScore

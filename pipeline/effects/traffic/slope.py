@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from pipeline.effects.base import Traffic
 from pipeline.scenario.effects import EffectParameters, SlopeParameters
 from pipeline.scenario.models import Scenario
-from pipeline.traffic import configuration, network
+from pipeline.traffic import network, sumo_folder
 from pipeline.traffic.boxes import Size, VehicleBoxes, tidy_m, tidy_rad
 from pipeline.world import terrain
 from pipeline.world.terrain import Surface
@@ -58,7 +58,7 @@ class Slope(Traffic[SlopeParameters]):
 
     def acts(self, scenario: Scenario) -> tuple[bool, str]:
         """Where the network has relief, whoever names it."""
-        path = configuration.network_path(scenario)
+        path = sumo_folder.network_path(scenario)
         if path is None:
             return False, "a finished FCD file names no network; its own heights and slopes are taken as they are"
         if not network.may_have_heights(path):
@@ -78,7 +78,7 @@ class Slope(Traffic[SlopeParameters]):
         self, scenario: Scenario, low_m: NDArray[np.float64] | None = None, high_m: NDArray[np.float64] | None = None
     ) -> Surface:
         """The ground through the network's lanes."""
-        path = configuration.network_path(scenario)
+        path = sumo_folder.network_path(scenario)
         assert path is not None, "a scenario in which the slope acts has a network"
         return terrain.ground(network.read(path), low_m, high_m)
 

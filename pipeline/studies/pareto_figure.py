@@ -14,7 +14,7 @@ from typing import Any
 
 from pipeline.core import files
 from pipeline.studies.comparison import Row
-from pipeline.studies.settings import APPROXIMATES, MEASURES, SCENARIO
+from pipeline.studies.variants import APPROXIMATES, MEASURES, SCENARIO
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000", "#999999")
 _SHAPES = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "p", "h")

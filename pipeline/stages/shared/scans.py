@@ -14,7 +14,7 @@ from pipeline.scoring.visibility import Beams
 from pipeline.sensing.scanner import Scanner
 from pipeline.sensing.sites import ScannedSite
 from pipeline.stages.base import Workspace
-from pipeline.stages.scene import SCANS, scene_of
+from pipeline.stages.shared.scene import SCANS, scene_of
 
 
 @dataclass(frozen=True)

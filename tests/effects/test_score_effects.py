@@ -31,8 +31,8 @@ from pipeline.sensing import sensors, sites
 from pipeline.sensing.scene import Scene
 from pipeline.stages import scan, score, statics, tpog, traffic
 from pipeline.stages.base import Workspace
-from pipeline.stages.scan_source import scans
-from pipeline.stages.scene import scene_of
+from pipeline.stages.shared.scans import scans
+from pipeline.stages.shared.scene import scene_of
 from tests.conftest import BUILDING, SCENARIO, SITES, collection, fcd, feature
 from tests.stages import run_stage
 

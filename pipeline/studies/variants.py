@@ -23,8 +23,8 @@ from pydantic import ValidationError
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Grid
 from pipeline.effects import registry
-from pipeline.effects.built_scene import build_scene
 from pipeline.effects.on_traffic import SELF_ACTING
+from pipeline.effects.scene_building import build_scene
 from pipeline.scenario.models import Scenario
 from pipeline.scenario.traffic import TrafficModel
 from pipeline.sensing import sites

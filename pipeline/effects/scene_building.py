@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from pipeline.effects import on_traffic, scenes
+from pipeline.effects import on_traffic, scene_resolving
 from pipeline.scenario.models import Scenario
 from pipeline.sensing.scene import Scene
-from pipeline.world import building
+from pipeline.world import static_world
 
 
 def build_scene(scenario: Scenario) -> Scene:
@@ -16,5 +16,5 @@ def build_scene(scenario: Scenario) -> Scene:
     InputError
         When the scenario, or a file that it names, is wrong.
     """
-    world, _ = building.build(scenario, on_traffic.ground(scenario))
-    return scenes.resolve(scenario, world)
+    world, _ = static_world.build(scenario, on_traffic.ground(scenario))
+    return scene_resolving.resolve(scenario, world)

@@ -6,21 +6,21 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from pipeline.core import files
-from pipeline.effects import registry, scenes
+from pipeline.effects import registry, scene_resolving
 from pipeline.effects.base import Effect
 from pipeline.formats import point_clouds
 from pipeline.scenario.models import Scenario
 from pipeline.sensing.scene import Scene
 from pipeline.sensing.sites import Site
 from pipeline.stages.base import StageInputs, Workspace
-from pipeline.stages.world import STATICS, world_of
+from pipeline.stages.shared.world import STATICS, world_of
 
 SCANS = "scans.parquet"
 
 
 def scene_of(work: Workspace) -> Scene:
     """The scene before the static world, resolved once."""
-    return work.remember("scene", (STATICS,), lambda: scenes.resolve(work.scenario, world_of(work)))
+    return work.remember("scene", (STATICS,), lambda: scene_resolving.resolve(work.scenario, world_of(work)))
 
 
 def scan_inputs(work: Workspace) -> StageInputs:

@@ -19,10 +19,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.artefacts import tables
-from pipeline.artefacts.boxes import COLUMNS, FrameBoxes
+from pipeline.artefacts.recorded_boxes import COLUMNS, FrameBoxes
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Grid, Roi
-from pipeline.effects import scenes
+from pipeline.effects import scene_resolving
 from pipeline.effects.registry import effect_class
 from pipeline.effects.traffic import articulated, pedestrians_bicycles, slope
 from pipeline.effects.traffic.articulated import Articulated
@@ -274,10 +274,10 @@ def test_footprints_stand_on_the_hill_and_sites_below_it_are_refused(hill, tmp_p
     }
     assert tops["h"] == pytest.approx(6 + 5, abs=0.2) and spans["h"] == pytest.approx(5 + 10 * GRADE, abs=0.2)
     assert tops["p"] == pytest.approx(10 + 5, abs=0.1) and spans["p"] == pytest.approx(3)
-    Scanner(scenes.resolve(scene, world)).check(sites.of(scene))
+    Scanner(scene_resolving.resolve(scene, world)).check(sites.of(scene))
     low = values | {"sites": {"grid": {"low_m": [300, 10], "high_m": [300, 10], "spacing_m": 1, "heights_m": [5]}}}
     with pytest.raises(InputError, match=r"z_m = 5 is not above the ground \(z = (6|5\.9\d*)\)"):
-        below = scenes.resolve(from_values(low, tmp_path, "place"), world)
+        below = scene_resolving.resolve(from_values(low, tmp_path, "place"), world)
         Scanner(below).check(below.sites)
 
 

@@ -33,10 +33,10 @@ from pipeline.sensing.sensors import Sensor, rotation
 from pipeline.sensing.sites import Pose
 from pipeline.stages import scan, statics
 from pipeline.stages.base import Workspace
-from pipeline.stages.scan_source import scans
-from pipeline.stages.scene import scene_of
-from pipeline.world import building
+from pipeline.stages.shared.scans import scans
+from pipeline.stages.shared.scene import scene_of
 from pipeline.world import casting as raycast
+from pipeline.world import static_world
 from pipeline.world.casting import Caster, EmptyScan
 from pipeline.world.footprints import Footprint
 from pipeline.world.mesh import World, read_ply
@@ -300,10 +300,10 @@ def test_the_densest_leaves_give_the_plain_scan(mini: Path, tmp_path: Path) -> N
 
 
 def _world(*polygons: tuple[list[tuple[float, float]], float, float]) -> World:
-    builder = building._Builder()
+    builder = static_world._Builder()
     for number, (ring, base, top) in enumerate(polygons):
         footprint = Footprint(str(number), "tree_crown", shapely.orient_polygons(shapely.Polygon(ring)), base, top)
-        builder.add(*building._extrude(footprint), footprint.name, footprint.kind)
+        builder.add(*static_world._extrude(footprint), footprint.name, footprint.kind)
     return builder.world()
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 import pipeline
-from pipeline.core import source
+from pipeline.core import code_digest
 
 PACKAGE = Path(pipeline.__file__).parent
 STAGES = [f"pipeline.stages.{name}" for name in ("statics", "scan", "traffic", "tpog", "score")] + [
@@ -49,8 +49,8 @@ def by_syntax_tree(text: str, package: str) -> set[str]:
 @pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_the_pattern_sees_what_the_syntax_tree_sees(path: Path) -> None:
     text, package = path.read_text(encoding="utf-8"), "pipeline.x"
-    assert by_syntax_tree(text, package) <= set(source.imported(text, package))
-    assert set(source.imported(text, package)) - by_syntax_tree(text, package) <= {"pipeline"}  # in docstrings
+    assert by_syntax_tree(text, package) <= set(code_digest.imported(text, package))
+    assert set(code_digest.imported(text, package)) - by_syntax_tree(text, package) <= {"pipeline"}  # in docstrings
 
 
 ODD = """
@@ -71,14 +71,14 @@ def n():
 
 def test_every_way_to_import_is_seen() -> None:
     expected = ["a", "b.c", "x.y", "x.y.e", "x.f", "x.f.g", "x.f.i", "o.p", "o.p.q", "o.p.r"]
-    assert list(source.imported(ODD, "x.y")) == expected
+    assert list(code_digest.imported(ODD, "x.y")) == expected
     assert by_syntax_tree(ODD, "x.y") == set(expected)
 
 
 DIGESTS = f"""
 import json
-from pipeline.core import source
-print(json.dumps([source.of(name).digest for name in {STAGES}]))
+from pipeline.core import code_digest
+print(json.dumps([code_digest.of(name).digest for name in {STAGES}]))
 """
 
 
@@ -108,7 +108,7 @@ CHANGED = {
 def test_a_changed_line_changes_the_digest_of_what_imports_it(file: str, tmp_path: Path) -> None:
     shutil.copytree(PACKAGE, tmp_path / "pipeline", ignore=shutil.ignore_patterns("__pycache__"))
     before = digests(tmp_path)
-    assert before == [source.of(name).digest for name in STAGES]  # the same source elsewhere is the same
+    assert before == [code_digest.of(name).digest for name in STAGES]  # the same source elsewhere is the same
     path = tmp_path / "pipeline" / file
     path.write_text(path.read_text(encoding="utf-8") + "\n# changed\n", encoding="utf-8")
     after = digests(tmp_path)
@@ -124,10 +124,10 @@ def test_the_module_of_somebody_elses_class_counts_with_what_it_imports(tmp_path
     (package / "effect.py").write_text("from somebody import model\nfrom pipeline.kernels import foliage\n")
     monkeypatch.syspath_prepend(str(tmp_path))
 
-    def digest() -> source.Source:
-        for remembered in (source.of, source._read, source._path):
+    def digest() -> code_digest.Source:
+        for remembered in (code_digest.of, code_digest._read, code_digest._path):
             remembered.cache_clear()
-        return source.of("somebody.effect")
+        return code_digest.of("somebody.effect")
 
     before = digest()
     assert "numba" in before.libraries
@@ -139,6 +139,6 @@ def test_the_module_of_somebody_elses_class_counts_with_what_it_imports(tmp_path
 def test_versions_are_those_installed() -> None:
     import numpy
 
-    assert source.versions(frozenset({"numpy"})) == {"numpy": numpy.__version__}
-    assert source.of("pipeline.stages.scan").libraries >= {"numpy", "numba", "embreex", "pyarrow"}
-    assert "numba" not in source.of("pipeline.stages.statics").libraries
+    assert code_digest.versions(frozenset({"numpy"})) == {"numpy": numpy.__version__}
+    assert code_digest.of("pipeline.stages.scan").libraries >= {"numpy", "numba", "embreex", "pyarrow"}
+    assert "numba" not in code_digest.of("pipeline.stages.statics").libraries
