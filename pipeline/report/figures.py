@@ -56,9 +56,9 @@ def draw(work: Workspace, ranking: Ranking, tpog: Tpog) -> Figures:
     """Draw the figures of the run in a workspace."""
     outlines = outlines_of(world_of(work), extent(tpog.grid, ranking.sites))
     occupied = tpog.counts.sum(axis=2) / tpog.frames
-    field = EntropyField.of(tpog.counts, tpog.frames, tpog.grid)
+    scorer = Scorer(scene_of(work), tpog, work.path("trajectories.parquet"))
     occupancy = _occupancy(tpog, occupied, ranking, outlines) if tpog.counts.any() else ""
-    views, scale = _views(work, ranking, tpog, field, outlines) if len(field.cells) else ((), "")
+    views, scale = _views(work, ranking, scorer, outlines) if len(scorer.field.cells) else ((), "")
     return Figures(occupancy, _sites(tpog, occupied, ranking, outlines), views, scale, outlines)
 
 
@@ -85,15 +85,14 @@ def _sites(tpog: Tpog, occupied: ColumnValues, ranking: Ranking, outlines: Seque
 
 
 def _views(
-    work: Workspace, ranking: Ranking, tpog: Tpog, field: EntropyField, outlines: Sequence[Outlines]
+    work: Workspace, ranking: Ranking, scorer: Scorer, outlines: Sequence[Outlines]
 ) -> tuple[tuple[SeenAndMissed, ...], str]:
     """What the best and the worst site see and miss, and the colour scale of these figures."""
-    extremes = ranking.extremes
+    field, extremes = scorer.field, ranking.extremes
     names = [site.site for site in extremes]
     titles = ("The site",) if len(ranking.sites) == 1 else ("Best site", "Last site")
     peak = float(_columns(field, np.ones(len(field.cells), dtype=np.bool_)).max())
     box = extent(field.grid, extremes)
-    scorer = Scorer(scene_of(work), tpog, work.path("trajectories.parquet"))
     views: dict[int, SeenAndMissed] = {}
     for scan in scans(work, names):
         i = names.index(scan.site.name)
