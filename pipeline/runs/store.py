@@ -7,8 +7,8 @@
 
 An entry is written aside, then renamed: it is there whole or not at all, whenever a process is killed. Every file's
 hash is checked when it is taken; an entry that is damaged is removed, so that it is made again. The entries used
-longest ago go first when all of them take more than a bound. A store that cannot be written is named once, and done
-without.
+longest ago go first when all of them take more than a bound. What else lies in the folder is left alone. A store that
+cannot be written is named once, and done without.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import shutil
 import sys
 import time
@@ -24,6 +25,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from pipeline.artefacts.run_record import STAGES
 from pipeline.core import files
 from pipeline.core.cost import Cost
 from pipeline.core.errors import InputError
@@ -38,6 +40,12 @@ DEFAULT_PLACE = Path("runs", ".store")
 DEFAULT_MAX_GB = 10.0
 
 _ENTRY = "entry.json"
+
+_NAME = re.compile(rf"({'|'.join(STAGES)})-[0-9a-f]{{32}}")
+"""An entry's folder. A folder of any other name is not the store's own, and never touched."""
+
+_WORK_NAME = re.compile(rf"{_NAME.pattern}|removed-{_NAME.pattern}-[0-9]+-[0-9]+")
+"""What the store makes in its folders for work."""
 
 
 @dataclass(frozen=True)
@@ -198,9 +206,10 @@ class Store:
         return removed
 
     def _folders(self) -> list[Path]:
+        """Entries, damaged ones too."""
         if self.folder is None or not self.folder.is_dir():
             return []
-        return [path for path in self.folder.iterdir() if not path.name.startswith(".") and path.is_dir()]
+        return [path for path in self.folder.iterdir() if _NAME.fullmatch(path.name) and path.is_dir()]
 
     def _place(self, stage: str, key: str) -> Path:
         assert self.folder is not None
@@ -227,7 +236,8 @@ class Store:
     def _clear_work(self, folder: Path) -> None:
         """Remove what killed processes left; who is still at work holds its lock."""
         places = [place for name in (".work", ".locks") if (place := folder / name).is_dir()]
-        for name in {path.name for place in places for path in place.iterdir()}:
+        names = {path.name for place in places for path in place.iterdir()}
+        for name in filter(_WORK_NAME.fullmatch, names):
             with suppress(OSError), locked(folder / ".locks" / name, wait=False, remove=True) as free:
                 if free:
                     shutil.rmtree(folder / ".work" / name, ignore_errors=True)

@@ -305,6 +305,28 @@ def test_the_command_line_lists_prunes_and_clears(done: tuple[pipeline.Scenario,
         assert (code, message in said) == (2, True), said
 
 
+def test_what_is_not_the_stores_own_is_left_alone(
+    mini: Path, tmp_path: Path, store: Path, egvs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A folder that somebody else uses, and names as the store where its own lie is not lost."""
+    (removed := store / ".work" / f"removed-scan-{'0' * 32}-1-2").mkdir(parents=True)
+    (store / ".locks").mkdir()
+    (damaged := store / f"scan-{'0' * 32}").mkdir()
+    others = ("photos/a", f"photos-{'0' * 32}/a", "scan-2024/a", ".work/mine/a", ".locks/mine", ".hidden/a")
+    for name in others:
+        (store / name).parent.mkdir(exist_ok=True)
+        (store / name).write_text("of somebody else")
+    monkeypatch.setenv("EGVS_STORE_MAX_GB", "0.0001")
+    pipeline.run(pipeline.load(mini), tmp_path / "out")
+    assert not removed.exists() and not damaged.exists()
+    for words in (("--prune", "--max", "1K"), ("--clear",)):
+        damaged.mkdir()
+        assert egvs("store", *words)[0] == 0
+        assert Store(store).entries() == []
+    assert not damaged.exists()
+    assert {name: (store / name).read_text() for name in others} == dict.fromkeys(others, "of somebody else")
+
+
 def test_a_run_says_what_it_fetched(done: tuple[pipeline.Scenario, Path], tmp_path: Path, egvs) -> None:
     scenario, _ = done
     code, printed, said = egvs("run", scenario.folder, "--out", tmp_path / "other")
