@@ -14,7 +14,6 @@ cannot be written is named once, and done without.
 from __future__ import annotations
 
 import json
-import math
 import os
 import re
 import shutil
@@ -28,16 +27,10 @@ from pathlib import Path
 from pipeline.artefacts.run_record import STAGES
 from pipeline.core import files
 from pipeline.core.cost import Cost
-from pipeline.core.errors import InputError
 from pipeline.core.progress import Progress, silent
+from pipeline.runs import store_settings
 from pipeline.runs.locking import locked
 from pipeline.runs.stages import Made
-
-PLACE, MAX_GB = "EGVS_STORE", "EGVS_STORE_MAX_GB"
-"""Environment variables: where the store is (empty for none), and how much it may hold."""
-
-DEFAULT_PLACE = Path("runs", ".store")
-DEFAULT_MAX_GB = 10.0
 
 _ENTRY = "entry.json"
 
@@ -93,7 +86,10 @@ class Store:
     """
 
     def __init__(
-        self, folder: Path | None, bound_bytes: float = DEFAULT_MAX_GB * 1e9, note: Callable[[str], None] = _to_stderr
+        self,
+        folder: Path | None,
+        bound_bytes: float = store_settings.DEFAULT_MAX_GB * 1e9,
+        note: Callable[[str], None] = _to_stderr,
     ) -> None:
         self.folder, self.bound_bytes, self._note = folder, bound_bytes, note
         self._can_write = folder is not None
@@ -103,15 +99,7 @@ class Store:
     @classmethod
     def default(cls) -> Store:
         """Where ``EGVS_STORE`` says, else beside the runs."""
-        place, most = os.environ.get(PLACE), os.environ.get(MAX_GB)
-        try:
-            bound_gb = DEFAULT_MAX_GB if most is None else float(most)
-        except ValueError:
-            bound_gb = math.nan
-        if not 0 <= bound_gb < math.inf:
-            raise InputError(MAX_GB, f"{most!r}", "how many GB the store may hold, for example 10")
-        folder = DEFAULT_PLACE if place is None else Path(place) if place else None
-        return cls(folder, bound_gb * 1e9)
+        return cls(*store_settings.read())
 
     # ---- one entry
 

@@ -262,7 +262,8 @@ def test_the_bound_holds_from_the_first_entry_on(
     assert 0 < sum(entry.bytes for entry in entries) <= 1e5 and len(entries) < len(STAGES)
     monkeypatch.setenv("EGVS_STORE_MAX_GB", "lots")
     with pytest.raises(InputError, match="EGVS_STORE_MAX_GB: 'lots'"):
-        pipeline.run(scenario, tmp_path / "out")
+        pipeline.run(scenario, tmp_path / "other")
+    assert not (tmp_path / "other").exists()
 
 
 def test_a_store_that_cannot_be_written_is_named_once(
@@ -325,6 +326,21 @@ def test_what_is_not_the_stores_own_is_left_alone(
         assert Store(store).entries() == []
     assert not damaged.exists()
     assert {name: (store / name).read_text() for name in others} == dict.fromkeys(others, "of somebody else")
+
+
+@pytest.mark.parametrize("name", [".store", ".store/mine", "elsewhere/../.store", "link", "link/mine"])
+@pytest.mark.parametrize("verb", ["run", "statics", "accuracy"])
+def test_a_run_does_not_go_into_the_store(
+    mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, egvs, verb: str, name: str
+) -> None:
+    """It would wait for ever on its own lock; the store by default, which a run's folder lies beside, is no other."""
+    monkeypatch.delenv("EGVS_STORE")
+    monkeypatch.chdir(tmp_path)
+    (store := tmp_path / "runs" / ".store").mkdir(parents=True)
+    (tmp_path / "runs" / "link").symlink_to(store)
+    code, _, said = egvs(verb, mini, "--out", f"runs/{name}")
+    assert (code, said.count("the store (runs/.store), or lies in it")) == (2, 1), said
+    assert not list(store.iterdir())
 
 
 def test_a_run_says_what_it_fetched(done: tuple[pipeline.Scenario, Path], tmp_path: Path, egvs) -> None:
