@@ -1,14 +1,14 @@
 """The store: what a stage once made, kept under the hash of everything that it depends on.
 
-    <store>/<stage>-<key>/          artefacts, companions, and entry.json: hashes, summary, cost
+    <store>/<stage>-<key>/          artefacts, companions, and entry.json: hashes (its own too), summary, cost
     <store>/.locks/<stage>-<key>    held by the one process that makes this entry; others wait for it, then take it
     <store>/.work/                  what is not whole yet, or no longer
     <store>/.lock                   shared by those who read or lay down an entry, held alone by those who remove one
 
 An entry is written aside, then renamed: it is there whole or not at all, whenever a process is killed. Every file's
-hash is checked when it is taken; an entry that is damaged is removed, so that it is made again. The entries used
-longest ago go first when all of them take more than a bound. What else lies in the folder is left alone. A store that
-cannot be written is named once, and done without.
+hash is checked when it is taken, and that of entry.json whenever it is read; an entry that is damaged is removed, so
+that it is made again. The entries used longest ago go first when all of them take more than a bound. What else lies in
+the folder is left alone. A store that cannot be written is named once, and done without.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ from pipeline.runs import store_settings
 from pipeline.runs.locking import locked
 from pipeline.runs.stages import Made
 
-_ENTRY = "entry.json"
+_ENTRY, _HASH = "entry.json", "sha256"
+"""What the store notes of an entry, and the note's key for the hash of all else in it."""
 
 _NAME = re.compile(rf"({'|'.join(STAGES)})-[0-9a-f]{{32}}")
 """An entry's folder. A folder of any other name is not the store's own, and never touched."""
@@ -244,7 +245,11 @@ def _lay(kept: Path, path: Path, digest: str, link: bool) -> None:
     with files.aside(path) as partial:
         if link:
             path.unlink(missing_ok=True)  # to rename one name of a file over another one does nothing
-        _copy(kept, partial, link)
+        try:
+            _copy(kept, partial, link)
+        except OSError as error:
+            error.filename, error.filename2 = str(path), None  # else a full disk is blamed on the file that is read
+            raise
         if files.sha256_of(partial) != digest:
             raise _Damaged(f"{kept.name} has other bytes than were kept")
 
@@ -263,19 +268,23 @@ def _copy(path: Path, other: Path, link: bool) -> None:
 def _to_json(stage: str, key: str, folder: Path, made: Made) -> str:
     sizes = {name: (folder / name).stat().st_size for name in made.files}
     about = {"stage": stage, "key": key, **asdict(made), "bytes": sizes, "created": time.time()}
+    about[_HASH] = files.hash_of(about)
     return json.dumps(about, indent=1, ensure_ascii=False) + "\n"
 
 
 def _read(folder: Path) -> Entry:
     try:
         value = json.loads((folder / _ENTRY).read_text(encoding="utf-8"))
+        if value.pop(_HASH) != files.hash_of(value):
+            raise _Damaged(f"{_ENTRY} says something else than was written")
         last_used = (folder / _ENTRY).stat().st_mtime
         artefacts, companions, summary = (dict(value[name]) for name in ("artefacts", "companions", "summary"))
         made = Made(artefacts, companions, summary, Cost(**value["cost"]))
         size = sum(int(size) for size in value["bytes"].values())
         entry = Entry(folder, value["stage"], value["key"], made, size, float(value["created"]), last_used)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        name = f"{entry.stage}-{entry.key[:32]}"
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
         raise _Damaged(f"{_ENTRY}: {error}") from None
-    if folder.name != f"{entry.stage}-{entry.key[:32]}":
-        raise _Damaged(f"{_ENTRY} is of {entry.stage}-{entry.key[:32]}")
+    if folder.name != name:
+        raise _Damaged(f"{_ENTRY} is of {name}")
     return entry

@@ -6,11 +6,13 @@ changed and removed; the program with one line changed. Nothing waits for a cloc
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import random
 import shutil
 import signal
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -159,6 +161,19 @@ def cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-1])
 
 
+def edited(how: Callable[[dict], object], rehash: bool = False) -> Callable[[Path], object]:
+    """A note of which a value was changed by hand."""
+
+    def edit(path: Path) -> None:
+        how(value := json.loads(path.read_text()))
+        if rehash:
+            del value["sha256"]
+            value["sha256"] = files.hash_of(value)
+        path.write_text(json.dumps(value))
+
+    return edit
+
+
 DAMAGE = {
     "a changed byte": ("tpog-*/tpog.parquet", a_changed_byte),
     "an artefact cut short": ("tpog-*/tpog.parquet", cut),
@@ -167,6 +182,13 @@ DAMAGE = {
     "an empty note": ("tpog-*/entry.json", lambda path: path.write_text("")),
     "a note of something else": ("tpog-*/entry.json", lambda path: path.write_text("[]")),
     "a note with holes": ("tpog-*/entry.json", lambda path: path.write_text('{"stage": "tpog", "artefacts": {}}')),
+    "a note without its hash": ("tpog-*/entry.json", edited(lambda note: note.pop("sha256"))),
+    "another summary": ("tpog-*/entry.json", edited(lambda note: note["summary"].popitem())),
+    "no artefacts": ("tpog-*/entry.json", edited(lambda note: note.update(artefacts={}))),
+    "a key that is a number": ("tpog-*/entry.json", edited(lambda note: note.update(key=5), rehash=True)),
+    "a time beyond all times": ("tpog-*/entry.json", edited(lambda note: note.update(created=10**400), rehash=True)),
+    "a lone surrogate": ("tpog-*/entry.json", edited(lambda note: note["summary"].update(best="\ud800"))),
+    "costs of something else": ("tpog-*/entry.json", edited(lambda note: note.update(cost=[]), rehash=True)),
 }
 
 
@@ -187,6 +209,29 @@ def test_a_damaged_entry_is_named_and_made_again(
     assert digests(tmp_path / "other") == digests(out)
     assert_whole(store)
     assert states(scenario, tmp_path / "third")["tpog"] == "fetched"
+
+
+@pytest.mark.parametrize("case", DAMAGE)
+def test_a_damaged_entry_is_cleared(done: tuple[pipeline.Scenario, Path], store: Path, egvs, case: str) -> None:
+    pattern, damage = DAMAGE[case]
+    (path,) = store.glob(pattern)
+    damage(path)
+    assert egvs("store")[0] == 0
+    assert egvs("store", "--clear")[0] == 0
+    assert not list(store.glob("*-*"))
+
+
+def test_a_full_disk_is_the_destinations(
+    done: tuple[pipeline.Scenario, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, egvs
+) -> None:
+    """A copy that cannot be written is not blamed on the store's file, which was only read."""
+
+    def full(path: Path, other: Path) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", str(path), None, str(other))
+
+    monkeypatch.setattr(shutil, "copyfile", full)
+    code, _, said = egvs("run", done[0].folder, "--out", other := tmp_path / "other")
+    assert (code, said.splitlines()[-1]) == (1, f"egvs: {other / 'statics.ply'}: No space left on device")
 
 
 def test_several_at_once_make_every_stage_once(mini: Path, tmp_path: Path, store: Path) -> None:
