@@ -27,6 +27,7 @@ from pathlib import Path
 from pipeline.artefacts.run_record import STAGES
 from pipeline.core import files
 from pipeline.core.cost import Cost
+from pipeline.core.errors import InputError
 from pipeline.core.progress import Progress, silent
 from pipeline.runs import store_settings
 from pipeline.runs.locking import locked
@@ -95,12 +96,20 @@ class Store:
         self.folder, self.bound_bytes, self._note = folder, bound_bytes, note
         self._can_write = folder is not None
         if folder is not None:
-            self._clear_work(folder)
+            with suppress(OSError):  # which is named where it is in the way
+                self._clear_work(folder)
 
     @classmethod
     def default(cls) -> Store:
         """Where ``EGVS_STORE`` says, else beside the runs."""
         return cls(*store_settings.read())
+
+    def check(self, *, changed: bool) -> None:
+        """InputError where the folder is a file, or where there is no store that could be ``changed``."""
+        if self.folder is None and changed:
+            raise InputError(store_settings.PLACE, "empty, so that there is no store", "the store's folder")
+        if self.folder is not None and _is(Path.is_file, self.folder):
+            raise InputError(self.folder, "is a file", f"the store's folder, which {store_settings.PLACE} names")
 
     # ---- one entry
 
@@ -110,7 +119,7 @@ class Store:
         ``link`` gives the files a second name instead of copying them: for folders in which files are replaced, never
         written into.
         """
-        if self.folder is None or not (folder := self._place(stage, key)).is_dir():
+        if self.folder is None or not _is(Path.is_dir, folder := self._place(stage, key)):
             return None
         try:
             with self._shared():
@@ -196,7 +205,7 @@ class Store:
 
     def _folders(self) -> list[Path]:
         """Entries, damaged ones too."""
-        if self.folder is None or not self.folder.is_dir():
+        if self.folder is None or not _is(Path.is_dir, self.folder):
             return []
         return [path for path in self.folder.iterdir() if _NAME.fullmatch(path.name) and path.is_dir()]
 
@@ -236,6 +245,14 @@ class Store:
         self._note(
             f"{self.folder}: the store cannot be written ({error.strerror or error}); the run goes on without it"
         )
+
+
+def _is(kind: Callable[[Path], bool], path: Path) -> bool:
+    """Whether there is a file or a folder; not where the path is too long, or leads through what is closed."""
+    try:
+        return kind(path)
+    except OSError:
+        return False
 
 
 def _lay(kept: Path, path: Path, digest: str, link: bool) -> None:

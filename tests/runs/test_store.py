@@ -311,13 +311,35 @@ def test_the_bound_holds_from_the_first_entry_on(
     assert not (tmp_path / "other").exists()
 
 
+@pytest.mark.parametrize("place", ["file", "file/store", "l" * 300, "/".join(["long"] * 2000)])
 def test_a_store_that_cannot_be_written_is_named_once(
-    mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, egvs, place: str
 ) -> None:
     (tmp_path / "file").write_text("")
-    monkeypatch.setenv("EGVS_STORE", str(tmp_path / "file" / "store"))
-    assert set(states(pipeline.load(mini), tmp_path / "out").values()) == {"done"}
-    assert capsys.readouterr().err.count("the store cannot be written") == 1
+    monkeypatch.setenv("EGVS_STORE", str(tmp_path / place))
+    code, _, said = egvs("run", mini, "--out", tmp_path / "out")
+    assert (code, said.count("the store cannot be written"), said.count("from store")) == (0, 1, 0)
+    assert egvs("statics", mini, "--out", tmp_path / "out")[0] == 0
+    assert egvs("store")[0] == (2 if place == "file" else 0)
+
+
+def test_what_cannot_be_asked_of_the_store_is_named(
+    tmp_path: Path, store: Path, monkeypatch: pytest.MonkeyPatch, egvs
+) -> None:
+    for words in (("--clear", "--prune"), ("--clear", "--prune", "--max", "2G")):
+        code, _, said = egvs("store", *words)
+        assert (code, "--clear: with --prune" in said) == (2, True), said
+    assert egvs("store", "--clear", "--max", "2G")[0] == 2
+    (tmp_path / "file").write_text("")
+    for place, words, message in (
+        (tmp_path / "file", (), f"{tmp_path / 'file'}: is a file"),
+        (tmp_path / "file", ("--clear",), "is a file"),
+        ("", ("--clear",), "EGVS_STORE: empty, so that there is no store"),
+        ("", ("--prune",), "there is no store"),
+    ):
+        monkeypatch.setenv("EGVS_STORE", str(place))
+        code, printed, said = egvs("store", *words)
+        assert (code, printed, message in said) == (2, "", True), said
 
 
 def test_an_empty_name_is_no_store(
