@@ -310,9 +310,12 @@ def store(
     from pipeline.cli import tables
     from pipeline.runs.store import Store
 
+    if clear and prune:
+        raise InputError("--clear", "with --prune", "one of them: --clear removes every entry, --prune the oldest")
     if most is not None and not prune:
         raise InputError("--max", "without --prune", "egvs store --prune --max 2G")
     kept = Store.default()
+    kept.check(changed=clear or prune)
     if clear or prune:
         bound = -1.0 if clear else kept.bound_bytes if most is None else arguments.size_bytes(most)
         tables.print_removed(kept, kept.prune(bound))

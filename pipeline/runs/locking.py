@@ -9,11 +9,13 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from pipeline.core.errors import InputError, RunError
+from pipeline.runs import store_settings
 
 
 @contextmanager
 def alone(folder: Path) -> Iterator[None]:
-    """Keep two runs out of one folder."""
+    """Keep two runs out of one folder, and every run out of the store; the store's settings are right then."""
+    store_settings.keep_out(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = (folder / ".lock").open("w")

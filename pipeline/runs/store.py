@@ -1,21 +1,21 @@
 """The store: what a stage once made, kept under the hash of everything that it depends on.
 
-    <store>/<stage>-<key>/          artefacts, companions, and entry.json: hashes, summary, cost
+    <store>/<stage>-<key>/          artefacts, companions, and entry.json: hashes (its own too), summary, cost
     <store>/.locks/<stage>-<key>    held by the one process that makes this entry; others wait for it, then take it
     <store>/.work/                  what is not whole yet, or no longer
     <store>/.lock                   shared by those who read or lay down an entry, held alone by those who remove one
 
 An entry is written aside, then renamed: it is there whole or not at all, whenever a process is killed. Every file's
-hash is checked when it is taken; an entry that is damaged is removed, so that it is made again. The entries used
-longest ago go first when all of them take more than a bound. A store that cannot be written is named once, and done
-without.
+hash is checked when it is taken, and that of entry.json whenever it is read; an entry that is damaged is removed, so
+that it is made again. The entries used longest ago go first when all of them take more than a bound. What else lies in
+the folder is left alone. A store that cannot be written is named once, and done without.
 """
 
 from __future__ import annotations
 
 import json
-import math
 import os
+import re
 import shutil
 import sys
 import time
@@ -24,20 +24,23 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from pipeline.artefacts.run_record import STAGES
 from pipeline.core import files
 from pipeline.core.cost import Cost
 from pipeline.core.errors import InputError
 from pipeline.core.progress import Progress, silent
+from pipeline.runs import store_settings
 from pipeline.runs.locking import locked
 from pipeline.runs.stages import Made
 
-PLACE, MAX_GB = "EGVS_STORE", "EGVS_STORE_MAX_GB"
-"""Environment variables: where the store is (empty for none), and how much it may hold."""
+_ENTRY, _HASH = "entry.json", "sha256"
+"""What the store notes of an entry, and the note's key for the hash of all else in it."""
 
-DEFAULT_PLACE = Path("runs", ".store")
-DEFAULT_MAX_GB = 10.0
+_NAME = re.compile(rf"({'|'.join(STAGES)})-[0-9a-f]{{32}}")
+"""An entry's folder. A folder of any other name is not the store's own, and never touched."""
 
-_ENTRY = "entry.json"
+_WORK_NAME = re.compile(rf"{_NAME.pattern}|removed-{_NAME.pattern}-[0-9]+-[0-9]+")
+"""What the store makes in its folders for work."""
 
 
 @dataclass(frozen=True)
@@ -85,25 +88,28 @@ class Store:
     """
 
     def __init__(
-        self, folder: Path | None, bound_bytes: float = DEFAULT_MAX_GB * 1e9, note: Callable[[str], None] = _to_stderr
+        self,
+        folder: Path | None,
+        bound_bytes: float = store_settings.DEFAULT_MAX_GB * 1e9,
+        note: Callable[[str], None] = _to_stderr,
     ) -> None:
         self.folder, self.bound_bytes, self._note = folder, bound_bytes, note
         self._can_write = folder is not None
         if folder is not None:
-            self._clear_work(folder)
+            with suppress(OSError):  # which is named where it is in the way
+                self._clear_work(folder)
 
     @classmethod
     def default(cls) -> Store:
         """Where ``EGVS_STORE`` says, else beside the runs."""
-        place, most = os.environ.get(PLACE), os.environ.get(MAX_GB)
-        try:
-            bound_gb = DEFAULT_MAX_GB if most is None else float(most)
-        except ValueError:
-            bound_gb = math.nan
-        if not 0 <= bound_gb < math.inf:
-            raise InputError(MAX_GB, f"{most!r}", "how many GB the store may hold, for example 10")
-        folder = DEFAULT_PLACE if place is None else Path(place) if place else None
-        return cls(folder, bound_gb * 1e9)
+        return cls(*store_settings.read())
+
+    def check(self, *, changed: bool) -> None:
+        """InputError where the folder is a file, or where there is no store that could be ``changed``."""
+        if self.folder is None and changed:
+            raise InputError(store_settings.PLACE, "empty, so that there is no store", "the store's folder")
+        if self.folder is not None and _is(Path.is_file, self.folder):
+            raise InputError(self.folder, "is a file", f"the store's folder, which {store_settings.PLACE} names")
 
     # ---- one entry
 
@@ -113,7 +119,7 @@ class Store:
         ``link`` gives the files a second name instead of copying them: for folders in which files are replaced, never
         written into.
         """
-        if self.folder is None or not (folder := self._place(stage, key)).is_dir():
+        if self.folder is None or not _is(Path.is_dir, folder := self._place(stage, key)):
             return None
         try:
             with self._shared():
@@ -198,9 +204,10 @@ class Store:
         return removed
 
     def _folders(self) -> list[Path]:
-        if self.folder is None or not self.folder.is_dir():
+        """Entries, damaged ones too."""
+        if self.folder is None or not _is(Path.is_dir, self.folder):
             return []
-        return [path for path in self.folder.iterdir() if not path.name.startswith(".") and path.is_dir()]
+        return [path for path in self.folder.iterdir() if _NAME.fullmatch(path.name) and path.is_dir()]
 
     def _place(self, stage: str, key: str) -> Path:
         assert self.folder is not None
@@ -227,7 +234,8 @@ class Store:
     def _clear_work(self, folder: Path) -> None:
         """Remove what killed processes left; who is still at work holds its lock."""
         places = [place for name in (".work", ".locks") if (place := folder / name).is_dir()]
-        for name in {path.name for place in places for path in place.iterdir()}:
+        names = {path.name for place in places for path in place.iterdir()}
+        for name in filter(_WORK_NAME.fullmatch, names):
             with suppress(OSError), locked(folder / ".locks" / name, wait=False, remove=True) as free:
                 if free:
                     shutil.rmtree(folder / ".work" / name, ignore_errors=True)
@@ -239,6 +247,14 @@ class Store:
         )
 
 
+def _is(kind: Callable[[Path], bool], path: Path) -> bool:
+    """Whether there is a file or a folder; not where the path is too long, or leads through what is closed."""
+    try:
+        return kind(path)
+    except OSError:
+        return False
+
+
 def _lay(kept: Path, path: Path, digest: str, link: bool) -> None:
     """One file into a run's folder, whole or not at all; :class:`_Damaged` when it is not as it was kept."""
     if not (kept.is_file() and os.access(kept, os.R_OK)):
@@ -246,7 +262,11 @@ def _lay(kept: Path, path: Path, digest: str, link: bool) -> None:
     with files.aside(path) as partial:
         if link:
             path.unlink(missing_ok=True)  # to rename one name of a file over another one does nothing
-        _copy(kept, partial, link)
+        try:
+            _copy(kept, partial, link)
+        except OSError as error:
+            error.filename, error.filename2 = str(path), None  # else a full disk is blamed on the file that is read
+            raise
         if files.sha256_of(partial) != digest:
             raise _Damaged(f"{kept.name} has other bytes than were kept")
 
@@ -265,19 +285,23 @@ def _copy(path: Path, other: Path, link: bool) -> None:
 def _to_json(stage: str, key: str, folder: Path, made: Made) -> str:
     sizes = {name: (folder / name).stat().st_size for name in made.files}
     about = {"stage": stage, "key": key, **asdict(made), "bytes": sizes, "created": time.time()}
+    about[_HASH] = files.hash_of(about)
     return json.dumps(about, indent=1, ensure_ascii=False) + "\n"
 
 
 def _read(folder: Path) -> Entry:
     try:
         value = json.loads((folder / _ENTRY).read_text(encoding="utf-8"))
+        if value.pop(_HASH) != files.hash_of(value):
+            raise _Damaged(f"{_ENTRY} says something else than was written")
         last_used = (folder / _ENTRY).stat().st_mtime
         artefacts, companions, summary = (dict(value[name]) for name in ("artefacts", "companions", "summary"))
         made = Made(artefacts, companions, summary, Cost(**value["cost"]))
         size = sum(int(size) for size in value["bytes"].values())
         entry = Entry(folder, value["stage"], value["key"], made, size, float(value["created"]), last_used)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        name = f"{entry.stage}-{entry.key[:32]}"
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
         raise _Damaged(f"{_ENTRY}: {error}") from None
-    if folder.name != f"{entry.stage}-{entry.key[:32]}":
-        raise _Damaged(f"{_ENTRY} is of {entry.stage}-{entry.key[:32]}")
+    if folder.name != name:
+        raise _Damaged(f"{_ENTRY} is of {name}")
     return entry

@@ -6,11 +6,13 @@ changed and removed; the program with one line changed. Nothing waits for a cloc
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import random
 import shutil
 import signal
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -159,6 +161,19 @@ def cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-1])
 
 
+def edited(how: Callable[[dict], object], rehash: bool = False) -> Callable[[Path], object]:
+    """A note of which a value was changed by hand."""
+
+    def edit(path: Path) -> None:
+        how(value := json.loads(path.read_text()))
+        if rehash:
+            del value["sha256"]
+            value["sha256"] = files.hash_of(value)
+        path.write_text(json.dumps(value))
+
+    return edit
+
+
 DAMAGE = {
     "a changed byte": ("tpog-*/tpog.parquet", a_changed_byte),
     "an artefact cut short": ("tpog-*/tpog.parquet", cut),
@@ -167,6 +182,13 @@ DAMAGE = {
     "an empty note": ("tpog-*/entry.json", lambda path: path.write_text("")),
     "a note of something else": ("tpog-*/entry.json", lambda path: path.write_text("[]")),
     "a note with holes": ("tpog-*/entry.json", lambda path: path.write_text('{"stage": "tpog", "artefacts": {}}')),
+    "a note without its hash": ("tpog-*/entry.json", edited(lambda note: note.pop("sha256"))),
+    "another summary": ("tpog-*/entry.json", edited(lambda note: note["summary"].popitem())),
+    "no artefacts": ("tpog-*/entry.json", edited(lambda note: note.update(artefacts={}))),
+    "a key that is a number": ("tpog-*/entry.json", edited(lambda note: note.update(key=5), rehash=True)),
+    "a time beyond all times": ("tpog-*/entry.json", edited(lambda note: note.update(created=10**400), rehash=True)),
+    "a lone surrogate": ("tpog-*/entry.json", edited(lambda note: note["summary"].update(best="\ud800"))),
+    "costs of something else": ("tpog-*/entry.json", edited(lambda note: note.update(cost=[]), rehash=True)),
 }
 
 
@@ -187,6 +209,29 @@ def test_a_damaged_entry_is_named_and_made_again(
     assert digests(tmp_path / "other") == digests(out)
     assert_whole(store)
     assert states(scenario, tmp_path / "third")["tpog"] == "fetched"
+
+
+@pytest.mark.parametrize("case", DAMAGE)
+def test_a_damaged_entry_is_cleared(done: tuple[pipeline.Scenario, Path], store: Path, egvs, case: str) -> None:
+    pattern, damage = DAMAGE[case]
+    (path,) = store.glob(pattern)
+    damage(path)
+    assert egvs("store")[0] == 0
+    assert egvs("store", "--clear")[0] == 0
+    assert not list(store.glob("*-*"))
+
+
+def test_a_full_disk_is_the_destinations(
+    done: tuple[pipeline.Scenario, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, egvs
+) -> None:
+    """A copy that cannot be written is not blamed on the store's file, which was only read."""
+
+    def full(path: Path, other: Path) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", str(path), None, str(other))
+
+    monkeypatch.setattr(shutil, "copyfile", full)
+    code, _, said = egvs("run", done[0].folder, "--out", other := tmp_path / "other")
+    assert (code, said.splitlines()[-1]) == (1, f"egvs: {other / 'statics.ply'}: No space left on device")
 
 
 def test_several_at_once_make_every_stage_once(mini: Path, tmp_path: Path, store: Path) -> None:
@@ -262,16 +307,39 @@ def test_the_bound_holds_from_the_first_entry_on(
     assert 0 < sum(entry.bytes for entry in entries) <= 1e5 and len(entries) < len(STAGES)
     monkeypatch.setenv("EGVS_STORE_MAX_GB", "lots")
     with pytest.raises(InputError, match="EGVS_STORE_MAX_GB: 'lots'"):
-        pipeline.run(scenario, tmp_path / "out")
+        pipeline.run(scenario, tmp_path / "other")
+    assert not (tmp_path / "other").exists()
 
 
+@pytest.mark.parametrize("place", ["file", "file/store", "l" * 300, "/".join(["long"] * 2000)])
 def test_a_store_that_cannot_be_written_is_named_once(
-    mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, egvs, place: str
 ) -> None:
     (tmp_path / "file").write_text("")
-    monkeypatch.setenv("EGVS_STORE", str(tmp_path / "file" / "store"))
-    assert set(states(pipeline.load(mini), tmp_path / "out").values()) == {"done"}
-    assert capsys.readouterr().err.count("the store cannot be written") == 1
+    monkeypatch.setenv("EGVS_STORE", str(tmp_path / place))
+    code, _, said = egvs("run", mini, "--out", tmp_path / "out")
+    assert (code, said.count("the store cannot be written"), said.count("from store")) == (0, 1, 0)
+    assert egvs("statics", mini, "--out", tmp_path / "out")[0] == 0
+    assert egvs("store")[0] == (2 if place == "file" else 0)
+
+
+def test_what_cannot_be_asked_of_the_store_is_named(
+    tmp_path: Path, store: Path, monkeypatch: pytest.MonkeyPatch, egvs
+) -> None:
+    for words in (("--clear", "--prune"), ("--clear", "--prune", "--max", "2G")):
+        code, _, said = egvs("store", *words)
+        assert (code, "--clear: with --prune" in said) == (2, True), said
+    assert egvs("store", "--clear", "--max", "2G")[0] == 2
+    (tmp_path / "file").write_text("")
+    for place, words, message in (
+        (tmp_path / "file", (), f"{tmp_path / 'file'}: is a file"),
+        (tmp_path / "file", ("--clear",), "is a file"),
+        ("", ("--clear",), "EGVS_STORE: empty, so that there is no store"),
+        ("", ("--prune",), "there is no store"),
+    ):
+        monkeypatch.setenv("EGVS_STORE", str(place))
+        code, printed, said = egvs("store", *words)
+        assert (code, printed, message in said) == (2, "", True), said
 
 
 def test_an_empty_name_is_no_store(
@@ -303,6 +371,43 @@ def test_the_command_line_lists_prunes_and_clears(done: tuple[pipeline.Scenario,
     for words, message in ((("--max", "2G"), "without --prune"), (("--prune", "--max", "much"), "--max: 'much'")):
         code, _, said = egvs("store", *words)
         assert (code, message in said) == (2, True), said
+
+
+def test_what_is_not_the_stores_own_is_left_alone(
+    mini: Path, tmp_path: Path, store: Path, egvs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A folder that somebody else uses, and names as the store where its own lie is not lost."""
+    (removed := store / ".work" / f"removed-scan-{'0' * 32}-1-2").mkdir(parents=True)
+    (store / ".locks").mkdir()
+    (damaged := store / f"scan-{'0' * 32}").mkdir()
+    others = ("photos/a", f"photos-{'0' * 32}/a", "scan-2024/a", ".work/mine/a", ".locks/mine", ".hidden/a")
+    for name in others:
+        (store / name).parent.mkdir(exist_ok=True)
+        (store / name).write_text("of somebody else")
+    monkeypatch.setenv("EGVS_STORE_MAX_GB", "0.0001")
+    pipeline.run(pipeline.load(mini), tmp_path / "out")
+    assert not removed.exists() and not damaged.exists()
+    for words in (("--prune", "--max", "1K"), ("--clear",)):
+        damaged.mkdir()
+        assert egvs("store", *words)[0] == 0
+        assert Store(store).entries() == []
+    assert not damaged.exists()
+    assert {name: (store / name).read_text() for name in others} == dict.fromkeys(others, "of somebody else")
+
+
+@pytest.mark.parametrize("name", [".store", ".store/mine", "elsewhere/../.store", "link", "link/mine"])
+@pytest.mark.parametrize("verb", ["run", "statics", "accuracy"])
+def test_a_run_does_not_go_into_the_store(
+    mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, egvs, verb: str, name: str
+) -> None:
+    """It would wait for ever on its own lock; the store by default, which a run's folder lies beside, is no other."""
+    monkeypatch.delenv("EGVS_STORE")
+    monkeypatch.chdir(tmp_path)
+    (store := tmp_path / "runs" / ".store").mkdir(parents=True)
+    (tmp_path / "runs" / "link").symlink_to(store)
+    code, _, said = egvs(verb, mini, "--out", f"runs/{name}")
+    assert (code, said.count("the store (runs/.store), or lies in it")) == (2, 1), said
+    assert not list(store.iterdir())
 
 
 def test_a_run_says_what_it_fetched(done: tuple[pipeline.Scenario, Path], tmp_path: Path, egvs) -> None:
