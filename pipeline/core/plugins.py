@@ -11,11 +11,22 @@ from __future__ import annotations
 
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
+from operator import attrgetter
 from typing import Any
 
 from pipeline.core.errors import InputError, MissingBackendError
 
-_OWN = "egvs"
+OWN = "egvs"
+"""The package of this program's own parts."""
+
+_RIGHT = {
+    "egvs.effects": (
+        ("NAME", "SOURCE", "STAGE", "KIND", "Model.of"),
+        "a subclass of Detect or another kind in pipeline.effects.base, with NAME, SOURCE and Model",
+    ),
+    "egvs.point_clouds": (("read",), "a module or an object with a function read"),
+}
+"""What an object of a group must have, and what would be right, in words."""
 
 
 def names(group: str) -> list[str]:
@@ -25,7 +36,22 @@ def names(group: str) -> list[str]:
 
 def module_of(group: str, name: str) -> str:
     """The module that an entry point names; it is not imported. KeyError when the group declares no such name."""
-    return _declared(group)[name].module
+    entry = _declared(group)[name]
+    if EntryPoint.pattern.match(entry.value) is None:
+        raise unusable(group, name, "it names no module")
+    return entry.module
+
+
+def package_of(group: str, name: str) -> str:
+    """The package that declares an entry point. KeyError when the group declares no such name."""
+    return _package(_declared(group)[name])
+
+
+def unusable(group: str, name: str, problem: str) -> MissingBackendError:
+    """The error for an entry point whose object cannot be used: names the package and the entry point."""
+    entry = _declared(group)[name]
+    place = f"entry point {entry.value!r} of the package {_package(entry)}"
+    return MissingBackendError(f"{name!r} of {group} cannot be loaded: {problem} ({place})")
 
 
 @cache
@@ -37,23 +63,38 @@ def load(group: str, name: str) -> Any:
     InputError
         When the group declares no such name.
     MissingBackendError
-        When the object cannot be imported: names the package that declares it, and its entry point.
+        When the object cannot be imported, or lacks what its group asks for: names the package that declares it, and
+        its entry point.
     """
     entry = _declared(group).get(name)
     if entry is None:
         raise InputError(group, f"knows no {name!r}", f"one of {', '.join(names(group)) or 'none'}")
     try:
-        return entry.load()
+        found = entry.load()
     except (ImportError, AttributeError, SyntaxError) as error:
-        place = f"entry point {entry.value!r} of the package {_package(entry)}"
-        raise MissingBackendError(f"{name!r} of {group} cannot be loaded: {error} ({place})") from error
+        raise unusable(group, name, str(error)) from error
+    except (Exception, SystemExit) as error:  # whatever somebody else's module does when it is imported
+        raise unusable(group, name, f"its module ended with {error!r}") from error
+    parts, right = _RIGHT.get(group, ((), ""))
+    if lacks := [part for part in parts if not _has(found, part)]:
+        raise unusable(group, name, f"it has no {', '.join(lacks)}; right is {right}")
+    return found
 
 
 @cache
 def _declared(group: str) -> dict[str, EntryPoint]:
-    entries = sorted(entry_points(group=group), key=lambda e: (_package(e) != _OWN, _package(e), e.value))
+    entries = sorted(entry_points(group=group), key=lambda e: (_package(e) != OWN, _package(e), e.value))
     return {entry.name: entry for entry in reversed(entries)}
 
 
 def _package(entry: EntryPoint) -> str:
-    return entry.dist.metadata["Name"] if entry.dist is not None else "?"
+    return (entry.dist.metadata["Name"] if entry.dist is not None else None) or "?"
+
+
+def _has(found: object, part: str) -> bool:
+    """Whether an object has an attribute, which may be one of an attribute (``a.b``)."""
+    try:
+        attrgetter(part)(found)
+    except AttributeError:
+        return False
+    return True

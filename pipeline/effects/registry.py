@@ -10,9 +10,11 @@ from collections.abc import Iterable
 from typing import Any
 
 from pipeline.core import plugins
-from pipeline.effects.base import Effect
+from pipeline.effects.base import Detect, Effect, Expand, Traffic, TransmitScan, TransmitScore
 from pipeline.scenario.effects import GROUP, EffectParameters, EffectsModel
 from pipeline.scenario.models import Scenario
+
+_KINDS = (Expand, TransmitScan, TransmitScore, Detect, Traffic)
 
 
 def names() -> list[str]:
@@ -21,8 +23,25 @@ def names() -> list[str]:
 
 
 def effect_class(name: str) -> type[Effect[Any]]:
-    """Import one effect; InputError for one that does not exist."""
-    found: type[Effect[Any]] = plugins.load(GROUP, name)
+    """Import one effect.
+
+    Raises
+    ------
+    InputError
+        When there is no such effect.
+    MissingBackendError
+        When it cannot be imported, is no effect, or has another name than its entry point: two effects of one name
+        would overwrite each other's parameters in :func:`settings`.
+    """
+    found = plugins.load(GROUP, name)
+    if not (isinstance(found, type) and issubclass(found, _KINDS)):
+        right = f"a subclass of {', '.join(kind.__name__ for kind in _KINDS)} of {Effect.__module__}"
+        raise plugins.unusable(GROUP, name, f"it is no effect; right is {right}")
+    if not (isinstance(found.Model, type) and issubclass(found.Model, EffectParameters)):
+        right = f"a subclass of {EffectParameters.__module__}.{EffectParameters.__name__}"
+        raise plugins.unusable(GROUP, name, f"its Model is {found.Model!r}; right is {right}")
+    if name != found.NAME:
+        raise plugins.unusable(GROUP, name, f"its NAME is {found.NAME!r}; right is {name!r}, as its entry point has it")
     return found
 
 

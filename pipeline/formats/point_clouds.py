@@ -12,6 +12,7 @@ Frame: the world's (right-handed, x east, y north, z up), metres, float64.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Protocol
 
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core import plugins
-from pipeline.core.errors import InputError
+from pipeline.core.errors import EgvsError, InputError, MissingBackendError
 from pipeline.core.files import aside
 
 GROUP = "egvs.point_clouds"
@@ -64,15 +65,28 @@ def read_points(path: Path, place: str) -> tuple[NDArray[np.float64], int]:
     Raises
     ------
     InputError
-        When the file is missing, of an unknown kind, damaged, or without one finite point.
+        When the file is missing, of an unknown kind, damaged, or without one finite point; or when what reads its
+        kind fails or returns anything but points.
     """
     place = _with_path(place, path)
-    point_format: PointFormat = plugins.load(GROUP, _kind(place, path, plugins.names(GROUP)))
+    kind = _kind(place, path, plugins.names(GROUP))
+    point_format: PointFormat = plugins.load(GROUP, kind)
+    reader = f"its reader {plugins.module_of(GROUP, kind)} (package {plugins.package_of(GROUP, kind)})"
     try:
         points = point_format.read(path, place)
+    except (EgvsError, MemoryError):
+        raise
     except OSError as error:
         problem = f"cannot be read ({error.strerror or error})"
         raise InputError(place, problem, "a file that is there and may be read") from None
+    except (Exception, SystemExit) as error:  # whatever somebody else's reader does
+        raise InputError(place, f"{reader} ended with {error!r}", "a whole file, or a mended reader") from error
+    if not isinstance(points, np.ndarray) or points.dtype.kind not in "fiu":
+        found = type(points).__name__ + (f" of {points.dtype}" if isinstance(points, np.ndarray) else "")
+        raise InputError(place, f"{reader} returns {found}", "an array of numbers, (n, 3)")
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(place, f"{reader} returns an array of the shape {points.shape}", "(n, 3)")
+    points = points.astype(np.float64, copy=False)
     finite = np.isfinite(points).all(axis=1)
     dropped = len(points) - int(np.count_nonzero(finite))
     if dropped == len(points):
@@ -102,9 +116,11 @@ def write_points(path: Path, points_m: NDArray[np.float64]) -> None:
     InputError
         When no format with that suffix can be written.
     """
-    writable: dict[str, WritableFormat] = {
-        name: loaded for name in plugins.names(GROUP) if hasattr(loaded := plugins.load(GROUP, name), "write")
-    }
+    writable: dict[str, WritableFormat] = {}
+    for name in plugins.names(GROUP):
+        with suppress(MissingBackendError):  # one that is broken may not keep the others from being written
+            if hasattr(loaded := plugins.load(GROUP, name), "write"):
+                writable[name] = loaded
     kind = _kind(path, path, list(writable))
     if points_m.ndim != 2 or points_m.shape[1] != 3:
         raise ValueError(f"points_m has the shape {points_m.shape}, not (n, 3)")

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.artefacts.readers import Tpog
-from pipeline.core.errors import InputError
+from pipeline.core.errors import InputError, RunError
 from pipeline.core.grid import Grid
 from pipeline.effects.base import Detect, Effect, TransmitScore
 from pipeline.kernels import march
@@ -123,10 +123,23 @@ class Visibility:
             share = np.ones(len(piece.cells)) if beams.weight is None else beams.weight[piece.rows][piece.piece]
             for effect in self._effects:
                 if isinstance(effect, Detect):
-                    share = share * effect.detect(piece.middle_m, beams.sensor)
+                    share = share * _shares(effect, effect.detect(piece.middle_m, beams.sensor), share)
                 elif isinstance(effect, TransmitScore):
-                    share = share * effect.share(piece)
+                    share = share * _shares(effect, effect.share(piece), share)
             accumulate(piece.cells, np.rint(share * UNIT).astype(np.int64), hits)
+
+
+def _shares(effect: Effect[Any], given: object, like: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What an effect gives, ``like`` many shares; RunError for anything else, since a wrong share is a wrong score."""
+    if not isinstance(given, np.ndarray) or given.dtype.kind not in "fiub":
+        found = f"gives {type(given).__name__}" + (f" of {given.dtype}" if isinstance(given, np.ndarray) else "")
+    elif given.shape != like.shape:
+        found = f"gives an array of the shape {given.shape} for {len(like)} crossings"
+    elif given.size and not (given.min() >= 0 and given.max() <= 1):  # false where one is NaN
+        found = f"gives values from {given.min():g} to {given.max():g}"
+    else:
+        return given
+    raise RunError(f"effects.{effect.NAME}: {found}; right are shares from 0 to 1, one each")
 
 
 def in_voxels(beams: Beams, grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:

@@ -7,14 +7,18 @@ for each effect whether it is on, and why.
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from pipeline.artefacts.readers import read_accuracy
-from pipeline.core import files
+from pipeline.core import files, plugins
+from pipeline.core.errors import MissingBackendError
 from pipeline.effects import registry
-from pipeline.effects.base import Traffic
+from pipeline.effects.base import Effect, Traffic
 from pipeline.effects.scene_building import build_scene
+from pipeline.scenario.effects import GROUP
 from pipeline.scenario.models import Scenario
 from pipeline.sensing.scene import Scene
 from pipeline.studies.measuring import inputs_of
@@ -23,7 +27,8 @@ from pipeline.studies.variants import SCENARIO, WITH, WITHOUT
 
 @dataclass(frozen=True)
 class Call:
-    """One effect, before one scene: "on", "off", "skipped", or "refused" because something is missing; and why."""
+    """One effect, before one scene: "on", "off", "skipped", "refused" because something is missing, or "broken"
+    because it cannot be loaded; and why."""
 
     name: str
     stage: str
@@ -57,14 +62,14 @@ class Price:
 
 def catalogue() -> list[Call]:
     """Every effect that exists."""
-    kinds = [registry.effect_class(name) for name in registry.names()]
-    return [Call(kind.NAME, kind.STAGE, kind.KIND, "", _first_line(kind), kind.SOURCE) for kind in kinds]
+    return [_unless_broken(name, _described) for name in registry.names()]
 
 
 def called(scenario: Scenario) -> list[Call]:
-    """Every effect before ``scenario``: on, off, skipped because it provably changes nothing, or refused; and why."""
+    """Every effect before ``scenario``: on, off, skipped because it provably changes nothing, refused or broken; and
+    why."""
     scene = build_scene(scenario)
-    return [_call(name, scene) for name in registry.names()]
+    return [_unless_broken(name, lambda name: _call(name, scene)) for name in registry.names()]
 
 
 def prices(scenario: Scenario, out: Path) -> dict[str, Price] | None:
@@ -81,11 +86,24 @@ def prices(scenario: Scenario, out: Path) -> dict[str, Price] | None:
     return priced
 
 
+def _unless_broken(name: str, told: Callable[[str], Call]) -> Call:
+    """What is told of an effect; of one that cannot be loaded, why: nobody may have named it."""
+    try:
+        return told(name)
+    except MissingBackendError as error:
+        return Call(name, "", "", "broken", str(error), "")
+
+
+def _described(name: str) -> Call:
+    kind = registry.effect_class(name)
+    return Call(name, kind.STAGE, kind.KIND, "", _first_line(kind), _source(kind))
+
+
 def _call(name: str, scene: Scene) -> Call:
     kind, named = registry.effect_class(name), scene.scenario.effects.named
 
     def call(state: str, why: str) -> Call:
-        return Call(name, kind.STAGE, kind.KIND, state, why, kind.SOURCE)
+        return Call(name, kind.STAGE, kind.KIND, state, why, _source(kind))
 
     if issubclass(kind, Traffic) and kind.SELF_ACTING:
         on, why = kind(kind.Model()).acts(scene.scenario)
@@ -99,6 +117,12 @@ def _call(name: str, scene: Scene) -> Call:
         return call("refused", str(refusal))
     values = ", ".join(f"{key} = {value}" for key, value in effect.parameters.model_dump(mode="json").items())
     return call("on", f"named, with {values}" if values else "named")
+
+
+def _source(kind: type[Effect[Any]]) -> str:
+    """Where an effect's model is published; and which package brings it, where that is not this program."""
+    package = plugins.package_of(GROUP, kind.NAME)
+    return kind.SOURCE if package == plugins.OWN else f"{kind.SOURCE} (package {package})"
 
 
 def _first_line(kind: type) -> str:

@@ -72,6 +72,9 @@ def test_an_unknown_name_is_said_with_those_that_are_known(site: Path) -> None:
         ("plug_a:PART", "", "module 'plug_a' has no attribute 'PART'"),
         ("plug_a", "import nowhere_to_be_found", "No module named 'nowhere_to_be_found'"),
         ("plug_a", "def", "invalid syntax"),
+        ("plug_a", "raise RuntimeError('boom')", r"its module ended with RuntimeError\('boom'\)"),
+        ("plug_a", "1 / 0", r"its module ended with ZeroDivisionError\('division by zero'\)"),
+        ("plug_a", "raise SystemExit(0)", r"its module ended with SystemExit\(0\)"),
     ],
 )
 def test_one_that_cannot_be_loaded_names_its_package(site: Path, entry: str, source: str, problem: str) -> None:
@@ -79,3 +82,40 @@ def test_one_that_cannot_be_loaded_names_its_package(site: Path, entry: str, sou
     place = rf"\(entry point '{entry}' of the package somebody-elses\)"
     with pytest.raises(MissingBackendError, match=rf"^'a' of egvs\.test_group cannot be loaded: {problem}.*{place}"):
         plugins.load(GROUP, "a")
+
+
+def test_an_interrupt_while_loading_is_no_fault_of_the_plug_in(site: Path) -> None:
+    install(site, "somebody-elses", "a = plug_a", {"plug_a": "raise KeyboardInterrupt"})
+    with pytest.raises(KeyboardInterrupt):
+        plugins.load(GROUP, "a")
+
+
+@pytest.mark.parametrize(
+    ("group", "entry", "lacks"),
+    [
+        ("egvs.effects", "collections:OrderedDict", "NAME, SOURCE, STAGE, KIND, Model.of; right is a subclass"),
+        ("egvs.effects", "plug_a:TABLE", "NAME, SOURCE, STAGE, KIND, Model.of; right is a subclass"),
+        ("egvs.effects", "plug_a", "NAME, SOURCE, STAGE, KIND, Model.of; right is a subclass"),
+        ("egvs.effects", "pipeline.effects.base:Detect", "NAME, SOURCE, Model.of; right is a subclass"),
+        ("egvs.point_clouds", "plug_a", "read; right is a module or an object with a function read"),
+    ],
+)
+def test_an_object_of_another_kind_is_refused(site: Path, group: str, entry: str, lacks: str) -> None:
+    install(site, "somebody-elses", f"zz = {entry}", {"plug_a": "TABLE = {}"}, group)
+    message = rf"cannot be loaded: it has no {lacks}.* \(entry point '{entry}' of the package somebody-elses\)"
+    with pytest.raises(MissingBackendError, match=message):
+        plugins.load(group, "zz")
+
+
+def test_a_value_that_names_no_module_is_refused(site: Path) -> None:
+    install(site, "somebody-elses", "a = !!no module", {})
+    with pytest.raises(MissingBackendError, match=r"names no module.*'!!no module' of the package somebody-elses"):
+        plugins.module_of(GROUP, "a")
+
+
+def test_packages_without_a_name_are_sorted_too(site: Path) -> None:
+    for package in ("one", "two"):
+        install(site, package, f"{package} = plug_{package}", {})
+    (site / "two-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\n", encoding="utf-8")
+    assert plugins.names(GROUP) == ["one", "two"]
+    assert (plugins.package_of(GROUP, "one"), plugins.package_of(GROUP, "two")) == ("one", "?")

@@ -8,9 +8,16 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import pipeline
+from pipeline.core.errors import MissingBackendError, RunError
+from pipeline.effects import registry
+from pipeline.effects.base import Detect
+from pipeline.scenario.effects import EffectParameters
+from pipeline.scoring import visibility
+from tests.core.test_plugins import install, site  # noqa: F401  the fixture
 
 EFFECT = '''
 """Every second return is lost (an example)."""
@@ -105,3 +112,103 @@ def test_one_that_cannot_be_imported_is_named_with_its_package(mini, package, tm
     (package / "half_returns.py").write_text("import no_such_library\n")
     done = egvs(package, "run", mini, "--out", tmp_path / "run", "--set", "effects.half.share=0.25")
     assert done.returncode == 1 and "half_returns:Half" in done.stderr and "Traceback" not in done.stderr
+
+
+NO_EFFECT = """
+from pipeline.scenario.effects import EffectParameters
+class Thing:
+    NAME, SOURCE, STAGE, KIND, Model = "zz", "", "score", "detect", EffectParameters
+"""
+
+
+@pytest.mark.parametrize(
+    ("source", "problem"),
+    [
+        (EFFECT, "its NAME is 'half'; right is 'zz', as its entry point has it"),
+        (NO_EFFECT + "Half = Thing", "it is no effect; right is a subclass of Expand, .* of pipeline.effects.base"),
+        (NO_EFFECT + "Half = Thing()", "it is no effect"),
+        (EFFECT + '    NAME = "zz"\n    Model = type("M", (), {"of": 1})', "its Model is <class .*EffectParameters"),
+    ],
+)
+def test_what_is_no_effect_of_that_name_is_refused(site: Path, source: str, problem: str) -> None:  # noqa: F811
+    install(site, "somebody-elses", "zz = plug_z:Half", {"plug_z": source}, "egvs.effects")
+    place = r"\(entry point 'plug_z:Half' of the package somebody-elses\)"
+    with pytest.raises(MissingBackendError, match=f"^'zz' of egvs.effects cannot be loaded: {problem}.*{place}"):
+        registry.effect_class("zz")
+
+
+@pytest.mark.system
+def test_two_effects_that_say_they_are_one_are_refused(mini, tmp_path):
+    """Their parameters would overwrite each other in the key of the stage: a changed one would change nothing."""
+    for name in ("aa", "bb"):
+        install(tmp_path / "site", f"p{name}", f"{name} = plug_{name}:Half", {f"plug_{name}": EFFECT}, "egvs.effects")
+    both = ("--set", "effects.aa.share=0.1", "--set", "effects.bb.share=0.2")
+    done = egvs(tmp_path / "site", "run", mini, "--out", tmp_path / "run", *both)
+    assert done.returncode == 1 and "Traceback" not in done.stderr
+    assert "its NAME is 'half'; right is 'aa'" in done.stderr and "of the package paa" in done.stderr
+
+
+@pytest.mark.system
+@pytest.mark.parametrize(
+    "source",
+    [
+        "import no_such_library",
+        "raise RuntimeError",
+        "raise SystemExit(0)",
+        "Half = dict",
+        EFFECT + '    NAME = "other"',
+    ],
+)
+def test_a_broken_one_that_nobody_named_is_listed_as_broken(mini, package, source):
+    (package / "half_returns.py").write_text(source)
+    for arguments in ((), (mini,)):
+        done = egvs(package, "effects", *arguments)
+        assert done.returncode == 0, done.stderr
+        words = " ".join(done.stdout.split())
+        assert "half" in words and "cannot be" in words and "broken" in words and "range_limit" in words
+    named = egvs(package, "effects", mini, "--set", "effects.half.share=0.25")
+    assert named.returncode == 1 and "half-returns" in named.stderr and "Traceback" not in named.stderr
+
+
+@pytest.mark.system
+def test_the_list_says_which_package_brings_an_effect(mini, package):
+    for arguments in ((), (mini,)):
+        words = " ".join(egvs(package, "effects", *arguments).stdout.split())
+        assert "half-returns" in words and "package egvs" not in words
+
+
+class Given(Detect[EffectParameters]):
+    NAME, SOURCE, Model = "given", "", EffectParameters
+
+
+@pytest.mark.parametrize(
+    ("given", "found"),
+    [
+        (np.array([0.5, np.nan]), "gives values from nan to nan"),
+        (np.array([0.5, 1.5]), "gives values from 0.5 to 1.5"),
+        (np.array([-0.25, 0.5]), "gives values from -0.25 to 0.5"),
+        (np.ones(3), r"gives an array of the shape \(3,\) for 2 crossings"),
+        (np.ones((2, 1)), r"gives an array of the shape \(2, 1\) for 2 crossings"),
+        (np.array(["1", "1"]), "gives ndarray of <U1"),
+        (None, "gives NoneType"),
+        (0.5, "gives float"),
+    ],
+)
+def test_what_is_no_share_is_refused(given: object, found: str) -> None:
+    with pytest.raises(RunError, match=rf"^effects\.given: {found}; right are shares from 0 to 1, one each$"):
+        visibility._shares(Given(EffectParameters()), given, np.ones(2))
+
+
+def test_shares_of_no_crossing_and_of_bits_are_shares() -> None:
+    effect = Given(EffectParameters())
+    assert visibility._shares(effect, np.ones(0), np.ones(0)).size == 0
+    assert visibility._shares(effect, np.array([True, False]), np.ones(2)).tolist() == [True, False]
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("value", ["np.nan", "2.0"])
+def test_a_run_with_an_effect_that_gives_no_shares_ends_with_its_name(mini, package, tmp_path, value):
+    (package / "half_returns.py").write_text(EFFECT.replace("1.0 - self.parameters.share", value))
+    done = egvs(package, "run", mini, "--out", tmp_path / "run", "--set", "effects.half.share=0.25")
+    assert done.returncode == 1 and "Traceback" not in done.stderr
+    assert "effects.half: gives values from" in done.stderr and not (tmp_path / "run" / "scores.parquet").exists()

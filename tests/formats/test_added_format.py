@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from pipeline.core import plugins
-from pipeline.formats.point_clouds import GROUP, read_points
-from tests.core.test_plugins import install
+from pipeline.core.errors import InputError, MissingBackendError
+from pipeline.formats.point_clouds import GROUP, read_points, write_points
+from tests.core.test_plugins import install, site  # noqa: F401  the fixture
 
 pytestmark = pytest.mark.system
 
@@ -79,3 +80,49 @@ def test_reading_imports_no_other_format(tmp_path: Path) -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+READ = """
+import numpy as np
+def read(path, place):
+    {}
+"""
+
+
+@pytest.mark.parametrize(
+    ("body", "found"),
+    [
+        ("raise RuntimeError('boom')", r"ended with RuntimeError\('boom'\)"),
+        ("raise SystemExit(0)", r"ended with SystemExit\(0\)"),
+        ("return None", "returns NoneType"),
+        ("return [[1.0, 2.0, 3.0]]", "returns list"),
+        ("return np.array([['a', 'b', 'c']])", "returns ndarray of <U1"),
+        ("return np.ones((5, 2))", r"returns an array of the shape \(5, 2\)"),
+        ("return np.ones(3)", r"returns an array of the shape \(3,\)"),
+    ],
+)
+def test_a_reader_that_fails_is_named_with_the_file(site: Path, body: str, found: str) -> None:  # noqa: F811
+    install(site, "foo", "foo = plug_foo", {"plug_foo": READ.format(body)}, GROUP)
+    with pytest.raises(InputError, match=rf"a\.foo: its reader plug_foo \(package foo\) {found}; "):
+        read_points(site / "a.foo", "sites.csv: row A")
+
+
+def test_whole_numbers_are_points(site: Path) -> None:  # noqa: F811
+    install(site, "foo", "foo = plug_foo", {"plug_foo": READ.format("return np.array([[1, 2, 3]])")}, GROUP)
+    points, dropped = read_points(site / "a.foo", "")
+    assert (points.dtype, points.tolist(), dropped) == (np.float64, [[1.0, 2.0, 3.0]], 0)
+
+
+def test_what_a_reader_says_itself_is_passed_on(site: Path) -> None:  # noqa: F811
+    body = "from pipeline.core.errors import InputError; raise InputError(place, 'is empty', 'a point')"
+    install(site, "foo", "foo = plug_foo", {"plug_foo": READ.format(body)}, GROUP)
+    with pytest.raises(InputError, match=r"a\.foo: is empty; a point$"):
+        read_points(site / "a.foo", "")
+
+
+def test_a_format_that_cannot_read_is_refused_and_keeps_no_other_from_being_written(site: Path) -> None:  # noqa: F811
+    install(site, "foo", "foo = plug_foo", {"plug_foo": ""}, GROUP)
+    with pytest.raises(MissingBackendError, match=r"it has no read; .*'plug_foo' of the package foo"):
+        read_points(site / "a.foo", "")
+    write_points(site / "a.ply", np.ones((1, 3)))
+    assert read_points(site / "a.ply", "")[0].tolist() == [[1.0, 1.0, 1.0]]
