@@ -57,7 +57,7 @@ def read(path: Path, place: str) -> NDArray[np.float64]:
         case ["binary_compressed"]:
             points = layout.from_blocks(_unpacked(place, data[start:], layout.n * layout.size))
         case other:
-            raise InputError(place, f"DATA is {' '.join(other)!r}", "ascii, binary or binary_compressed")
+            raise InputError(place, f"DATA is {' '.join(other)[:60]!r}", "ascii, binary or binary_compressed")
     return points if viewpoint == _IDENTITY else _to_world(points, viewpoint)
 
 

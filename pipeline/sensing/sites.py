@@ -10,6 +10,7 @@ import csv
 import json
 import math
 import re
+import reprlib
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -24,7 +25,7 @@ from pipeline.scenario.types import FARTHEST_M
 _NEEDED = ("site", "x_m", "y_m", "z_m")
 _ANGLES = ("yaw_deg", "pitch_deg", "roll_deg")
 _TEXTS = ("sensor", "points")
-_NAME = re.compile(r"[^/\\\x00-\x1f]{1,80}")  # becomes part of file names
+_NAME = re.compile(r"[^/\\\x00-\x1f\ud800-\udfff]{1,80}")  # becomes part of file names
 
 
 @dataclass(frozen=True)
@@ -139,6 +140,9 @@ def _site(place: str, row: dict[str, Any], scenario: Scenario) -> Site:
     for key in _NEEDED:
         if row.get(key) in (None, ""):
             raise InputError(place, f"{key} is missing", f"the columns {', '.join(_NEEDED)}")
+    for key in ("site", *_TEXTS):
+        if isinstance(row.get(key), bool | list | dict):
+            raise InputError(f"{place}: {key}", repr(row[key])[:80], "a text")
     name = str(row["site"]).strip()
     if not _NAME.fullmatch(name):
         raise InputError(f"{place}: site", f"{name[:80]!r}", "a name of up to 80 characters without / and \\")
@@ -155,10 +159,10 @@ def _site(place: str, row: dict[str, Any], scenario: Scenario) -> Site:
 def _number(place: str, key: str, value: Any) -> float:
     try:
         number = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not abs(number) <= FARTHEST_M or isinstance(value, bool):
-        raise InputError(f"{place}: {key}", f"{value!r}", f"a finite number, at most {FARTHEST_M:g}")
+        raise InputError(f"{place}: {key}", repr(value)[:80], f"a finite number, at most {FARTHEST_M:g}")
     return number
 
 
@@ -181,18 +185,47 @@ def _csv(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def _geojson(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    right = "a FeatureCollection of Points in world-frame metres"
     try:
-        features = json.loads(path.read_text(encoding="utf-8"))["features"]
-        for number, feature in enumerate(features):
-            place = f"{path}: feature {number}"
-            geometry, properties = feature["geometry"], dict(feature.get("properties") or {})
-            if geometry["type"] != "Point":
-                raise InputError(place, f"is a {geometry['type']}", "a Point")
-            row = dict(zip(("x_m", "y_m", "z_m"), geometry["coordinates"], strict=False))
-            name = properties.pop("name", None)
-            yield place, {"site": name, **row, **properties}
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, ValueError, RecursionError) as error:
-        raise InputError(path, f"cannot be read as GeoJSON ({error})", "a FeatureCollection of Points") from None
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise InputError(path, f"cannot be read as GeoJSON ({error})", right) from None
+    if not isinstance(document, dict) or not isinstance(document.get("features"), list):
+        raise InputError(path, f"has no list of features: {reprlib.repr(document)[:120]}", right)
+    if (crs := document.get("crs")) is not None and not _in_metres(crs):
+        raise InputError(f"{path}: crs", repr(crs)[:120], "no crs (RFC 7946), and metres in the world frame")
+    for number, feature in enumerate(document["features"]):
+        place = f"{path}: feature {number}"
+        yield place, _feature(place, feature)
+
+
+def _in_metres(crs: Any) -> bool:
+    """Whether all axes of a GeoJSON ``crs`` member (of 2008; RFC 7946 has none) are in metres."""
+    import pyproj
+
+    try:
+        return all(axis.unit_name == "metre" for axis in pyproj.CRS(crs["properties"]["name"]).axis_info)
+    except (pyproj.exceptions.CRSError, LookupError, TypeError):
+        return False
+
+
+def _feature(place: str, feature: Any) -> dict[str, Any]:
+    """The columns that a feature's coordinates and properties give."""
+    match feature:
+        case {"geometry": {"type": "Point", "coordinates": [_, _, *more] as spot}, "properties": dict(properties)} if (
+            len(more) < 2
+        ):
+            own = dict(zip(_NEEDED, (properties.get("name"), *spot), strict=False))
+        case _:
+            right = "a Feature with properties, its geometry a Point of two or three coordinates"
+            raise InputError(place, f"is {reprlib.repr(feature)[:120]}", right)
+    row = {key: value for key, value in properties.items() if key != "name"}
+    for key, value in own.items():
+        if isinstance(value, str) and key != "site":
+            raise InputError(f"{place}: {key}", f"the coordinate {value!r}", "a number, not text")
+        if value is not None and row.get(key, value) not in (None, value):
+            raise InputError(f"{place}: {key}", f"{row[key]!r} there, but {value!r} as well", "one of them")
+    return row | {key: value for key, value in own.items() if value is not None}
 
 
 def _lattice(rule: SiteGrid) -> Iterator[tuple[str, dict[str, Any]]]:

@@ -76,6 +76,7 @@ OTHER_COLUMNS = r"has no single column 'x_m' \(its columns: x, y_m, z_m\); a hea
          r"holds no finite point \(of 2\); at least one"),
         ("a.pcd", BINARY + bytes(23), r"holds 23 bytes of points; 24 \(2 points of 12\), as its header says"),
         ("a.pcd", BINARY + bytes(25), "holds 25 bytes of points; 24"),
+        ("a.pcd", ASCII_PCD.replace("DATA ascii", "DATA " + "x" * 900), "DATA is 'x{60}'; ascii, binary"),
         ("a.pcd", PACKED + bytes(7), r"ends before its points \(7 bytes of them\); 24, as its header says"),
         ("a.pcd", PACKED + struct.pack("<II", 1, 12) + b"\0", "holds 12 bytes of points, unpacked; 24"),
         ("a.pcd", PACKED + packed(bytes(24))[:-1], "holds 4 bytes of packed points; 5; a whole file"),

@@ -277,16 +277,43 @@ def test_las_cut_anywhere_is_refused(tmp_path: Path, name: str) -> None:
         (100, b"\xff\xff\xff\xff", "points past the file or into itself"),  # number of variable-length records
         (96, b"\xff\xff\xff\x7f", "points past the file or into itself"),  # where the points start
         (104, b"\x3f", "cannot be read as LAS"),  # point format 63
-        (247, b"\x2d\x01", "holds|cannot be read"),  # 301 points
+        (247, b"\x2d\x01", "holds 9000 bytes of points; 9030, as its header says"),  # 301 points
+        (105, b"\xff\xff", "holds 9000 bytes of points; 19660500, as its header says"),  # length of a point
+        (131, struct.pack("<d", 1e308), "holds no finite point"),  # the scale of x
     ],
 )
 def test_las_with_a_damaged_header_is_refused(tmp_path: Path, at: int, value: bytes, message: str) -> None:
     path, _ = las(tmp_path, "a.las")
+    overwrite(path, at, value)
+    with pytest.raises(InputError, match=message):
+        read_points(path, "")
+
+
+@needs_laspy
+def test_laz_that_would_end_the_process_is_refused(tmp_path: Path) -> None:
+    """By memory for 4e9 chunks, wherever the table's place stands, or by a panic for a point of no items."""
+    path, _ = las(tmp_path, "a.laz")
+    whole = path.read_bytes()
+    points_at = struct.unpack_from("<I", whole, 96)[0]
+    table_at = whole[points_at : points_at + 8]
+    overwrite(path, struct.unpack("<q", table_at)[0] + 4, b"\xff\xff\xff\xff")
+    many = "says that it holds 4294967295 chunks in .* bytes; a whole LAS or LAZ file"
+    with pytest.raises(InputError, match=many):
+        read_points(path, "")
+    overwrite(path, points_at, b"\xff" * 8)
+    overwrite(path, path.stat().st_size, table_at)
+    with pytest.raises(InputError, match=many):
+        read_points(path, "")
+    path.write_bytes(whole)
+    overwrite(path, 375 + 54 + 32, b"\0\0")  # how many items: after the header and the record's own
+    with pytest.raises(InputError, match=r"cannot be read as LAS \(.*LazItem"):
+        read_points(path, "")
+
+
+def overwrite(path: Path, at: int, value: bytes) -> None:
     data = bytearray(path.read_bytes())
     data[at : at + len(value)] = value
     path.write_bytes(data)
-    with pytest.raises(InputError, match=message):
-        read_points(path, "")
 
 
 @pytest.mark.parametrize("name", ["a.las", "a.laz"])

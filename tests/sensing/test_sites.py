@@ -15,8 +15,13 @@ from pipeline.sensing import sites
 from tests.conftest import collection, feature
 
 
-def point(*coordinates: float, **properties: object) -> dict[str, Any]:
+def point(*coordinates: object, **properties: object) -> dict[str, Any]:
     return feature({"type": "Point", "coordinates": coordinates}, **properties)
+
+
+def named(crs: str) -> dict[str, Any]:
+    """What GeoJSON of 2008 could hold as ``crs``."""
+    return {"type": "name", "properties": {"name": crs}}
 
 
 def of_geojson(mini: Path, text: str, name: str = "sites.geojson") -> tuple[sites.Site, ...]:
@@ -58,6 +63,18 @@ def test_properties_of_a_feature_are_its_pose_sensor_and_scan(mini: Path) -> Non
     assert second == sites.Site("b", sites.Pose(3, 4, 5), "small")
 
 
+def test_a_height_may_be_a_property_and_a_name_a_number_as_in_csv(mini: Path) -> None:
+    found = of_geojson(mini, collection(point(0, 1, z_m=2, name=5), point(0, 1, 3, z_m=3.0, site="b"),
+                                        point(0, 1, 4, z_m=None, name="c")))  # fmt: skip
+    assert places(found) == [("5", 0, 1, 2), ("b", 0, 1, 3), ("c", 0, 1, 4)]
+
+
+@pytest.mark.parametrize("crs", [None, named("urn:ogc:def:crs:EPSG::25832"), named('LOCAL_CS["site",UNIT["metre",1]]')])
+def test_a_crs_in_metres_is_taken(mini: Path, crs: object) -> None:
+    text = json.dumps({"crs": crs, "features": [point(0, 1, 2, name="a")]})
+    assert places(of_geojson(mini, text)) == [("a", 0, 1, 2)]
+
+
 def test_a_run_from_geojson_scores_what_a_run_from_csv_does(mini: Path, tmp_path: Path) -> None:
     settings = ["score.standard_error=false"]
     pipeline.run(pipeline.load(mini, settings), tmp_path / "csv")
@@ -73,14 +90,32 @@ def test_a_run_from_geojson_scores_what_a_run_from_csv_does(mini: Path, tmp_path
     ("text", "message"),
     [
         ("", "cannot be read as GeoJSON"),
-        ("[1, 2]", "cannot be read as GeoJSON"),
-        ('{"type": "Point"}', "cannot be read as GeoJSON .*features"),
+        *((text, r"sites\.geojson: has no list of features: .*; a FeatureCollection of Points in world-frame metres$")
+          for text in ("[1, 2]", '{"type": "Point"}', "[]", "null", "5", '{"features": null}', '{"features": {}}')),
         pytest.param("[" * 100_000, "cannot be read as GeoJSON", id="deep"),
         (collection(), "holds no site"),
-        (collection({"type": "Feature", "geometry": None}), "cannot be read as GeoJSON"),
+        *((collection(point(0, 0, 3, name="a"), wrong), "feature 1: is .*; a Feature with properties, its")
+          for wrong in (None, 5, [], {"type": "Feature", "geometry": None}, feature({"type": "Point"}, name="b"),
+                        feature({"type": "Point", "coordinates": None}, name="b"), point(0, name="b"),
+                        feature({"type": "Point", "coordinates": "195"}, name="b"), point(0, 0, 3, 4, name="b"),
+                        {**point(0, 0, 3), "properties": None})),
+        (collection(point(0, "195", 3, name="a")), "feature 0: y_m: the coordinate '195'; a number, not text"),
+        (collection(point(0, True, 3, name="a")), "feature 0: y_m: True; a finite number"),
+        (collection(point(0, None, 3, name="a")), "feature 0: y_m is missing"),
+        (collection(point(0, 0, 10**400, name="a")), "feature 0: z_m: 1000.*; a finite number"),
+        (collection(point(0, 0, 3, name="a", z_m=4)), "feature 0: z_m: 4 there, but 3 as well; one of them"),
+        (collection(point(0, 0, 3, name="a", site="b")), "feature 0: site: 'b' there, but 'a' as well"),
+        *((collection(point(0, 0, 3, **{"name": "a", key: value})), f"feature 0: {found}: .*; a text")
+          for key, found in (("name", "site"), ("sensor", "sensor"), ("points", "points"))
+          for value in ([], ["b"], {}, True)),
+        (collection(point(0, 0, 3, name="\ud800")), r"feature 0: site: '\\ud800'; a name of up to 80"),
+        *((json.dumps({"crs": crs, "features": [point(0, 0, 3, name="a")]}),
+           r"sites\.geojson: crs: .*; no crs \(RFC 7946\), and metres in the world frame")
+          for crs in (5, "EPSG:25832", {}, named("local"), named("EPSG:4326"), named("urn:ogc:def:crs:OGC:1.3:CRS84"),
+                      named("EPSG:2263"))),
         (
             collection(feature({"type": "LineString", "coordinates": [[0, 0, 3], [1, 1, 3]]}, name="a")),
-            "feature 0.*is a LineString.*a Point",
+            "feature 0: is .*'LineString'.*a Point",
         ),
         (collection(point(0, 0, 3, name="a"), point(0, 0, name="b")), "feature 1.*z_m is missing"),
         (collection(point(0, 0, 3)), "feature 0.*site is missing"),
@@ -96,7 +131,7 @@ def test_a_run_from_geojson_scores_what_a_run_from_csv_does(mini: Path, tmp_path
             "feature 0: x_m.*'x'",
         ),
     ],
-)
+)  # fmt: skip
 def test_what_is_wrong_with_geojson_is_said(mini: Path, text: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
         of_geojson(mini, text)
