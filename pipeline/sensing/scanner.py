@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pipeline.core.errors import InputError
 from pipeline.formats import point_clouds
 from pipeline.kernels import rays
+from pipeline.scenario.types import FARTHEST_M
 from pipeline.sensing import placing
 from pipeline.sensing.beam_effects import BeamCutter, BeamExpander
 from pipeline.sensing.scene import Scene
@@ -173,6 +174,8 @@ class Scanner:
         assert site.points is not None
         place, roi = f"site {site.name}: points", self.scene.roi
         points, _ = point_clouds.read_points(self.scene.scenario.find(site.points, place), place)
+        if (farthest_m := np.abs(points).max()) > FARTHEST_M:
+            raise InputError(place, f"a point lies {farthest_m:g} m from the world's zero", f"within {FARTHEST_M:g} m")
         ends = points - np.asarray(site.pose.position_m)
         far = np.sqrt((ends**2).sum(axis=1))
         away = np.maximum(far, np.finfo(np.float64).tiny)[:, None]

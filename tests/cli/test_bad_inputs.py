@@ -223,6 +223,10 @@ BAD: dict[str, tuple[Change, str]] = {
         r"statics.geojson: (is not valid JSON|has no list)",
     ),
     # measured scans
+    "points beyond the Earth": (
+        put("cloud.csv", "x_m,y_m,z_m\n10,1e200,3\n", POINTS, ONE_SITE),
+        r"a point lies 1e\+200 m from the world's zero",
+    ),
     "points from elsewhere": (
         put("cloud.csv", "x_m,y_m,z_m\n10,500,3\n", POINTS, ONE_SITE),
         r"none of 1 points lies on a beam",
