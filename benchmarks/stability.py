@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import re
 import statistics
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -116,8 +115,7 @@ def medians(works: Sequence[Callable[[], object]]) -> list[float]:
 
 def march_rows() -> list[tuple[str, float, float, int]]:
     """Ours and the textbook's on the beams of all sites, a round of the sites at a time."""
-    with tempfile.TemporaryDirectory() as temporary:
-        grid, sites = beams_of(SCENE, Path(temporary))
+    grid, sites = beams_of(SCENE)
     shape = np.asarray(grid.shape, np.int64)
     hits = np.zeros(int(shape.prod()), np.uint32)
 
