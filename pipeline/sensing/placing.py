@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.core.errors import InputError
 from pipeline.kernels import rays, solids
@@ -15,8 +16,8 @@ from pipeline.world.mesh import World
 
 def check(scene: Scene, pose: Pose, sensor: Sensor, place: str) -> None:
     """InputError naming ``place`` where the sensor cannot stand or would see nothing of the region of interest."""
-    roi = scene.roi
-    ground_m = _ground_m(scene.world, pose) if scene.scenario.statics.ground else -np.inf
+    roi, over = scene.roi, _faces_round(scene.world, pose)
+    ground_m = _ground_m(scene.world, pose, over) if scene.scenario.statics.ground else -np.inf
     if not pose.z_m > ground_m + rays.EDGE_M:
         raise InputError(
             place,
@@ -34,7 +35,7 @@ def check(scene: Scene, pose: Pose, sensor: Sensor, place: str) -> None:
             f"stands {far_m:.1f} m from the region of interest",
             f"within the {sensor.range_m:g} m of {sensor.name}",
         )
-    inside = _solid_round(scene.world, pose)
+    inside = _solid_round(scene.world, pose, over)
     if inside is not None:
         name, kind = scene.world.solids[inside]
         raise InputError(
@@ -42,11 +43,18 @@ def check(scene: Scene, pose: Pose, sensor: Sensor, place: str) -> None:
         )
 
 
-def _ground_m(world: World, pose: Pose) -> float:
+def _faces_round(world: World, pose: Pose) -> NDArray[np.int64]:
+    """The faces that a plumb line through the sensor may meet."""
+    low, high = world.bounds_xy_m
+    may = np.ones(len(low), dtype=np.bool_)
+    for axis, at_m in enumerate((pose.x_m, pose.y_m)):  # column by column: four times as fast as both at once
+        may &= (low[:, axis] - rays.EDGE_M <= at_m) & (at_m <= high[:, axis] + rays.EDGE_M)
+    return np.flatnonzero(may)
+
+
+def _ground_m(world: World, pose: Pose, over: NDArray[np.int64]) -> float:
     """The ground's z below a sensor: 0, or on the surface that a network with relief has."""
     at = np.array([pose.x_m, pose.y_m])
-    low, high = world.bounds_xy_m
-    over = np.flatnonzero(np.all((low - rays.EDGE_M <= at) & (at <= high + rays.EDGE_M), axis=1))
     of_ground = [i for i in over if world.solids[world.solid_of_face[i]] == ("ground", "ground")]
     for a, b, c in world.triangles_m[of_ground]:
         u, v, to = (b - a)[:2], (c - a)[:2], at - a[:2]
@@ -57,11 +65,9 @@ def _ground_m(world: World, pose: Pose) -> float:
     return 0.0
 
 
-def _solid_round(world: World, pose: Pose) -> int | None:
+def _solid_round(world: World, pose: Pose, over: NDArray[np.int64]) -> int | None:
     """The first solid that a sensor stands in, by its winding number; not one whose surface it stands on."""
     at = np.asarray(pose.position_m)
-    low, high = world.bounds_xy_m
-    over = np.flatnonzero(np.all((low - rays.EDGE_M <= at[:2]) & (at[:2] <= high + rays.EDGE_M), axis=1))
     totals = np.zeros(len(world.solids), dtype=np.int64)
     owner = world.solid_of_face[over]
     solids.windings_at(at, world.triangles_m[over], owner.astype(np.int64), world.signs[owner], totals)
