@@ -1,8 +1,8 @@
 """Finds effects by name and makes those that a scenario names.
 
 Effects are entry points of the group ``egvs.effects`` (``name = "module:Class"``): this program's own, declared in its
-``pyproject.toml``, and those of any other package. A module is imported only when its effect is named. What belongs to a
-new one (its base class, its parameters in :mod:`pipeline.scenario.effects`, the docs) is listed in ``docs/extending.md``.
+``pyproject.toml``, and those of any other package. A module is imported only when its effect is named. What belongs to
+a new one (base class, parameters in :mod:`pipeline.scenario.effects`, docs) is listed in ``docs/extending.md``.
 """
 
 from __future__ import annotations

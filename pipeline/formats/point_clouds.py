@@ -5,8 +5,8 @@ world frame; drop, and count, the returns that are missing (NaN) or infinite. Wh
 guessed.
 
 A format is an entry point of the group ``egvs.point_clouds``: its name is the suffix without the dot, its object has
-``read`` and perhaps ``write`` (:class:`PointFormat`). Here, each is a module of its own, declared in ``pyproject.toml``;
-other packages may add theirs (``docs/extending.md``).
+``read`` and perhaps ``write`` (:class:`PointFormat`). Here, each is a module, declared in ``pyproject.toml``; other
+packages may add theirs (``docs/extending.md``).
 
 Frame: the world's (right-handed, x east, y north, z up), metres, float64.
 """
