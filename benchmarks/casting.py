@@ -39,9 +39,9 @@ def _work(name: str) -> tuple[dict[str, Callable[[], Any]], int, int]:
     jobs = []
     for site in sites.of(scenario):
         sensor = sensors.resolve(site.sensor, scenario.sensors, site.name)
-        directions = sensor.directions(site.yaw_deg, site.pitch_deg, site.roll_deg)
-        position = np.asarray(site.position_m)
-        d = directions[caster.scan(site.position_m, directions, sensor.range_m).beam]
+        directions = sensor.directions(*site.pose.angles_deg)
+        position = np.asarray(site.pose.position_m)
+        d = directions[caster.scan(site.pose.position_m, directions, sensor.range_m).beam]
         start, single = np.tile((position - origin).astype(np.float32), (len(d), 1)), d.astype(np.float32)
         proposed = caster._owner[caster._scene.run(start, single)]
         ranges, doubtful = np.empty(len(d)), np.empty(len(d), dtype=np.int64)
@@ -50,7 +50,7 @@ def _work(name: str) -> tuple[dict[str, Callable[[], Any]], int, int]:
         )
         jobs.append(
             (
-                site.position_m,
+                site.pose.position_m,
                 directions,
                 sensor.range_m,
                 position - origin,
