@@ -14,7 +14,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +58,12 @@ def once(work: Callable[[], Any]) -> float:
     start = time.perf_counter()
     work()
     return time.perf_counter() - start
+
+
+def every(work: Callable[[Site], object], sites: Iterable[Site], threads: int = 1) -> None:
+    """Do the work for every site."""
+    for _ in in_order(work, sites, threads):
+        pass
 
 
 def egvs(*arguments: str) -> tuple[float, float]:
@@ -133,16 +140,14 @@ def sites(folder: Path) -> list[tuple[str, str, str, bool]]:
         hits.fill(0)
         march.count_hits(o, d, shape, counted.grid.voxel_m, hits)
 
-    whole = statistics.median(seconds(lambda site=site: score_one(site)) for site in scene.sites)
-    part = statistics.median(seconds(lambda site=site: march_one(site)) for site in scene.sites)
+    whole = statistics.median(seconds(partial(score_one, site)) for site in scene.sites)
+    part = statistics.median(seconds(partial(march_one, site)) for site in scene.sites)
     times: dict[str, list[float]] = {"1": [], "2": [], "bare": [], "plain": []}
     for _ in range(REPEATS):
         for threads in (1, 2):
-            times[str(threads)].append(
-                once(lambda threads=threads: list(in_order(score_one, scene.sites * 4, threads)))
-            )
-        times["bare"].append(once(lambda: [march_one(site) for site in scene.sites]))
-        times["plain"].append(once(lambda: [visibility.borrowed_hits(beams[site]) for site in scene.sites]))
+            times[str(threads)].append(once(partial(every, score_one, scene.sites * 4, threads)))
+        times["bare"].append(once(partial(every, march_one, scene.sites)))
+        times["plain"].append(once(partial(every, lambda site: visibility.borrowed_hits(beams[site]), scene.sites)))
     gain = statistics.median(a / b for a, b in zip(times["1"], times["2"], strict=True))
     extra = statistics.median(a / b for a, b in zip(times["plain"], times["bare"], strict=True))
     return [

@@ -95,7 +95,7 @@ def prepare(size: Size, folder: Path) -> Path:
     long, wide = _sides(size.hectares)
     channels = min(128, max(4, round(math.sqrt(size.beams / 22.5))))
     spots = max(1, math.ceil(math.sqrt(size.sites)))
-    values = {
+    values: dict[str, dict[str, Any]] = {
         "roi": {"center_m": [long / 2, wide / 2, 2.5], "size_m": [long, wide, 5], "voxel_m": 0.25},
         "traffic": {"fcd": "fcd.csv", "frames": size.frames, "frame_period_s": 0.25, "warmup_s": 0},
         "statics": {"footprints": ["city.geojson"]},
@@ -129,7 +129,8 @@ def _sides(hectares: float) -> tuple[float, float]:
 
 def _city(buildings: int, long: float, wide: float) -> str:
     """Square towers of 12 triangles on a lattice 12 m apart, round the region of interest: GeoJSON."""
-    features, ring = [], 1
+    features: list[Any] = []
+    ring = 1
     while len(features) < buildings:
         reach = 12.0 * ring + 4.0
         low, high = (-reach, -reach), (long + reach, wide + reach)
@@ -247,7 +248,8 @@ def study() -> dict[str, Points]:
         points: Points = {}
         for value in axis.sizes:
             start = time.perf_counter()
-            size = replace(axis.others, **{axis.name: value if axis.name == "hectares" else int(value)})
+            asked: dict[str, Any] = {axis.name: value if axis.name == "hectares" else int(value)}
+            size = replace(axis.others, **asked)
             costs = apart(size)
             for stage, cost in costs.items():
                 points.setdefault(stage, {})[value] = cost

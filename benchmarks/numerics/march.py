@@ -320,12 +320,12 @@ def far_chords(scale):
         away = rng.normal(size=3)
         o = target - away / np.sqrt((away**2).sum()) * FAR_M / voxel_m
         d = 2 * (target - o)
-        exact = oracle.shares(o, d, shape)
+        exact = oracle.shares(o, d, shape.tolist())
         count, _, _ = march.walk(o, d, shape, voxel_m, np.zeros(1, np.uint32), cells, t_cells)
         for c in range(count):
-            voxel = tuple(int(i) for i in np.unravel_index(cells[c], tuple(shape)))
+            i, j, k = (int(i) for i in np.unravel_index(cells[c], tuple(shape)))
             worst = max(
-                worst, abs(Fraction(t_cells[c, 1]) - Fraction(t_cells[c, 0]) - exact[voxel]) * Fraction(2 * FAR_M)
+                worst, abs(Fraction(t_cells[c, 1]) - Fraction(t_cells[c, 0]) - exact[i, j, k]) * Fraction(2 * FAR_M)
             )
     return Row(
         "chords of beams from 1e7 m away",
