@@ -10,6 +10,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from pipeline.artefacts.run_record import StageRecord
 from pipeline.cli.terminal import in_words
+from pipeline.core.findings import WARNINGS, warnings_of
 
 
 class Screen:
@@ -60,8 +61,10 @@ class Screen:
         if self._has_bar:
             self._bar.update(self._task, visible=False)
         took = {"skipped": "unchanged", "fetched": "from store"}.get(state) or f"{record.cost.seconds:.2f} s"
-        summary = {key: value for key, value in record.summary.items() if key != "flags"}
+        summary = {key: value for key, value in record.summary.items() if key not in ("flags", WARNINGS)}
         self._print(f"{stage:<8} {took:>10}   {in_words(summary)}")
+        for warning in warnings_of([record.summary]):
+            self._print(f"warning: {warning}")
 
     def setting_event(self, name: str, state: str, about: dict[str, Any]) -> None:
         """A setting of a study is "done", "kept" or "skipped": one line, but for what the budget leaves out."""

@@ -18,6 +18,7 @@ from typing import Any
 from pipeline.artefacts.readers import SEPARABLE, Tpog, read_tpog
 from pipeline.artefacts.run_record import RECORD, RunRecord, StageRecord
 from pipeline.core import files
+from pipeline.core.findings import WARNINGS, warnings_of
 from pipeline.core.version import __version__
 from pipeline.report import figures, maps, wording
 from pipeline.report.colours import STYLE_SHEET
@@ -68,7 +69,8 @@ def inputs(work: Workspace) -> StageInputs:
         if name in stages
     }
     costs = {name: [stage.cost.seconds, stage.cost.peak_mb] for name, stage in stages.items()}
-    return StageInputs(settings, hashes, {"costs": costs, "summaries": summaries})
+    warnings = [stage.summary.get(WARNINGS, []) for stage in stages.values()]
+    return StageInputs(settings, hashes, {"costs": costs, "summaries": summaries, "warnings": warnings})
 
 
 def _shown(scenario: Scenario) -> dict[str, Any]:
@@ -157,5 +159,6 @@ def page(
         watched=wording.duration(tpog.frames * scenario.traffic.frame_period_s),
         effects=effects,
         left_out=[what for what, effect in _LEFT_OUT if effect not in effects],
+        warnings=warnings_of(stage.summary for stage in stages.values()),
         version=__version__,
     )

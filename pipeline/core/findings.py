@@ -1,0 +1,63 @@
+"""What was found wrong or doubtful about a scenario or a run: where, what, and the cure.
+
+An error stops; a warning is told on the terminal, kept in ``run.json`` and shown above the report's ranking. A stage
+leaves its warnings in its summary under :data:`WARNINGS`, as :meth:`Finding.to_json` gives them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from pipeline.core.errors import EgvsError
+
+WARNINGS = "warnings"
+"""The key of a stage's summary that holds its warnings."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that a planner has to know before trusting a ranking.
+
+    Attributes
+    ----------
+    rule
+        What was held against what, a short name that stays the same: "sites on lanes".
+    place
+        File and key or row, or coordinates in the world frame.
+    found
+        What is there, with its numbers.
+    cure
+        What would be right, or how to get there.
+    is_error
+        Whether it must stop the run.
+    """
+
+    rule: str
+    place: str
+    found: str
+    cure: str
+    is_error: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.place}: {self.found}" + (f"; {self.cure}" if self.cure else "")
+
+    def to_json(self) -> dict[str, Any]:
+        """As a stage's summary holds it."""
+        return asdict(self)
+
+
+def warnings_of(summaries: Iterable[Mapping[str, Any]]) -> list[Finding]:
+    """The warnings that stages have left in their summaries, in their order."""
+    return [Finding(**value) for summary in summaries for value in summary.get(WARNINGS, ())]
+
+
+class FindingsError(EgvsError):
+    """What was found forbids the run; all errors at once."""
+
+    exit_code = 2
+
+    def __init__(self, findings: Iterable[Finding]) -> None:
+        self.findings = tuple(findings)
+        super().__init__("\n".join(map(str, self.findings)))
