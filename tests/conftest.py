@@ -136,7 +136,11 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
 @pytest.fixture
 def mini(tmp_path: Path) -> Path:
     """A scenario folder: a finished FCD file, one building and a pole, two sites, a coarse sensor."""
-    folder = tmp_path / "mini"
+    return write_mini(tmp_path / "mini")
+
+
+def write_mini(folder: Path) -> Path:
+    """Make the folder of :func:`mini`."""
     folder.mkdir()
     (folder / "scenario.toml").write_text(SCENARIO)
     (folder / "fcd.csv").write_text(fcd())

@@ -15,6 +15,7 @@ import pytest
 from importlinter.cli import lint_imports
 
 import pipeline
+from tests.conftest import write_mini
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "pipeline"
@@ -41,8 +42,11 @@ def imported(name: str) -> set[str]:
     return found
 
 
-def run_python(code: str) -> str:
-    return subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True).stdout
+def run_python(code: str, folder: Path = ROOT) -> str:
+    """What a new process prints that runs ``code`` in ``folder``."""
+    done = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 # ---- what imports what
@@ -117,10 +121,49 @@ def test_dir_shows_what_the_package_offers() -> None:
         _ = pipeline.nothing
 
 
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of a small scenario that keeps what its sites see."""
+    folder = tmp_path_factory.mktemp("offered")
+    write_mini(folder / "mini")
+    scenario = pipeline.load(folder / "mini", ["score.keep_visibility='all'"])
+    pipeline.run(scenario, folder / "run", jobs=1)
+    return folder
+
+
+SCENE = "from pipeline import *; s = load('mini'); scene = build_scene(s); "
+USES = {
+    "EgvsError": "EgvsError('text')",
+    "InputError": "InputError('place', 'found', 'right').right == 'right'",
+    "Pose": "Pose(1.0, 2.0, 3.0).position_m == (1.0, 2.0, 3.0)",
+    "RunError": "RunError('text').exit_code == 1",
+    "Scanner": SCENE + "Scanner(scene).scan_site(scene.sites[0]).beams_in_roi > 0",
+    "Scenario": "Scenario.model_fields['roi']",
+    "Scene": SCENE + "isinstance(scene, Scene)",
+    "Scorer": SCENE + "Scorer(scene, read_tpog('run/tpog.parquet')).limit > 0",
+    "Sensor": SCENE + "isinstance(scene.sensor('small'), Sensor) and Sensor.directions(scene.sensor('small')).any()",
+    "Site": "Site('a', __import__('pipeline').Pose(1.0, 2.0, 3.0), 'VLP-16').points is None",
+    "Tpog": "(Tpog.p.fget(__import__('pipeline').read_tpog('run/tpog.parquet')) <= 1).all()",
+    "World": SCENE + "isinstance(scene.world, World) and scene.world.triangles_m.shape[1:] == (3, 3)",
+    "build_scene": "build_scene(__import__('pipeline').load('mini')).sites",
+    "load": "load('mini').name == 'mini'",
+    "read_scans": "len(read_scans('run/scans.parquet').to_pandas())",
+    "read_scores": "list(read_scores('run/scores.parquet').to_pandas().site) == ['pole_a', 'pole_b']",
+    "read_tpog": "read_tpog('run/tpog.parquet').p.max() > 0",
+    "read_trajectories": "len(read_trajectories('run/trajectories.parquet').to_pandas()) == 80",
+    "read_visibility": "read_visibility('run/visibility.parquet', 'pole_a').sum() > 0",
+    "run": "run(__import__('pipeline').load('mini'), 'again').stages['score']",
+    "verify": "verify('run') == []",
+}
+"""Public name -> something that it is used for, in a folder that holds a scenario and its run."""
+
+
 @pytest.mark.system
 @pytest.mark.parametrize("name", sorted(set(pipeline.__all__) - {"__version__"}))
-def test_each_name_can_be_imported_first_and_says_what_it_is(name: str) -> None:
-    code = f"import inspect, pipeline; from pipeline import {name}; assert pipeline.{name} is {name}"
-    kind, said = run_python(f"{code}; print(inspect.isclass({name})); print(inspect.getdoc({name}))").split("\n", 1)
+def test_each_name_can_be_imported_and_used_first_and_says_what_it_is(name: str, run_folder: Path) -> None:
+    *before, use = USES[name].split("; ")
+    lines = [f"from pipeline import {name}", *before, f"assert {use}"]
+    code = "\n".join([*lines, f"import inspect\nprint(inspect.isclass({name}))\nprint(inspect.getdoc({name}))"])
+    kind, said = run_python(code, run_folder).split("\n", 1)
     assert said.strip() not in ("", "None")
     assert kind == str(name[0].isupper())

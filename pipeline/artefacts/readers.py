@@ -1,7 +1,7 @@
 """Artefacts as arrays and tables, for notebooks, stages, and people who want to compute further.
 
-Each reader checks what it reads and says which file is wrong. Tables come as Arrow tables (``.to_pandas()`` where
-pandas is installed), grids as NumPy arrays.
+Each reader checks what it reads and says which file is wrong. Tables come as Arrow tables (``.to_pandas()`` makes a
+data frame of one), grids as NumPy arrays.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from pipeline.artefacts import tables
@@ -98,7 +99,7 @@ def read_visibility(path: str | Path, site: str) -> NDArray[np.float64]:
     """Hits of one site in every voxel, (nx, ny, nz) float64, from ``visibility.parquet``."""
     path = Path(path)
     table, about = tables.read(path, "visibility")
-    mine = table.filter(pa.compute.equal(table.column("site"), site))
+    mine = table.filter(pc.equal(table.column("site"), site))
     if len(mine) == 0 and site not in {s["site"] for s in about["sites"]}:
         raise InputError(path, f"no site {site!r}", "a site that score.keep_visibility names")
     hits = np.zeros(Grid.from_json(about["grid"]).shape)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pipeline.cli import arguments, interrupts
-from pipeline.cli.arguments import Audit, Jobs, Out, ScenarioPath, Set
+from pipeline.cli.arguments import Audit, Jobs, Out, ScenarioPath, Set, Top
 from pipeline.core.errors import EgvsError, InputError
 from pipeline.core.version import __version__
 
@@ -71,7 +71,14 @@ def options(
 
 
 @app.command()
-def run(scenario: ScenarioPath, out: Out = None, set_: Set = None, jobs: Jobs = None, audit: Audit = False) -> None:
+def run(
+    scenario: ScenarioPath,
+    out: Out = None,
+    set_: Set = None,
+    jobs: Jobs = None,
+    audit: Audit = False,
+    top: Top = None,
+) -> None:
     """Everything, in order; stages whose inputs did not change are skipped."""
     from pipeline.cli import results
     from pipeline.cli.progress import Screen
@@ -83,7 +90,7 @@ def run(scenario: ScenarioPath, out: Out = None, set_: Set = None, jobs: Jobs = 
         record = workflow.run(
             resolved, folder, jobs=jobs, progress=screen.progress, listener=screen.stage_event, options=extra
         )
-    results.print_run(folder, record, anything_ran=screen.any_stage_ran)
+    results.print_run(folder, record, anything_ran=screen.any_stage_ran, top=top)
 
 
 @app.command()
@@ -133,9 +140,16 @@ def scan(
 
 
 @app.command()
-def score(scenario: ScenarioPath, out: Out = None, set_: Set = None, jobs: Jobs = None, audit: Audit = False) -> None:
+def score(
+    scenario: ScenarioPath,
+    out: Out = None,
+    set_: Set = None,
+    jobs: Jobs = None,
+    audit: Audit = False,
+    top: Top = None,
+) -> None:
     """Score and rank the sites: scores.parquet."""
-    _run_stage("score", scenario, out, set_, jobs, **({"audit": True} if audit else {}))
+    _run_stage("score", scenario, out, set_, jobs, top, **({"audit": True} if audit else {}))
 
 
 @app.command()
@@ -145,7 +159,13 @@ def report(scenario: ScenarioPath, out: Out = None, set_: Set = None) -> None:
 
 
 def _run_stage(
-    stage: str, scenario: Path, out: Path | None, set_: list[str] | None, jobs: int | None = None, **extra: Any
+    stage: str,
+    scenario: Path,
+    out: Path | None,
+    set_: list[str] | None,
+    jobs: int | None = None,
+    top: int | None = None,
+    **extra: Any,
 ) -> None:
     """Run one stage and print what it wrote."""
     from pipeline.cli import results
@@ -157,7 +177,7 @@ def _run_stage(
         record = workflow.run_one(
             stage, resolved, folder, jobs=jobs, progress=screen.progress, listener=screen.stage_event, **extra
         )
-    results.print_stage(folder, stage, record)
+    results.print_stage(folder, stage, record, top=top)
 
 
 # ---- runs that exist already

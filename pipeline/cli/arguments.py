@@ -21,6 +21,9 @@ Set = Annotated[
 Jobs = Annotated[
     int | None, typer.Option("--jobs", min=1, help="Threads; one a core by default. Results do not depend on it.")
 ]
+Top = Annotated[
+    int | None, typer.Option("--top", metavar="N", min=1, help="Print the best N sites only; all by default.")
+]
 Audit = Annotated[bool, typer.Option("--audit", help="Check every beam's chords, and print the worst case.")]
 
 

@@ -20,19 +20,20 @@ if TYPE_CHECKING:
 _FILE_WIDTH = 150
 
 
-def ranking_table(sites: Sequence[ScoredSite], width: int = WIDE) -> Table:
-    """Sites by rank; without poses and sensors where the terminal is narrow."""
+def ranking_table(sites: Sequence[ScoredSite], width: int = WIDE, top: int | None = None) -> Table:
+    """The ``top`` sites (all by default) by rank; without poses and sensors where the terminal is narrow."""
     is_wide, has_errors = width >= NARROW, any(site.egvs_se is not None for site in sites)
     names = ["rank", "site", *(["x m", "y m", "z m", "sensor"] if is_wide else []), "EGVS bit"]
     names += ["std error", "beats next"] if has_errors else []
     names += ["of best", "entropy seen", *(["beams in ROI"] if is_wide else [])]
     ranking = table(names, left=("site", "sensor"), whole=[name for name in names if name != "site"])
-    if not all(site.is_separable for site in sites):
+    by_rank = sorted(sites, key=lambda site: site.rank)
+    shown = by_rank[:top]
+    if not all(site.is_separable for site in shown):
         chance = f"the chance that it truly scores higher is below {SEPARABLE:.0%}"
         ranking.caption = f"~ not separable from the next site: {chance}"
-    by_rank = sorted(sites, key=lambda site: site.rank)
     best = max((site.egvs for site in sites), default=0.0)
-    for site in by_rank:
+    for site in shown:
         sure = "" if site.is_separable else "~ "
         cells = {
             "rank": str(site.rank), "site": site.site, "x m": f"{site.x_m:.2f}", "y m": f"{site.y_m:.2f}",
@@ -46,10 +47,10 @@ def ranking_table(sites: Sequence[ScoredSite], width: int = WIDE) -> Table:
     return ranking
 
 
-def print_run(folder: Path, record: RunRecord, *, anything_ran: bool) -> None:
+def print_run(folder: Path, record: RunRecord, *, anything_ran: bool, top: int | None = None) -> None:
     """The ranking, the artefacts, and what each stage cost."""
     out = console(_FILE_WIDTH)
-    _print_scores(out, folder, record)
+    _print_scores(out, folder, record, top)
     stages = Table("stage", "artefact", "seconds", "peak MB", box=None, pad_edge=False)
     for stage, done in record.stages.items():
         names = "\n".join(str(folder / name) for name in done.artefacts)
@@ -59,11 +60,11 @@ def print_run(folder: Path, record: RunRecord, *, anything_ran: bool) -> None:
         out.print("nothing to do: no stage's inputs changed since the last run")
 
 
-def print_stage(folder: Path, stage: str, record: RunRecord) -> None:
+def print_stage(folder: Path, stage: str, record: RunRecord, *, top: int | None = None) -> None:
     """What one stage wrote."""
     out = console(_FILE_WIDTH)
     if stage == "score":
-        _print_scores(out, folder, record)
+        _print_scores(out, folder, record, top)
     done = record.stages[stage]
     for name in (*done.artefacts, *done.summary.get("clouds", ())):
         out.print(str(folder / name), markup=False)
@@ -84,9 +85,12 @@ def print_new_scenario(made: NewScenario) -> None:
     out.print(f"next: egvs run {made.folder}", markup=False)
 
 
-def _print_scores(out: Console, folder: Path, record: RunRecord) -> None:
-    """The ranking, and the audit's worst case where there was one."""
-    out.print(ranking_table(ScoredSite.all_of(read_scores(folder / "scores.parquet")), out.width))
+def _print_scores(out: Console, folder: Path, record: RunRecord, top: int | None) -> None:
+    """The ranking of the ``top`` sites, and the audit's worst case where there was one."""
+    sites = ScoredSite.all_of(read_scores(folder / "scores.parquet"))
+    out.print(ranking_table(sites, out.width, top))
+    if top is not None and len(sites) > top:
+        out.print(f"... and {len(sites) - top} more: without --top, in {folder / 'scores.parquet'} or in the report")
     audit = record.stages["score"].summary.get("audit")
     if audit:
         out.print(

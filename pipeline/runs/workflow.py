@@ -211,8 +211,8 @@ def _intact(work: Workspace, artefacts: dict[str, str]) -> bool:
 
 
 def verify(
-    folder: Path,
-    scenario_folder: Path | None = None,
+    folder: str | Path,
+    scenario_folder: str | Path | None = None,
     *,
     jobs: int | None = None,
     progress: Progress = silent,
@@ -230,11 +230,12 @@ def verify(
     list of str
         One line for each artefact that differs: altered since the run, or not reproduced by it. Empty when all is well.
     """
+    folder = Path(folder)
     record = RunRecord.read(folder)
     missing = [name for name in STAGES if name not in record.stages]
     if missing:
         raise InputError(folder / RECORD, f"the stage {missing[0]} is not done", "a finished run; call egvs run first")
-    source = scenario_folder or Path(os.path.normpath(folder / record.scenario_folder))
+    source = Path(scenario_folder or os.path.normpath(folder / record.scenario_folder))
     if not source.is_dir():
         raise InputError(folder / RECORD, f"the scenario's folder {source} is not there", "name it with --scenario")
     scenario = from_values(record.scenario, source, str(folder / RECORD))

@@ -18,7 +18,8 @@ from pydantic import ValidationError
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Grid
 from pipeline.scenario.messages import explain
-from pipeline.scenario.models import FILE, Scenario
+from pipeline.scenario.models import FILE, SITE_SOURCES, Scenario
+from pipeline.scenario.traffic import SOURCES, idle_beside
 
 
 def load(path: str | Path, overrides: Iterable[str] = ()) -> Scenario:
@@ -43,7 +44,7 @@ def load(path: str | Path, overrides: Iterable[str] = ()) -> Scenario:
         if override.partition("=")[0].strip() == "extends":
             found = "a scenario is extended by its file alone"
             raise InputError(f"--set {override}", found, "extends = ... in a scenario.toml")
-        _lay_over(values, override)
+        values = _lay_over(values, override)
     scenario = from_values(values, file.parent, str(file))
     source, idle = scenario.traffic.idle_keys()
     if idle:
@@ -65,7 +66,28 @@ def _read(file: Path, heirs: tuple[Path, ...]) -> dict[str, Any]:
         raise InputError(file, f"is not valid TOML: {error}") from None
     if not isinstance(base := values.get("extends", ""), str):
         raise InputError(f"{file}: extends", f"{base!r}", "the path of a scenario's folder")
-    return _merged(_read(file.parent / base / FILE, (*heirs, file.resolve())), values) if base else values
+    if not base:
+        return values
+    below = _read(file.parent / base / FILE, (*heirs, file.resolve()))
+    return _merged(_making_way(below, values), values)
+
+
+_SOURCES = {"traffic": SOURCES, "sites": SITE_SOURCES}
+
+
+def _making_way(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    """``below`` without the sources of traffic and sites that ``above`` replaces by others, and what hangs on them."""
+    left = dict(below)
+    for table, sources in _SOURCES.items():
+        old, new = below.get(table), above.get(table)
+        if not isinstance(old, dict) or not isinstance(new, dict):
+            continue
+        source = next((key for key in sources if key in new), None)
+        if source is None or all(key in new for key in sources if key in old):
+            continue
+        idle = idle_beside(source) | {"routes"} if table == "traffic" else {"points"}
+        left[table] = {key: value for key, value in old.items() if key not in idle and key not in sources}
+    return left
 
 
 def _merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
@@ -104,7 +126,8 @@ def json_schema() -> str:
     return json.dumps(Scenario.model_json_schema(), indent=2, ensure_ascii=False) + "\n"
 
 
-def _lay_over(values: dict[str, Any], override: str) -> None:
+def _lay_over(values: dict[str, Any], override: str) -> dict[str, Any]:
+    """``values`` with one ``key.key=value`` in them."""
     key, equals, text = override.partition("=")
     if not equals or not key.strip():
         raise InputError(f"--set {override}", "no key=value", "for example --set traffic.frames=500")
@@ -112,9 +135,13 @@ def _lay_over(values: dict[str, Any], override: str) -> None:
         value = tomllib.loads(f"v = {text}")["v"]
     except tomllib.TOMLDecodeError:
         value = text
-    *parents, last = key.strip().split(".")
+    *parents, last = words = key.strip().split(".")
+    if parents:
+        values = _making_way(values, {words[0]: {words[1]: value}})
+    top = values
     for parent in parents:
         values = values.setdefault(parent, {})
         if not isinstance(values, dict):
             raise InputError(f"--set {override}", f"'{parent}' is not a table", "a key that the scenario knows")
     values[last] = value
+    return top

@@ -86,6 +86,10 @@ class SiteLine(StrictModel):
     heights_m: tuple[Positive, ...] = Field(min_length=1)
 
 
+SITE_SOURCES = ("file", "grid", "along")
+"""Keys that say where candidate sites come from; a scenario has one of them."""
+
+
 class SitesModel(StrictModel):
     """Candidate sites: a file, or a rule. Pose and sensor below hold for every site that names none of its own."""
 
@@ -102,7 +106,7 @@ class SitesModel(StrictModel):
 
     @model_validator(mode="after")
     def _one_source(self) -> SitesModel:
-        given = [key for key in ("file", "grid", "along") if getattr(self, key)]
+        given = [key for key in SITE_SOURCES if getattr(self, key)]
         if len(given) != 1:
             raise ValueError(f"exactly one of file, grid and along is needed, found {' and '.join(given) or 'none'}")
         return self

@@ -32,6 +32,19 @@ _FLEET = (
 )
 
 
+SOURCES = ("network", "sumocfg", "fcd")
+"""Keys that say where vehicles come from; a scenario has one of them."""
+
+
+def idle_beside(source: str) -> frozenset[str]:
+    """The keys that act on nothing with this source: one of :data:`SOURCES`, or "routes" for a network with routes."""
+    drawn = frozenset({"trips_per_s", "min_trip_m", "edge_weights", "kinds"})
+    simulated = frozenset({"vehicles", "hold", "step_s", "lateral_resolution_m", "max_depart_delay_s"})
+    if source == "fcd":
+        return simulated | drawn - {"kinds"} | {"routes"}
+    return {"sumocfg": drawn | {"routes"}, "routes": drawn}.get(source, frozenset())
+
+
 class TrafficModel(StrictModel):
     """Where vehicles come from: a network (with drawn or given demand), a SUMO configuration, or a finished FCD
     file.
@@ -73,7 +86,7 @@ class TrafficModel(StrictModel):
 
     @model_validator(mode="after")
     def _one_source(self) -> TrafficModel:
-        given = [key for key in ("network", "sumocfg", "fcd") if getattr(self, key) is not None]
+        given = [key for key in SOURCES if getattr(self, key) is not None]
         if len(given) != 1:
             raise ValueError(
                 f"exactly one of network, sumocfg and fcd is needed, found {' and '.join(given) or 'none'}"
@@ -97,10 +110,7 @@ class TrafficModel(StrictModel):
 
     def idle_keys(self) -> tuple[str, set[str]]:
         """The source of the traffic, and the keys that the user set although they act on nothing with this source."""
-        drawn = {"trips_per_s", "min_trip_m", "edge_weights", "kinds"}
-        simulated = {"vehicles", "hold", "step_s", "lateral_resolution_m", "max_depart_delay_s"}
-        if self.fcd is not None:
-            return "fcd", self.model_fields_set & ({"routes"} | simulated | drawn - {"kinds"})
-        if self.sumocfg is not None:
-            return "sumocfg", self.model_fields_set & ({"routes"} | drawn)
-        return "routes", self.model_fields_set & (drawn if self.routes else set())
+        source = next(key for key in SOURCES if getattr(self, key) is not None)
+        if self.routes and source == "network":
+            source = "routes"
+        return source, set(self.model_fields_set & idle_beside(source))

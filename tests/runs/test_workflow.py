@@ -285,3 +285,19 @@ def test_a_record_of_an_earlier_version_is_one_of_nothing(done: tuple[Path, Path
     assert set(states(pipeline.load(mini), out).values()) == {"fetched"}
     assert workflow.verify(out) == []
     assert not {"effects", "said"} & json.loads((out / "run.json").read_text()).keys()
+
+
+def test_the_best_sites_alone_are_printed_and_the_others_counted(mini: Path, tmp_path: Path, egvs) -> None:
+    rows = [f"p{i:02d},{2 + i},12,{3 + i / 8}" for i in range(9)]
+    (mini / "sites.csv").write_text("\n".join(["site,x_m,y_m,z_m", *rows]) + "\n")
+    code, whole, _ = egvs("run", mini, "--out", tmp_path / "out")
+    assert (code, "more: without --top" in whole) == (0, False)
+    ranked = [line.split()[1] for line in whole.splitlines() if re.match(r"\s*\d+\s+p\d\d", line)]
+    assert len(ranked) == 9
+    for verb in ("run", "score"):
+        code, printed, _ = egvs(verb, mini, "--out", tmp_path / "out", "--top", 4)
+        assert code == 0
+        assert [line.split()[1] for line in printed.splitlines() if re.match(r"\s*\d+\s+p\d\d", line)] == ranked[:4]
+        assert "... and 5 more: without --top, in " in printed
+    assert "more: without" not in egvs("score", mini, "--out", tmp_path / "out", "--top", 9)[1]
+    assert egvs("run", mini, "--top", 0)[0] == 2

@@ -1,0 +1,95 @@
+"""Scenarios that build on others: what takes the place of what."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import pipeline
+from pipeline.core.errors import InputError
+from pipeline.scenario.models import Scenario
+
+BASE = """
+[roi]
+center_m = [0, 0, 2.5]
+size_m = [40, 20, 5]
+
+[traffic]
+network = "a.net.xml"
+routes = ["a.rou.xml"]
+vehicles = 30
+warmup_s = 60
+
+[[traffic.kinds]]
+name = "car"
+length_m = 4.5
+width_m = 1.8
+height_m = 1.5
+
+[sites]
+file = "sites.csv"
+points = "measured.ply"
+pitch_deg = -5
+"""
+
+DRAWN = BASE.replace('routes = ["a.rou.xml"]\n', "")
+GRID = "[sites.grid]\nlow_m = [0, 0]\nhigh_m = [9, 0]\nspacing_m = 3\nheights_m = [4]\n"
+
+
+def extended(tmp_path: Path, above: str, below: str = DRAWN, *overrides: str) -> Scenario:
+    for name, text in (("below", below), ("above", 'extends = "../below"\n' + above)):
+        (tmp_path / name).mkdir(exist_ok=True)
+        (tmp_path / name / "scenario.toml").write_text(text)
+    return pipeline.load(tmp_path / "above", overrides)
+
+
+def test_a_rule_for_sites_takes_the_place_of_a_file_and_of_its_measured_scan(tmp_path: Path) -> None:
+    sites = extended(tmp_path, GRID).sites
+    assert (sites.file, sites.points, sites.pitch_deg) == (None, None, -5)
+    assert sites.grid is not None and sites.grid.spacing_m == 3
+    back = extended(tmp_path, '[sites]\nfile = "other.csv"\n', DRAWN.split("[sites]")[0] + GRID).sites
+    assert (back.file, back.grid) == ("other.csv", None)
+
+
+def test_a_table_of_the_same_source_still_merges(tmp_path: Path) -> None:
+    sites = extended(tmp_path, "[sites.grid]\nspacing_m = 1\n", DRAWN.split("[sites]")[0] + GRID).sites
+    assert sites.grid is not None
+    assert (sites.grid.spacing_m, sites.grid.high_m) == (1, (9, 0))
+    traffic = extended(tmp_path, '[traffic]\nnetwork = "b.net.xml"\n').traffic
+    assert (traffic.network, traffic.vehicles) == ("b.net.xml", 30)
+
+
+def test_a_finished_file_takes_the_place_of_a_network_and_of_what_it_alone_needed(tmp_path: Path) -> None:
+    traffic = extended(tmp_path, '[traffic]\nfcd = "fcd.csv"\n').traffic
+    assert (traffic.network, traffic.fcd, traffic.warmup_s) == (None, "fcd.csv", 60)
+    assert "vehicles" not in traffic.model_fields_set
+    assert [kind.name for kind in traffic.kinds] == ["car"]  # its sizes
+
+
+@pytest.mark.parametrize("source", ["network", "sumocfg", "fcd"])
+@pytest.mark.parametrize("old", ["network", "sumocfg", "fcd"])
+def test_the_new_source_of_traffic_wins(tmp_path: Path, old: str, source: str) -> None:
+    below = f'[roi]\ncenter_m = [0, 0, 1]\nsize_m = [4, 4, 2]\n[sites]\nfile = "s.csv"\n[traffic]\n{old} = "old"\n'
+    traffic = extended(tmp_path, f'[traffic]\n{source} = "new"\n', below).traffic
+    assert {key: getattr(traffic, key) for key in ("network", "sumocfg", "fcd") if getattr(traffic, key)} == {
+        source: "new"
+    }
+
+
+def test_routes_of_another_source_are_left_behind(tmp_path: Path) -> None:
+    below = BASE.split("[[traffic.kinds]]")[0] + "[sites]" + BASE.split("[sites]")[1]
+    assert extended(tmp_path, '[traffic]\nsumocfg = "x.sumocfg"\n', below).traffic.routes == ()
+    assert extended(tmp_path, '[traffic]\nnetwork = "b.net.xml"\n', below).traffic.routes == ("a.rou.xml",)
+
+
+def test_an_override_takes_the_place_of_a_source_too(tmp_path: Path) -> None:
+    scenario = extended(tmp_path, "", DRAWN, "traffic.fcd=x.csv", "sites.along=[]", "sites.file=y.csv")
+    assert (scenario.traffic.network, scenario.traffic.fcd, scenario.sites.file) == (None, "x.csv", "y.csv")
+
+
+def test_two_sources_in_one_place_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="exactly one of network, sumocfg and fcd is needed, found network and fcd"):
+        extended(tmp_path, '[traffic]\nfcd = "x.csv"\nnetwork = "b.net.xml"\n')
+    with pytest.raises(InputError, match="vehicles would act on nothing beside fcd"):
+        extended(tmp_path, '[traffic]\nfcd = "x.csv"\nvehicles = 5\n')
