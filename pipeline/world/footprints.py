@@ -1,7 +1,7 @@
 """Reads footprints, and mends or refuses what is not sound.
 
-Steps: read GeoJSON polygons, lines and points, or a SUMO .poly.xml; widen lines and points; mend what has one meaning
-only, and count it; refuse the rest. World frame, metres.
+Steps: read GeoJSON polygons, lines and points (:mod:`pipeline.world.poly_xml` reads SUMO's); widen lines and points;
+mend what has one meaning only, and count it; refuse the rest. World frame, metres.
 
 ``height_m`` is the z of the top, ``base_m`` (default 0) the z of the underside. Points are discs of ``radius_m``, lines
 are strips of that half width.
@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.core.errors import InputError
-from pipeline.formats import safe_xml
 from pipeline.scenario.types import FARTHEST_M
 
 if TYPE_CHECKING:
@@ -71,7 +70,7 @@ def read_geojson(path: Path) -> FootprintFile:
         if not height > base:
             raise InputError(place, f"height_m = {height:g} with base_m = {base:g}", "a top above the underside")
         kind = str(properties.get("kind", "footprint"))
-        for part in _polygons(feature.get("geometry"), properties, place, file.mended):
+        for part in polygons_of(feature.get("geometry"), properties, place, file.mended):
             file.footprints.append(Footprint(name, kind, part, base, height))
     return file
 
@@ -85,7 +84,7 @@ def _metres(properties: dict[str, Any], key: str, place: str, default: float | N
     return float(value)
 
 
-def _polygons(geometry: Any, properties: dict[str, Any], place: str, mended: Counter[str]) -> list[Polygon]:
+def polygons_of(geometry: Any, properties: dict[str, Any], place: str, mended: Counter[str]) -> list[Polygon]:
     """The polygons of one feature: lines and points buffered, dirt mended, multi-part geometries taken apart."""
     import shapely
 
@@ -131,32 +130,3 @@ def _sound(shape: BaseGeometry, place: str, mended: Counter[str]) -> BaseGeometr
     if doubled := len(shapely.get_coordinates(shape)) - len(shapely.get_coordinates(clean)):
         mended["doubled points"] += doubled
     return shapely.orient_polygons(clean)
-
-
-def read_poly_xml(path: Path, height_m: float) -> FootprintFile:
-    """Footprints of a SUMO .poly.xml; a ``height`` parameter overrides the default height.
-
-    InputError names the polygon that is not in metres, or not sound.
-    """
-    file = FootprintFile()
-    for number, element in enumerate(safe_xml.children(path, "additional")):
-        if element.tag != "poly":
-            file.left_out[f"<{element.tag}> of .poly.xml"] += 1
-            continue
-        name = element.get("id", f"{path.stem}_{number}")
-        place = f"{path}: poly {name}"
-        if element.get("geo", "false").lower() in ("true", "1"):
-            raise InputError(place, "has longitude and latitude (geo)", "a shape in the network's metres")
-        try:
-            points = [tuple(float(v) for v in pair.split(",")[:2]) for pair in element.get("shape", "").split()]
-            top = next((float(p.get("value", "")) for p in element if p.get("key") == "height"), height_m)
-        except ValueError as error:
-            what = f"has a value that is no number ({error})"
-            raise InputError(place, what, "shape='x,y x,y ...' in metres") from None
-        if element.get("fill", "false").lower() not in ("true", "1") or len(points) < 3:
-            file.left_out["lines of .poly.xml"] += 1
-            continue
-        ring = [*points, points[0]]
-        for part in _polygons({"type": "Polygon", "coordinates": [ring]}, {}, place, file.mended):
-            file.footprints.append(Footprint(name, element.get("type", "polygon"), part, 0.0, top))
-    return file

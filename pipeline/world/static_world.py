@@ -22,9 +22,10 @@ from pipeline.core.errors import InputError
 from pipeline.core.progress import Progress, silent
 from pipeline.scenario.models import MeshModel, Scenario
 from pipeline.scenario.types import FARTHEST_M
-from pipeline.world.footprints import Footprint, read_geojson, read_poly_xml
+from pipeline.world.footprints import Footprint, read_geojson
 from pipeline.world.ground import GroundSource
 from pipeline.world.mesh import World
+from pipeline.world.poly_xml import read_poly_xml
 from pipeline.world.terrain import Surface
 
 Floats = NDArray[np.float64]
