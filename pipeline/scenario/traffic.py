@@ -38,7 +38,7 @@ SOURCES = ("network", "sumocfg", "fcd")
 
 def idle_beside(source: str) -> frozenset[str]:
     """The keys that act on nothing with this source: one of :data:`SOURCES`, or "routes" for a network with routes."""
-    drawn = frozenset({"trips_per_s", "min_trip_m", "edge_weights", "kinds"})
+    drawn = frozenset({"vehicles_per_lane_km", "trips_per_s", "min_trip_m", "edge_weights", "kinds"})
     simulated = frozenset({"vehicles", "hold", "step_s", "lateral_resolution_m", "max_depart_delay_s"})
     if source == "fcd":
         return simulated | drawn - {"kinds"} | {"routes"}
@@ -60,9 +60,17 @@ class TrafficModel(StrictModel):
     fcd: str | None = Field(
         None, description="A finished FCD file (XML, CSV or Parquet, may be gzipped); nothing is simulated"
     )
-    vehicles: int = Field(50, ge=1, description="Vehicles in the whole network at all times")
+    vehicles: int | None = Field(
+        None,
+        ge=1,
+        description="Vehicles in the whole network at all times; not given, routes and a sumocfg are taken as they are"
+        " and drawn trips follow vehicles_per_lane_km",
+    )
+    vehicles_per_lane_km: Positive = Field(
+        4.0, description="Drawn trips where vehicles is not given: vehicles for each km of lanes that the fleet may use"
+    )
     hold: Literal["exactly", "at_most"] = Field(
-        "exactly", description="Whether a frame with fewer vehicles is an error"
+        "exactly", description="Whether a frame with fewer vehicles than are to be held is an error"
     )
     frames: int = Field(5000, ge=1, le=2**32 - 1, description="Frames to record")
     frame_period_s: Positive = Field(1.0, description="Time between two frames; a whole number of steps")
@@ -74,7 +82,11 @@ class TrafficModel(StrictModel):
     trips_per_s: Positive = Field(
         2.0, description="Rate of drawn trips; more than the network takes, so that N is held"
     )
-    max_depart_delay_s: Positive = Field(120.0, description="A trip that could not start for so long is given up")
+    max_depart_delay_s: Positive | None = Field(
+        None,
+        description="A trip that could not start for so long is given up; not given, drawn trips are after 120 s and a"
+        " demand of your own never",
+    )
     min_trip_m: float = Field(0.0, ge=0, description="Drawn trips are at least so long as the crow flies")
     edge_weights: dict[str, Annotated[float, Field(ge=0)]] = Field(
         default_factory=dict,
@@ -113,4 +125,6 @@ class TrafficModel(StrictModel):
         source = next(key for key in SOURCES if getattr(self, key) is not None)
         if self.routes and source == "network":
             source = "routes"
-        return source, set(self.model_fields_set & idle_beside(source))
+        if idle := self.model_fields_set & idle_beside(source):
+            return source, set(idle)
+        return "vehicles", self.model_fields_set & ({"vehicles_per_lane_km"} if self.vehicles is not None else set())

@@ -14,6 +14,7 @@ randomTrips.py. All randomness comes from the generator that is passed in.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -106,6 +107,16 @@ def _reachable(
         targets.append(good)
     origin, target = np.concatenate(origins), np.concatenate(targets)
     return Pairs(origin, target, weights[origin] * weights[target], fringe)
+
+
+def vehicles_to_hold(traffic: TrafficModel, network: Network) -> int:
+    """How many vehicles drawn trips keep in the network: ``vehicles``, or by the length of lanes for the fleet."""
+    if traffic.vehicles is not None:
+        return traffic.vehicles
+    vclasses = {kind.vclass for kind in traffic.kinds}
+    lanes = (lane for edge in network.edges for lane in edge.lanes)
+    length_m = math.fsum(lane.length_m for lane in lanes if any(map(lane.permission.admits, vclasses)))
+    return max(1, round(traffic.vehicles_per_lane_km * length_m / 1000.0))
 
 
 def draw(

@@ -50,6 +50,8 @@ class Recording:
         Of each type; of a running SUMO filled as rows come.
     patience_s
         How long a vehicle may stand through to the last frame; None where nothing is promised.
+    vehicles
+        How many are to be in each frame; None where nothing is promised.
     stopped_on_purpose
         Vehicles that may stand longer; of a running SUMO filled as rows come.
     summary
@@ -61,6 +63,7 @@ class Recording:
     sizes: Mapping[str, Size]
     place: str
     patience_s: float | None = None
+    vehicles: int | None = None
     stopped_on_purpose: Set[str] = frozenset()
     persons: Iterable[pa.Table] | None = None
     summary: Callable[[], RecordingSummary | None] = lambda: None
@@ -119,6 +122,7 @@ def _simulated(
             sizes,
             sumo_folder.place_of(scenario),
             patience_s(prepared.roads.cycle_s),
+            prepared.vehicles,
             _stopped_on_purpose(prepared),
             None if not prepared.adds_traffic else (fcd.read(persons, "person") if _has_rows(persons) else ()),
             lambda: summary,
@@ -145,6 +149,7 @@ def _running(scenario: Scenario, host: str, port: int, extensions: Sequence[Traf
             observations.sizes,
             sumo_folder.place_of(scenario),
             patience_s(cycle_s),
+            scenario.traffic.vehicles,
             observations.stopped_on_purpose,
             summary=lambda: RecordingSummary(version, None, None, len(observations.collided)),
         )

@@ -50,6 +50,9 @@ _OSM_FLAGS = (
 FCD_DIGITS = 8
 """Decimals that SUMO writes."""
 
+_DRAWN_DEPART_DELAY_S = 120.0
+"""More trips are drawn than start, so that those of long ago make room."""
+
 _ATTRIBUTES = "id,x,y,angle,type,speed"
 
 
@@ -195,6 +198,8 @@ class Prepared:
     options: dict[str, str]
     timing: Timing
     roads: network.Network
+    vehicles: int | None
+    """How many are to be held in the network; None where the demand is taken as it is."""
     drawn: bool
     """Whether the trips are drawn here, not a user's."""
     adds_traffic: bool
@@ -233,19 +238,24 @@ def prepare(scenario: Scenario, folder: Path, extensions: Iterable[TrafficExtens
     if drawn:
         notes = _draw(scenario, roads, when, np.random.default_rng(demand_seed), folder)
         named |= {"additional-files": VTYPES, "route-files": TRIPS}
-    vehicles, times = traffic.vehicles, (when.begin_ms / 1000.0, when.end_ms / 1000.0)
+    vehicles = demand.vehicles_to_hold(traffic, roads) if drawn else traffic.vehicles
+    others_at_most, times = 0, (when.begin_ms / 1000.0, when.end_ms / 1000.0)
     for extension, name, seed in zip(adding, others, other_seeds, strict=True):
         plan = extension.plan(scenario, roads, *times, np.random.default_rng(seed))
         files.write_text(folder / name, plan.xml)
         named["route-files"] = ",".join(filter(None, (named.get("route-files"), name)))
-        vehicles, notes = vehicles + plan.vehicles, [*notes, *plan.notes]
+        others_at_most, notes = others_at_most + plan.vehicles, [*notes, *plan.notes]
     number = int(sumo_seed.generate_state(1)[0]) & 0x7FFFFFFF
-    options = given.options | named | _settings(traffic, when, number, vehicles)
+    options = given.options | named | _settings(traffic, when, number)
+    if vehicles is not None:
+        options["max-num-vehicles"] = str(vehicles + others_at_most)
+    if delay_s := traffic.max_depart_delay_s or (_DRAWN_DEPART_DELAY_S if drawn else None):
+        options["max-depart-delay"] = f"{delay_s:g}"
     files.write_text(folder / CONFIG, _config_xml(options))
-    return Prepared(folder, options, when, roads, drawn, bool(adding), notes)
+    return Prepared(folder, options, when, roads, vehicles, drawn, bool(adding), notes)
 
 
-def _settings(traffic: TrafficModel, when: Timing, seed: int, vehicles: int) -> dict[str, str]:
+def _settings(traffic: TrafficModel, when: Timing, seed: int) -> dict[str, str]:
     """What the scenario decides, whatever a user's configuration says; see the traps of SUMO behind each."""
     return {
         "seed": str(seed),
@@ -254,8 +264,6 @@ def _settings(traffic: TrafficModel, when: Timing, seed: int, vehicles: int) -> 
         "step-length": _text(when.step_ms),
         "threads": "1",
         "lateral-resolution": f"{traffic.lateral_resolution_m:g}",
-        "max-num-vehicles": str(vehicles),
-        "max-depart-delay": f"{traffic.max_depart_delay_s:g}",
         "time-to-teleport": "-1",
         "collision.action": "warn",
         "collision.check-junctions": "true",

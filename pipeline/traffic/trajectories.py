@@ -70,21 +70,21 @@ def _check(traffic: TrafficModel, tally: TrafficTally, recording: Recording) -> 
         raise RunError(
             f"{recording.place}: no vehicle is in any of {tally.frames} frames; check the demand and warmup_s"
         )
-    if traffic.fcd is None and traffic.hold == "exactly":
-        _check_held(traffic, tally, recording.place)
+    if recording.vehicles is not None and traffic.hold == "exactly":
+        _check_held(recording.vehicles, tally, recording.place)
     if recording.patience_s is not None:
         _check_moving(tally, recording, recording.patience_s)
 
 
-def _check_held(traffic: TrafficModel, tally: TrafficTally, place: str) -> None:
-    wrong = tally.vehicles != traffic.vehicles
+def _check_held(vehicles: int, tally: TrafficTally, place: str) -> None:
+    wrong = tally.vehicles != vehicles
     if wrong.any():
         first = int(wrong.argmax())
         raise RunError(
-            f"{place}: {traffic.vehicles} vehicles are in {tally.frames - int(wrong.sum())} of {tally.frames} frames"
+            f"{place}: {vehicles} vehicles are in {tally.frames - int(wrong.sum())} of {tally.frames} frames"
             f" only; the fewest are {tally.vehicles.min()}, the most {tally.vehicles.max()}, frame {first} has"
-            f" {tally.vehicles[first]}. Lower traffic.vehicles, lengthen warmup_s, raise trips_per_s or the demand,"
-            ' or set hold = "at_most"'
+            f" {tally.vehicles[first]}. Lower traffic.vehicles (or vehicles_per_lane_km), lengthen warmup_s, raise"
+            ' trips_per_s or the demand, or set hold = "at_most"'
         )
 
 
