@@ -30,14 +30,30 @@ def folder() -> Path:
 
 
 @cache
+def _declared(artefact: str) -> dict[str, Any]:
+    """The Table Schema of an artefact."""
+    declared: dict[str, Any] = json.loads((folder() / f"{artefact}.schema.json").read_text(encoding="utf-8"))
+    return declared
+
+
 def _fields(artefact: str) -> list[dict[str, Any]]:
     """The columns that the Table Schema of an artefact declares."""
-    return list(json.loads((folder() / f"{artefact}.schema.json").read_text(encoding="utf-8"))["fields"])
+    return list(_declared(artefact)["fields"])
+
+
+def names(artefact: str) -> tuple[str, ...]:
+    """All columns that the schema declares."""
+    return tuple(field["name"] for field in _fields(artefact))
+
+
+def takes_foreign_columns(artefact: str) -> bool:
+    """Whether an artefact may have columns that its schema does not name ("partial", as Table Schema calls it)."""
+    return "partial" in _declared(artefact).get("fieldsMatch", ())
 
 
 @cache
 def arrow_schema(artefact: str, optional: tuple[str, ...] = ()) -> pa.Schema:
-    """The Arrow schema of an artefact: its needed columns, and those named in ``optional``. No column holds nulls."""
+    """The Arrow schema of an artefact: its needed columns, and those named in ``optional``. None holds nulls."""
     import pyarrow as pa
 
     fields = [f for f in _fields(artefact) if f["constraints"]["required"] or f["name"] in optional]

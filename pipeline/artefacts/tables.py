@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -43,12 +43,17 @@ class TableWriter:
 
 
 @contextmanager
-def writer(path: Path, artefact: str, optional: tuple[str, ...] = ()) -> Iterator[TableWriter]:
+def writer(
+    path: Path, artefact: str, optional: tuple[str, ...] = (), foreign: Mapping[str, pa.Array] | None = None
+) -> Iterator[TableWriter]:
     """Open an artefact for writing in pieces; the file appears under its name only when all went well.
 
-    ``optional`` names the columns beyond the needed ones that this file has.
+    ``optional`` names the columns beyond the needed ones that this file has; ``foreign`` are those that the schema does
+    not name (:mod:`pipeline.artefacts.foreign_columns`), of which the types are taken here.
     """
     schema = schemas.arrow_schema(artefact, optional)
+    for name, column in (foreign or {}).items():
+        schema = schema.append(pa.field(name, column.type))
     strings = [f.name for f in schema if f.type == pa.string()]
     with files.aside(path) as partial, pq.ParquetWriter(partial, schema, use_dictionary=strings, **_WRITE) as file:
         yield TableWriter(file, schema)
@@ -109,6 +114,8 @@ def _check_columns(path: Path, artefact: str, schema: pa.Schema) -> None:
                 raise InputError(path, f"column '{field.name}' is {schema.field(index).type}", f"{field.type}")
         elif field.name in needed:
             raise InputError(path, f"column '{field.name}' is missing", f"the columns {', '.join(needed)}")
+    if schemas.takes_foreign_columns(artefact):
+        return
     if extra := sorted(set(schema.names) - set(known.names)):
         raise InputError(path, f"unknown columns {', '.join(extra)}", f"the columns {', '.join(needed)}")
 

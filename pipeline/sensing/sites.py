@@ -12,7 +12,7 @@ import math
 import re
 import reprlib
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +21,12 @@ import numpy as np
 from pipeline.core.errors import InputError
 from pipeline.scenario.models import Scenario, SiteGrid, SiteLine
 from pipeline.scenario.types import FARTHEST_M
+from pipeline.sensing import own_columns
 
 _NEEDED = ("site", "x_m", "y_m", "z_m")
 _ANGLES = ("yaw_deg", "pitch_deg", "roll_deg")
 _TEXTS = ("sensor", "points")
+_KNOWN = (*_NEEDED, *_ANGLES, *_TEXTS)
 _NAME = re.compile(r"[^/\\\x00-\x1f\ud800-\udfff]{1,80}")  # becomes part of file names
 
 
@@ -55,12 +57,13 @@ class Pose:
 
 @dataclass(frozen=True)
 class Site:
-    """A candidate: its name, pose and sensor, and the file of a measured scan if any."""
+    """A candidate: its name, pose and sensor, the file of a measured scan if any, and what else its row says."""
 
     name: str
     pose: Pose
     sensor: str
     points: str | None = None
+    own: Mapping[str, own_columns.Value] = field(default_factory=dict, hash=False)
 
 
 @dataclass(frozen=True)
@@ -97,7 +100,7 @@ def of(scenario: Scenario) -> tuple[Site, ...]:
     Raises
     ------
     InputError
-        Naming file and row: a missing or unknown column, a value that is no finite number, a name used twice.
+        Naming file and row: a missing or misspelt column, a value that is no finite number, a name used twice.
     """
     model = scenario.sites
     if model.file is not None:
@@ -134,9 +137,7 @@ def _with_points(sites: tuple[Site, ...], scenario: Scenario) -> tuple[Site, ...
 
 
 def _site(place: str, row: dict[str, Any], scenario: Scenario) -> Site:
-    unknown = sorted(set(row) - {*_NEEDED, *_ANGLES, *_TEXTS})
-    if unknown:
-        raise InputError(place, f"unknown column {unknown[0]!r}", f"{', '.join((*_NEEDED, *_ANGLES, *_TEXTS))}")
+    own = own_columns.own_columns(place, row, _KNOWN)
     for key in _NEEDED:
         if row.get(key) in (None, ""):
             raise InputError(place, f"{key} is missing", f"the columns {', '.join(_NEEDED)}")
@@ -153,7 +154,7 @@ def _site(place: str, row: dict[str, Any], scenario: Scenario) -> Site:
     if not -90 <= values["pitch_deg"] <= 90:
         raise InputError(f"{place}: pitch_deg", f"{values['pitch_deg']:g}", "between -90 and 90, nose up positive")
     points = str(row["points"]).strip() if row.get("points") else None
-    return Site(name, Pose(**values), str(row.get("sensor") or scenario.sites.sensor).strip(), points)
+    return Site(name, Pose(**values), str(row.get("sensor") or scenario.sites.sensor).strip(), points, own)
 
 
 def _number(place: str, key: str, value: Any) -> float:
@@ -167,21 +168,24 @@ def _number(place: str, key: str, value: Any) -> float:
 
 
 def _csv(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    places, rows = [], []
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = csv.DictReader(file, skipinitialspace=True)
-            names = list(rows.fieldnames or ())
+            reader = csv.DictReader(file, skipinitialspace=True)
+            names = list(reader.fieldnames or ())
             if twice := sorted({name for name in names if names.count(name) > 1}):
                 raise InputError(path, f"the column {twice[0]!r} stands there twice", "each column once")
-            for row in rows:
+            for row in reader:
                 place = f"{path}: row {row.get('site') or '?'}"
                 if None in row or None in row.values():
                     raise InputError(
                         place, "has more or fewer values than the header has columns", "one value a column"
                     )
-                yield place, dict(row)
+                places.append(place)
+                rows.append(dict(row))
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(path, f"cannot be read as CSV ({error})", "UTF-8 text with a header row") from None
+    yield from zip(places, own_columns.with_numbers(rows, _KNOWN), strict=True)
 
 
 def _geojson(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:

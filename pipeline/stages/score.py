@@ -12,9 +12,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
-from pipeline.artefacts import tables
+from pipeline.artefacts import schemas, tables
+from pipeline.artefacts.foreign_columns import foreign_columns
 from pipeline.artefacts.readers import read_tpog
 from pipeline.core.grid import Grid
 from pipeline.core.parallel import in_order
@@ -58,6 +60,8 @@ def inputs(work: Workspace) -> StageInputs:
     """Gamma and what to keep; TPOG and scans by hash (without kept scans: what a scan depends on)."""
     scenario, live = work.scenario, scene_of(work).acting(Effect, "score")
     settings: dict[str, Any] = {"name": scenario.name, "score": scenario.score.model_dump(mode="json")}
+    if own := _own_columns(work):
+        settings["own_columns"] = {name: column.to_pylist() for name, column in own.items()}
     if live:
         settings["effects"] = registry.settings(live)
         settings["sensors"] = {name: model.model_dump(mode="json") for name, model in scenario.sensors.items()}
@@ -108,9 +112,9 @@ def run(
     about = work.metadata(inputs, gamma=wanted.gamma, grid=tpog.grid.to_json(), frames=tpog.frames, sites=sites)
     _write_visibility(work, done, about)
     estimate = _estimate(done, leave_out)
-    columns = _columns(done, scorer.limit) | _error_columns(estimate)
-    with tables.writer(work.path(ARTEFACTS[0]), "scores", tuple(_error_columns(estimate))) as file:
-        file.write(columns)
+    columns, own = _columns(done, scorer.limit) | _error_columns(estimate), _own_columns(work)
+    with tables.writer(work.path(ARTEFACTS[0]), "scores", tuple(_error_columns(estimate)), foreign=own) as file:
+        file.write(columns | own)
         file.describe(about)
     best = [d.site.name for d, rank in zip(done, columns["rank"], strict=True) if rank == 1]
     summary: Summary = {"sites": len(done), "best": best, "egvs_limit": scorer.limit}
@@ -145,6 +149,11 @@ def _columns(done: list[ScoredSite], limit: float) -> dict[str, Any]:
         "rank": ranks(scores),
         "entropy_seen": np.array([d.score.entropy_seen for d in done]),
     }
+
+
+def _own_columns(work: Workspace) -> dict[str, pa.Array]:
+    """The columns of the user's own that the sites have, in the order of the sites."""
+    return foreign_columns([site.own for site in scene_of(work).sites], schemas.names("scores"))
 
 
 def _estimate(done: list[ScoredSite], leave_out: uncertainty.LeaveOut | None) -> uncertainty.Estimate | None:

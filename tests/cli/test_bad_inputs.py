@@ -181,7 +181,11 @@ BAD: dict[str, tuple[Change, str]] = {
     "sites empty": (put("sites.csv", "site,x_m,y_m,z_m\n"), r"sites.csv: holds no site"),
     "sites without z": (sites("a,1,12", head="site,x_m,y_m"), r"row a: z_m is missing"),
     "sites with text": (sites("a,1,north,3"), r"row a: y_m: 'north'; a finite number"),
-    "sites with an odd column": (sites("a,1,12,3,9", head="site,x_m,y_m,z_m,tilt"), r"unknown column 'tilt'"),
+    "sites with a misspelt column": (
+        sites("a,1,12,3,9", head="site,x_m,y_m,z_m,yaw_dge"),
+        r"row a: unknown column 'yaw_dge'; did you mean yaw_deg\?",
+    ),
+    "sites with a column without a name": (sites("0,a,1,12,3", head=",site,x_m,y_m,z_m"), r"a column is named ''"),
     "sites ragged": (sites("a,1,12"), r"row a: has more or fewer values"),
     "site twice": (sites("a,1,12,3", "a,2,12,3"), r"site 'a' stands there twice"),
     "site NaN": (sites("a,nan,12,3"), r"row a: x_m: 'nan'"),

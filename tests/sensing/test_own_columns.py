@@ -1,0 +1,92 @@
+"""Columns of a sites file that are the user's own: which are carried through, as what, and which are misspelt."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+
+import pipeline
+from pipeline.artefacts.foreign_columns import foreign_columns
+from pipeline.core.near_names import misspelt
+from pipeline.sensing import sites
+from tests.conftest import collection, feature
+
+CSV = """fid,site,x_m,y_m,z_m,owner,note,plan,cost,rank
+1,pole_a,10,12,3,"City, east",,007,1200,b
+2,pole_b,30.5,-12,3,Grid Ltd.,"by the ""old"" bridge",012,1300.5,
+"""
+OWN = {"fid": [1, 2], "owner": ["City, east", "Grid Ltd."], "note": [None, 'by the "old" bridge'],
+       "plan": ["007", "012"], "cost": [1200.0, 1300.5], "given_rank": ["b", None]}  # fmt: skip
+KNOWN = ("site", "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg", "sensor", "points")
+
+
+def test_columns_of_a_csv_arrive_in_the_scores_with_their_types(mini: Path, tmp_path: Path, egvs) -> None:
+    plain = tmp_path / "plain"
+    assert egvs("run", mini, "--out", plain)[0] == 0
+    (mini / "sites.csv").write_text(CSV)
+    code, _, said = egvs("run", mini, "--out", tmp_path / "own")
+    assert code == 0, said
+    scores = pipeline.read_scores(tmp_path / "own" / "scores.parquet")
+    assert {name: scores.column(name).to_pylist() for name in OWN} == OWN
+    assert scores.schema.field("fid").type == pa.int64()
+    assert scores.schema.field("cost").type == pa.float64()
+    assert scores.drop_columns(list(OWN)).equals(pipeline.read_scores(plain / "scores.parquet"))
+    assert list(scores.to_pandas().owner) == OWN["owner"]
+    assert egvs("verify", tmp_path / "own")[0] == 0
+
+
+def test_a_note_that_changes_is_in_the_next_scores(mini: Path, tmp_path: Path, egvs) -> None:
+    for note in ("first", "second"):
+        rows = f"site,x_m,y_m,z_m,note\npole_a,10,12,3,{note}\npole_b,30.5,-12,3,{note}\n"
+        (mini / "sites.csv").write_text(rows)
+        assert egvs("run", mini, "--out", tmp_path / "out")[0] == 0
+        assert pipeline.read_scores(tmp_path / "out" / "scores.parquet").column("note").to_pylist() == [note] * 2
+
+
+def test_properties_of_geojson_keep_their_types(mini: Path) -> None:
+    own = {
+        "fid": 7,
+        "lit": True,
+        "tags": {"ref": ["A", 1]},
+        "text": "12",
+        "odd": "\ud800",
+        "huge": 10**30,
+        "none": None,
+    }
+    point = feature({"type": "Point", "coordinates": [0, 1, 2]}, name="a", **own)
+    (mini / "sites.geojson").write_text(collection(point))
+    (site,) = sites.of(pipeline.load(mini, ['sites.file="sites.geojson"']))
+    expected = {"tags": '{"ref": ["A", 1]}', "odd": "\ufffd", "huge": str(10**30)}
+    assert site.own == own | expected
+
+
+def test_a_column_has_the_type_that_all_its_values_have() -> None:
+    rows = [{"a": 1, "b": 1, "c": 1, "d": True, "e": None}, {"a": None, "b": 0.5, "c": "x", "d": False}, {"f": "y"}]
+    columns = foreign_columns(rows, ("a", "given_a", "f"))
+    assert {name: (column.to_pylist(), str(column.type)) for name, column in columns.items()} == {
+        "given_given_a": ([1, None, None], "int64"),
+        "b": ([1.0, 0.5, None], "double"),
+        "c": (["1", "x", None], "string"),
+        "d": ([True, False, None], "bool"),
+        "e": ([None] * 3, "string"),
+        "given_f": ([None, None, "y"], "string"),
+    }
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [("yaw", "yaw_deg"), ("YAW_DEG", "yaw_deg"), ("pitch_dg", "pitch_deg"), ("role_deg", "roll_deg"),
+     ("sensors", "sensor"), ("point", "points"), ("x", "x_m"), ("Z_M", "z_m")],
+)  # fmt: skip
+def test_a_near_miss_of_a_known_name_is_found_where_that_is_missing(name: str, meant: str) -> None:
+    assert misspelt([name, *(set(KNOWN) - {meant})], KNOWN) == (name, meant)
+    assert misspelt([name, *KNOWN], KNOWN) is None
+
+
+def test_names_of_ones_own_are_left_alone() -> None:
+    assert (
+        misspelt(["fid", "owner", "note", "name", "side", "height", "street", "id", "tilt", "lamp", "type"], KNOWN)
+        is None
+    )
