@@ -205,6 +205,18 @@ def verify(
         raise typer.Exit(1)
 
 
+@app.command()
+def compare(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN RUN...", help="Folders of finished runs, two or more.")],
+    top: Top = None,
+) -> None:
+    """Runs side by side: scores, ranks, how well they agree, and what differs in their settings."""
+    from pipeline.cli import comparison_tables
+    from pipeline.studies import run_comparison
+
+    comparison_tables.print_comparison(run_comparison.compare(runs), top)
+
+
 # ---- studies: many runs of one scenario
 
 
