@@ -24,7 +24,8 @@ from pipeline.core.errors import InputError
 from pipeline.formats import osm, safe_xml
 from pipeline.scenario.models import Scenario
 from pipeline.scenario.traffic import TrafficModel
-from pipeline.traffic import demand, network, sumo
+from pipeline.traffic import network, sumo
+from pipeline.traffic.demand import trips as demand
 from pipeline.traffic.extensions import TrafficExtension
 from pipeline.traffic.frames import Window
 

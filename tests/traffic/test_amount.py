@@ -8,7 +8,8 @@ import pytest
 from pipeline.core.errors import InputError, RunError
 from pipeline.scenario.loading import load
 from pipeline.stages import traffic
-from pipeline.traffic import demand, network
+from pipeline.traffic import network
+from pipeline.traffic.demand import trips as demand
 from tests.stages import run_stage
 from tests.traffic.helpers import car, drawn, scenario
 

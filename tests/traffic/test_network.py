@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from pipeline.core.errors import InputError
-from pipeline.traffic import demand, network, sumo
+from pipeline.traffic import network, sumo
+from pipeline.traffic.demand import trips as demand
 from tests.traffic.helpers import car, drawn
 
 NET = """<net version="1.20">

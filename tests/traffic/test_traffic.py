@@ -18,7 +18,8 @@ import pytest
 from pipeline.artefacts import tables
 from pipeline.core.errors import InputError, RunError
 from pipeline.stages import traffic
-from pipeline.traffic import demand, network, recording, sumo
+from pipeline.traffic import network, recording, sumo
+from pipeline.traffic.demand import trips as demand
 from tests.stages import inputs_of, run_stage
 from tests.traffic.helpers import SMALL, car, drawn, netgenerate, scenario
 

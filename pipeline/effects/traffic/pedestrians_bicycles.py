@@ -44,8 +44,8 @@ from pipeline.effects.base import Traffic
 from pipeline.scenario.effects import EffectParameters, PedestriansBicyclesParameters
 from pipeline.scenario.models import Scenario
 from pipeline.scenario.traffic import TrafficModel, VehicleKind
-from pipeline.traffic import demand
 from pipeline.traffic.boxes import Size
+from pipeline.traffic.demand import trips as demand
 from pipeline.traffic.extensions import TrafficPlan
 from pipeline.traffic.network import Network, Sidewalk
 
