@@ -12,7 +12,7 @@ from rich.table import Table
 from pipeline.artefacts.readers import SEPARABLE, read_scores
 from pipeline.artefacts.run_record import RunRecord
 from pipeline.cli.terminal import NARROW, WIDE, console, in_words, table, value_in_words
-from pipeline.report.ranking import ScoredSite
+from pipeline.report.ranking import ScoredSite, poles_of
 
 if TYPE_CHECKING:
     from pipeline.importers.openstreetmap import NewScenario
@@ -45,6 +45,22 @@ def ranking_table(sites: Sequence[ScoredSite], width: int = WIDE, top: int | Non
         }  # fmt: skip
         ranking.add_row(*(cells[name] for name in names))
     return ranking
+
+
+def poles_table(sites: Sequence[ScoredSite], top: int | None = None) -> Table:
+    """The ``top`` poles' best candidates, how they are mounted, and by how much they beat the worst ones there."""
+    names = ("rank", "pole", "best candidate", "z m", "yaw deg", "pitch deg", "EGVS bit", "of", "beats worst by")
+    rows = table(
+        names, left=("pole", "best candidate"), whole=[n for n in names if n not in ("pole", "best candidate")]
+    )
+    rows.title, rows.title_justify = "best of each pole", "left"
+    for pole in poles_of(sorted(sites, key=lambda site: site.rank))[:top]:
+        best = pole.best
+        rows.add_row(
+            str(best.rank), pole.name, best.site, f"{best.z_m:g}", f"{best.yaw_deg:.1f}", f"{best.pitch_deg:.1f}",
+            f"{best.egvs:.1f}", str(len(pole.sites)), "-" if pole.gain is None else f"{pole.gain:.1%}",
+        )  # fmt: skip
+    return rows
 
 
 def print_run(folder: Path, record: RunRecord, *, anything_ran: bool, top: int | None = None) -> None:
@@ -86,11 +102,13 @@ def print_new_scenario(made: NewScenario) -> None:
 
 
 def _print_scores(out: Console, folder: Path, record: RunRecord, top: int | None) -> None:
-    """The ranking of the ``top`` sites, and the audit's worst case where there was one."""
+    """The ranking of the ``top`` sites, the best of each pole, and the audit's worst case where there was one."""
     sites = ScoredSite.all_of(read_scores(folder / "scores.parquet"))
     out.print(ranking_table(sites, out.width, top))
     if top is not None and len(sites) > top:
         out.print(f"... and {len(sites) - top} more: without --top, in {folder / 'scores.parquet'} or in the report")
+    if len({site.pole for site in sites}) < len(sites):
+        out.print(poles_table(sites, top))
     audit = record.stages["score"].summary.get("audit")
     if audit:
         out.print(

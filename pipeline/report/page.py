@@ -145,6 +145,7 @@ def page(
         study=study,
         first=sites[:FIRST] if shortened else sites,
         last=sites[-LAST:] if shortened else (),
+        listed=LISTED,
         hidden=len(sites) - FIRST - LAST if shortened else 0,
         headline=wording.headline(ranking, has_traffic),
         lead=wording.lead(ranking),

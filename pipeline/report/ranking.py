@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -24,6 +25,7 @@ class ScoredSite(MapSite):
     ``egvs_se`` and ``beats_next`` are None where no standard errors were computed.
     """
 
+    pole: str
     yaw_deg: float
     pitch_deg: float
     roll_deg: float
@@ -53,6 +55,33 @@ class ScoredSite(MapSite):
 
 
 @dataclass(frozen=True)
+class Pole:
+    """The candidates of one place, by rank; at least one."""
+
+    name: str
+    sites: tuple[ScoredSite, ...]
+
+    @property
+    def best(self) -> ScoredSite:
+        """The best candidate there."""
+        return self.sites[0]
+
+    @property
+    def gain(self) -> float | None:
+        """By how much its best candidate beats its worst, as a share of the worst; None for one, or from nothing."""
+        worst = self.sites[-1].egvs
+        return self.best.egvs / worst - 1 if len(self.sites) > 1 and worst > 0 else None
+
+
+def poles_of(by_rank: Iterable[ScoredSite]) -> tuple[Pole, ...]:
+    """The poles, the one with the best candidate first, of candidates by rank."""
+    grouped: dict[str, list[ScoredSite]] = {}
+    for site in by_rank:
+        grouped.setdefault(site.pole, []).append(site)
+    return tuple(Pole(name, tuple(sites)) for name, sites in grouped.items())
+
+
+@dataclass(frozen=True)
 class Ranking:
     """Sites by rank, those of equal rank in the order of the sites; at least one.
 
@@ -78,6 +107,11 @@ class Ranking:
     def last(self) -> ScoredSite:
         """The worst site."""
         return self.sites[-1]
+
+    @cached_property
+    def poles(self) -> tuple[Pole, ...]:
+        """The poles, the one with the best candidate first."""
+        return poles_of(self.sites)
 
     @property
     def is_tie(self) -> bool:

@@ -8,7 +8,7 @@ models; :mod:`pipeline.scenario.loading` reads the file.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, PrivateAttr, model_validator
 
@@ -89,6 +89,8 @@ class SiteLine(StrictModel):
 SITE_SOURCES = ("file", "grid", "along")
 """Keys that say where candidate sites come from; a scenario has one of them."""
 
+Pitch = Annotated[float, Field(ge=-90, le=90)] | Literal["aim"]
+
 
 class SitesModel(StrictModel):
     """Candidate sites: a file, or a rule. Pose and sensor below hold for every site that names none of its own."""
@@ -100,8 +102,22 @@ class SitesModel(StrictModel):
         None, description="A measured empty scan (PCD, PLY, LAS, LAZ, CSV; world frame) of the only site"
     )
     sensor: str = Field("VLP-32C", description="A name from `egvs sensors` or from [sensors]")
-    yaw_deg: float = Field(0.0, description="The sensor's x axis, counter-clockwise from +x")
-    pitch_deg: float = Field(0.0, ge=-90, le=90, description="Nose up positive")
+    heights_m: tuple[Positive, ...] = Field(
+        (), description="Heights of the places in `file` that name no z_m; each is a candidate of its own"
+    )
+    aim: Literal["roi"] | None = Field(
+        None, description="'roi': turned and tilted so that the sensor's middle ray meets the middle of the ROI"
+    )
+    aim_m: Point2 | Point3 | None = Field(
+        None, description="Likewise at a point; without z, at the height of the ROI's middle"
+    )
+    yaw_deg: float | None = Field(
+        None, description="The sensor's x axis, counter-clockwise from +x; 0, or what the aim asks for"
+    )
+    pitch_deg: Pitch | tuple[Pitch, ...] | None = Field(
+        None,
+        description="Nose up positive, or 'aim'; several are as many candidates. 'aim' where a site is aimed, else 0",
+    )
     roll_deg: float = 0.0
 
     @model_validator(mode="after")
@@ -109,6 +125,21 @@ class SitesModel(StrictModel):
         given = [key for key in SITE_SOURCES if getattr(self, key)]
         if len(given) != 1:
             raise ValueError(f"exactly one of file, grid and along is needed, found {' and '.join(given) or 'none'}")
+        if self.heights_m and self.file is None:
+            raise ValueError(f"heights_m is for places in a file: {given[0]} has heights_m of its own")
+        return self
+
+    @model_validator(mode="after")
+    def _one_direction(self) -> SitesModel:
+        given = [key for key in ("aim", "aim_m", "yaw_deg") if getattr(self, key) is not None]
+        if len(given) > 1:
+            raise ValueError(f"at most one of aim, aim_m and yaw_deg can hold, found {' and '.join(given)}")
+        for key in ("heights_m", "pitch_deg"):
+            values = getattr(self, key)
+            if isinstance(values, tuple) and len(set(values)) < len(values):
+                raise ValueError(f"{key} = {list(values)} names a value twice")
+        if self.pitch_deg == ():
+            raise ValueError("pitch_deg = [] leaves no candidate")
         return self
 
 

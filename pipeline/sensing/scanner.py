@@ -59,9 +59,10 @@ class Scan:
         """How many different beams met something."""
         return _different(self.rows.beam[self.rows.returned])
 
-    def as_site(self, name: str) -> ScannedSite:
-        """What artefacts hold of it."""
-        return ScannedSite(name, self.pose, self.sensor.name, self.beams, self.beams_in_roi, self.returns)
+    def as_site(self, name: str, pole: str = "") -> ScannedSite:
+        """What artefacts hold of it; ``pole`` is where it stands, the site alone if nothing else is said."""
+        counts = self.beams, self.beams_in_roi, self.returns
+        return ScannedSite(name, pole or name, self.pose, self.sensor.name, *counts)
 
 
 class Scanner:

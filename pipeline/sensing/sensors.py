@@ -73,6 +73,12 @@ class Sensor:
         """Number of beams in one turn."""
         return self.channels * self.azimuths
 
+    @property
+    def middle_deg(self) -> tuple[float, float]:
+        """Elevation and azimuth of the middle ray, which an aim points at something: halfway between the lowest and
+        the highest elevation; the azimuth of a sensor that sees all round is 0."""
+        return 0.5 * (min(self.elevations_deg) + max(self.elevations_deg)), 0.0
+
     def directions(self, yaw_deg: float = 0.0, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> NDArray[np.float64]:
         """Unit vectors of all beams along the world's axes, (beams, 3) float64, for a sensor mounted so."""
         steps = np.arange(self.azimuths) * (360.0 / self.azimuths)

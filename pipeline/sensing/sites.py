@@ -1,7 +1,9 @@
 """Places where a sensor could stand: poses, and candidate sites with names and sensors.
 
 Candidate sites come from a CSV, a GeoJSON file, or a rule (a lattice, or along lines). Each has a position in the world
-frame in metres, a pose in degrees, and a sensor; what a site does not name is taken from the scenario's ``[sites]``.
+frame in metres, a pose in degrees, and a sensor; what a site does not name is taken from the scenario's ``[sites]``. A
+place with several heights or pitches is as many candidates (:mod:`pipeline.sensing.aiming`). Those of one x, y stand at
+one *pole*, which has the name of the first place there.
 """
 
 from __future__ import annotations
@@ -21,12 +23,14 @@ import numpy as np
 from pipeline.core.errors import InputError
 from pipeline.scenario.models import Scenario, SiteGrid, SiteLine
 from pipeline.scenario.types import FARTHEST_M
-from pipeline.sensing import own_columns
+from pipeline.sensing import aiming, own_columns, sensors
+from pipeline.sensing.aiming import Wishes
 
 _NEEDED = ("site", "x_m", "y_m", "z_m")
 _ANGLES = ("yaw_deg", "pitch_deg", "roll_deg")
-_TEXTS = ("sensor", "points")
-_KNOWN = (*_NEEDED, *_ANGLES, *_TEXTS)
+_AIM = ("aim_x_m", "aim_y_m", "aim_z_m")
+_TEXTS = ("sensor", "points", "aim")
+_KNOWN = (*_NEEDED, *_ANGLES, *_AIM, *_TEXTS)
 _NAME = re.compile(r"[^/\\\x00-\x1f\ud800-\udfff]{1,80}")  # becomes part of file names
 
 
@@ -57,21 +61,24 @@ class Pose:
 
 @dataclass(frozen=True)
 class Site:
-    """A candidate: its name, pose and sensor, the file of a measured scan if any, and what else its row says."""
+    """A candidate: its name, pose and sensor, the file of a measured scan if any, the pole that it stands at, and what
+    else its row says."""
 
     name: str
     pose: Pose
     sensor: str
     points: str | None = None
+    pole: str = ""
     own: Mapping[str, own_columns.Value] = field(default_factory=dict, hash=False)
 
 
 @dataclass(frozen=True)
 class ScannedSite:
-    """What artefacts hold of a site: name, pose, sensor; beams of the sensor, beams that can meet the region,
+    """What artefacts hold of a site: name, pole, pose, sensor; beams of the sensor, beams that can meet the region,
     returns."""
 
     name: str
+    pole: str
     pose: Pose
     sensor: str
     beams: int
@@ -81,7 +88,7 @@ class ScannedSite:
     def to_json(self) -> dict[str, str | float | int]:
         """As the artefacts' metadata holds it."""
         counts = {"beams": self.beams, "beams_in_roi": self.beams_in_roi, "returns": self.returns}
-        return {"site": self.name, **asdict(self.pose), "sensor": self.sensor, **counts}
+        return {"site": self.name, "pole": self.pole, **asdict(self.pose), "sensor": self.sensor, **counts}
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any], place: object) -> ScannedSite:
@@ -89,18 +96,19 @@ class ScannedSite:
         try:
             pose = Pose(**{field.name: float(value[field.name]) for field in fields(Pose)})
             counts = (int(value[key]) for key in ("beams", "beams_in_roi", "returns"))
-            return cls(str(value["site"]), pose, str(value["sensor"]), *counts)
+            return cls(str(value["site"]), str(value["pole"]), pose, str(value["sensor"]), *counts)
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(place, f"its metadata names a site {value!r} ({error!r})", "an unaltered file") from None
 
 
 def of(scenario: Scenario) -> tuple[Site, ...]:
-    """All candidate sites of a scenario, in the order of the file or the rule.
+    """All candidate sites of a scenario, in the order of the file or the rule; those of one place by height and pitch.
 
     Raises
     ------
     InputError
-        Naming file and row: a missing or misspelt column, a value that is no finite number, a name used twice.
+        Naming file and row: a missing or misspelt column, a value that is no finite number, a name used twice; or a key
+        of ``[sites]`` that acts on no site.
     """
     model = scenario.sites
     if model.file is not None:
@@ -110,13 +118,20 @@ def of(scenario: Scenario) -> tuple[Site, ...]:
         path = scenario.file
         rows = _lattice(model.grid) if model.grid is not None else _lines(model.along)
     found: dict[str, Site] = {}
-    for place, row in rows:
-        site = _site(place, row, scenario)
-        if site.name in found:
-            raise InputError(place, f"site {site.name!r} stands there twice", "a name of its own for each site")
-        found[site.name] = site
+    poles: dict[tuple[float, float], str] = {}
+    used: set[str] = set()
+    for row in rows:
+        for site in _candidates(row, scenario, poles, used):
+            if site.name in found:
+                raise InputError(row.place, f"site {site.name!r} stands there twice", "a name of its own for each site")
+            found[site.name] = site
     if not found:
         raise InputError(path, "holds no site", "at least one")
+    if idle := aiming.idle_keys(scenario.sites, used):
+        own = "z_m" if idle[0] == "heights_m" else "yaw_deg or aim" if idle[0].startswith("aim") else "pitch_deg"
+        raise InputError(
+            f"{scenario.file}: sites.{idle[0]}", "acts on no site", f"remove it, or {own} from the rows of {path.name}"
+        )
     keep = scenario.score.keep_visibility
     for name in () if keep == "all" else keep:
         if name not in found:
@@ -136,25 +151,82 @@ def _with_points(sites: tuple[Site, ...], scenario: Scenario) -> tuple[Site, ...
     return (replace(sites[0], points=points),)
 
 
-def _site(place: str, row: dict[str, Any], scenario: Scenario) -> Site:
-    own = own_columns.own_columns(place, row, _KNOWN)
-    for key in _NEEDED:
-        if row.get(key) in (None, ""):
+@dataclass(frozen=True)
+class _Row:
+    """A place as a file or a rule names it: where for messages, its columns, the heights that a rule gives it."""
+
+    place: str
+    columns: dict[str, Any]
+    heights_m: tuple[float, ...] = ()
+
+
+def _candidates(row: _Row, scenario: Scenario, poles: dict[tuple[float, float], str], used: set[str]) -> Iterator[Site]:
+    """The candidates of one place; ``poles`` and ``used`` (keys of ``[sites]``) take what it adds."""
+    place, columns = row.place, row.columns
+    other = own_columns.own_columns(place, columns, _KNOWN)
+    _check_columns(row, scenario)
+    name = str(columns["site"]).strip()
+    sensor = str(columns.get("sensor") or scenario.sites.sensor).strip()
+    points = str(columns["points"]).strip() if columns.get("points") else None
+    wishes = _wishes(row, scenario)
+    pole = poles.setdefault((wishes.x_m, wishes.y_m), name)
+    mounts = aiming.mounts(
+        place, wishes, scenario, lambda: sensors.resolve(sensor, scenario.sensors, f"{place}: sensor"), used
+    )
+    if points is not None and len(mounts) > 1:
+        raise InputError(f"{place}: points", f"one measured scan for {len(mounts)} mounts", "one height and one pitch")
+    for mount in mounts:
+        own = name + mount.mark
+        if not _NAME.fullmatch(own):
+            right = "a name of up to 80 characters without / and \\"
+            raise InputError(f"{place}: site", f"{own[:80]!r}", right)
+        pose = Pose(wishes.x_m, wishes.y_m, mount.z_m, mount.yaw_deg, mount.pitch_deg, wishes.roll_deg)
+        yield Site(own, pose, sensor, points, pole, other)
+
+
+def _check_columns(row: _Row, scenario: Scenario) -> None:
+    """InputError for a column that is missing, or a text that is none."""
+    place, columns = row.place, row.columns
+    has_height = row.heights_m or scenario.sites.heights_m
+    for key in _NEEDED[:-1] if has_height else _NEEDED:
+        if columns.get(key) in (None, ""):
             raise InputError(place, f"{key} is missing", f"the columns {', '.join(_NEEDED)}")
     for key in ("site", *_TEXTS):
-        if isinstance(row.get(key), bool | list | dict):
-            raise InputError(f"{place}: {key}", repr(row[key])[:80], "a text")
-    name = str(row["site"]).strip()
-    if not _NAME.fullmatch(name):
-        raise InputError(f"{place}: site", f"{name[:80]!r}", "a name of up to 80 characters without / and \\")
-    values = {}
-    for key in (*_NEEDED[1:], *_ANGLES):
-        value = row.get(key)
-        values[key] = _number(place, key, getattr(scenario.sites, key) if value in (None, "") else value)
-    if not -90 <= values["pitch_deg"] <= 90:
-        raise InputError(f"{place}: pitch_deg", f"{values['pitch_deg']:g}", "between -90 and 90, nose up positive")
-    points = str(row["points"]).strip() if row.get("points") else None
-    return Site(name, Pose(**values), str(row.get("sensor") or scenario.sites.sensor).strip(), points, own)
+        if isinstance(columns.get(key), bool | list | dict):
+            raise InputError(f"{place}: {key}", repr(columns[key])[:80], "a text")
+
+
+def _wishes(row: _Row, scenario: Scenario) -> Wishes:
+    """The numbers of a row."""
+    place = row.place
+    given = {
+        key: _number(place, key, value)
+        for key in (*_NEEDED[1:], *_ANGLES, *_AIM)
+        if (value := row.columns.get(key)) not in (None, "")
+    }
+    heights_m = row.heights_m or ((given["z_m"],) if "z_m" in given else ())
+    pitch_deg, yaw_deg = given.get("pitch_deg"), given.get("yaw_deg")
+    if pitch_deg is not None and not -90 <= pitch_deg <= 90:
+        raise InputError(f"{place}: pitch_deg", f"{pitch_deg:g}", "between -90 and 90, nose up positive")
+    aim_m = _own_aim(row, given, scenario)
+    if aim_m is not None and yaw_deg is not None:
+        raise InputError(f"{place}: yaw_deg", f"{yaw_deg:g} there, but an aim as well", "one of them")
+    roll_deg = given.get("roll_deg", scenario.sites.roll_deg)
+    return Wishes(given["x_m"], given["y_m"], heights_m, yaw_deg, pitch_deg, roll_deg, aim_m)
+
+
+def _own_aim(row: _Row, given: Mapping[str, float], scenario: Scenario) -> aiming.Spot | None:
+    """The point that a row aims at: the middle of the region, or its own."""
+    place, middle = row.place, scenario.roi.center_m
+    named = row.columns.get("aim") or None
+    if named not in (None, "roi"):
+        raise InputError(f"{place}: aim", f"{named!r}", "roi, or the columns aim_x_m and aim_y_m")
+    if not any(key in given for key in _AIM):
+        return middle if named else None
+    if named or "aim_x_m" not in given or "aim_y_m" not in given:
+        found = "'roi' and a point" if named else "one of aim_x_m and aim_y_m is missing"
+        raise InputError(f"{place}: aim", found, "one of them" if named else "both")
+    return given["aim_x_m"], given["aim_y_m"], given.get("aim_z_m", middle[2])
 
 
 def _number(place: str, key: str, value: Any) -> float:
@@ -167,7 +239,7 @@ def _number(place: str, key: str, value: Any) -> float:
     return number
 
 
-def _csv(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+def _csv(path: Path) -> Iterator[_Row]:
     places, rows = [], []
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
@@ -185,10 +257,10 @@ def _csv(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
                 rows.append(dict(row))
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(path, f"cannot be read as CSV ({error})", "UTF-8 text with a header row") from None
-    yield from zip(places, own_columns.with_numbers(rows, _KNOWN), strict=True)
+    yield from map(_Row, places, own_columns.with_numbers(rows, _KNOWN))
 
 
-def _geojson(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+def _geojson(path: Path) -> Iterator[_Row]:
     right = "a FeatureCollection of Points in world-frame metres"
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
@@ -200,7 +272,7 @@ def _geojson(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
         raise InputError(f"{path}: crs", repr(crs)[:120], "no crs (RFC 7946), and metres in the world frame")
     for number, feature in enumerate(document["features"]):
         place = f"{path}: feature {number}"
-        yield place, _feature(place, feature)
+        yield _Row(place, _feature(place, feature))
 
 
 def _in_metres(crs: Any) -> bool:
@@ -232,28 +304,27 @@ def _feature(place: str, feature: Any) -> dict[str, Any]:
     return row | {key: value for key, value in own.items() if value is not None}
 
 
-def _lattice(rule: SiteGrid) -> Iterator[tuple[str, dict[str, Any]]]:
+def _lattice(rule: SiteGrid) -> Iterator[_Row]:
     axes = []
     for low, high in zip(rule.low_m, rule.high_m, strict=True):
         count = math.floor((high - low) / rule.spacing_m + 1e-9) + 1
         axes.append([low + i * rule.spacing_m for i in range(count)])
-    spots = [(x, y) for y in axes[1] for x in axes[0]]
-    yield from _named("g", [(x, y, z) for x, y in spots for z in rule.heights_m], "sites.grid")
+    yield from _named("g", [(x, y, rule.heights_m) for y in axes[1] for x in axes[0]], "sites.grid")
 
 
-def _lines(rules: tuple[SiteLine, ...]) -> Iterator[tuple[str, dict[str, Any]]]:
+def _lines(rules: tuple[SiteLine, ...]) -> Iterator[_Row]:
     spots = []
     for rule in rules:
         line = np.asarray(rule.line_m)
         along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
         where = np.arange(math.floor(along[-1] / rule.spacing_m + 1e-9) + 1) * rule.spacing_m
         xs, ys = np.interp(where, along, line[:, 0]), np.interp(where, along, line[:, 1])
-        spots += [(float(x), float(y), z) for x, y in zip(xs, ys, strict=True) for z in rule.heights_m]
+        spots += [(float(x), float(y), rule.heights_m) for x, y in zip(xs, ys, strict=True)]
     yield from _named("a", spots, "sites.along")
 
 
-def _named(letter: str, spots: list[tuple[float, float, float]], place: str) -> Iterator[tuple[str, dict[str, Any]]]:
+def _named(letter: str, spots: list[tuple[float, float, tuple[float, ...]]], place: str) -> Iterator[_Row]:
     width = max(2, len(str(len(spots))))
-    for number, (x, y, z) in enumerate(spots, start=1):
+    for number, (x, y, heights_m) in enumerate(spots, start=1):
         name = f"{letter}{number:0{width}d}"
-        yield f"{place}: {name}", {"site": name, "x_m": x, "y_m": y, "z_m": z}
+        yield _Row(f"{place}: {name}", {"site": name, "x_m": x, "y_m": y}, heights_m)

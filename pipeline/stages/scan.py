@@ -74,7 +74,7 @@ def _write_all(work: Workspace, inputs: StageInputs, scanner: Scanner, points: t
 
     def scan(site: Site) -> tuple[Site, Scan, ScannedSite]:
         done = scanner.scan_site(site)
-        return site, done, done.as_site(site.name)
+        return site, done, done.as_site(site.name, site.pole)
 
     with tables.writer(work.path(SCANS), "scans", scanner.columns) as file:
         for site, done, scanned in in_order(scan, scene.sites, work.threads):

@@ -289,7 +289,11 @@ def _with_one_site(scenario: Scenario) -> Scenario:
     site = sites.of(scenario)[0]
     at_m = (site.pose.x_m, site.pose.y_m)
     here = SiteGrid(low_m=at_m, high_m=at_m, spacing_m=1.0, heights_m=(max(site.pose.z_m, 0.1),))
-    alone = {"file": None, "along": (), "points": None, "grid": here, "sensor": site.sensor}
+    yaw_deg, pitch_deg, roll_deg = site.pose.angles_deg
+    alone = {
+        "file": None, "along": (), "points": None, "grid": here, "sensor": site.sensor, "heights_m": (), "aim": None,
+        "aim_m": None, "yaw_deg": yaw_deg, "pitch_deg": pitch_deg, "roll_deg": roll_deg,
+    }  # fmt: skip
     nothing_kept = scenario.score.model_copy(update={"keep_visibility": ()})
     return scenario.model_copy(update={"sites": scenario.sites.model_copy(update=alone), "score": nothing_kept})
 

@@ -59,8 +59,8 @@ def test_properties_of_a_feature_are_its_pose_sensor_and_scan(mini: Path) -> Non
     first, second = of_geojson(
         mini, collection(point(0, 1, 2, name="a", **own), point(3, 4, 5, name="b", yaw_deg=None))
     )
-    assert first == sites.Site("a", sites.Pose(0, 1, 2, 90, -7.5, 1), "VLP-16", "measured.ply")
-    assert second == sites.Site("b", sites.Pose(3, 4, 5), "small")
+    assert first == sites.Site("a", sites.Pose(0, 1, 2, 90, -7.5, 1), "VLP-16", "measured.ply", "a")
+    assert second == sites.Site("b", sites.Pose(3, 4, 5), "small", pole="b")
 
 
 def test_a_height_may_be_a_property_and_a_name_a_number_as_in_csv(mini: Path) -> None:
@@ -168,7 +168,14 @@ def test_each_place_has_all_heights_and_names_go_on_from_line_to_line(mini: Path
         {"line": [[0, 0], [0, -3.5]], "spacing": 2, "heights": [3, 5]},
         {"line": [[7, 7], [8, 7]], "spacing": 2, "heights": [6]},
     )
-    assert places(found) == [("a01", 0, 0, 3), ("a02", 0, 0, 5), ("a03", 0, -2, 3), ("a04", 0, -2, 5), ("a05", 7, 7, 6)]
+    assert places(found) == [
+        ("a01@3m", 0, 0, 3),
+        ("a01@5m", 0, 0, 5),
+        ("a02@3m", 0, -2, 3),
+        ("a02@5m", 0, -2, 5),
+        ("a03", 7, 7, 6),
+    ]
+    assert [site.pole for site in found] == ["a01", "a01", "a02", "a02", "a03"]
 
 
 def test_the_end_of_a_line_has_a_site_though_tenths_do_not_add_up(mini: Path) -> None:

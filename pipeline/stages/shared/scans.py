@@ -54,4 +54,4 @@ def _cast(work: Workspace, only: Collection[str] | None) -> Iterator[SiteBeams]:
     for site in scene_of(work).sites:
         if only is None or site.name in only:
             scan = scanner.scan_site(site)
-            yield SiteBeams(scan.as_site(site.name), Beams.of(scan))
+            yield SiteBeams(scan.as_site(site.name, site.pole), Beams.of(scan))
