@@ -1,11 +1,8 @@
 """Buildings of a map: closed ways, multipolygons, and parts, which replace their outline where they stand.
 
-Heights: the top as in :mod:`pipeline.importers.mapped_solids`;
-
-    base = min_height     or building:min_level * 3 m      or 0
-
-Multipolygons are assembled here: osmium gives no area to a ring that crosses itself (here: repaired, and counted), nor
-to tags on the outer way alone.
+What is a building, and how high where the map does not say, stands in :mod:`pipeline.world.solid_types`; heights are
+those of :mod:`pipeline.world.mapped_heights`. Multipolygons are assembled here:
+osmium gives no area to a ring that crosses itself (here: repaired, and counted), nor to tags on the outer way alone.
 """
 
 from __future__ import annotations
@@ -16,15 +13,13 @@ import shapely
 from shapely.geometry import LineString
 from shapely.geometry.base import BaseGeometry
 
-from pipeline.formats.osm import Extract, Relation, Tags, length_m, number
-from pipeline.importers.mapped_solids import LEVEL_M, ImportCounts, MappedSolid, tag_value, top_of
+from pipeline.formats.osm import Extract, Relation, Tags
+from pipeline.importers.mapped_solids import ImportCounts, MappedSolid, extent_counted
 from pipeline.importers.shapes import XY, area_within, large_pieces_of
+from pipeline.world.mapped_heights import is_underground
+from pipeline.world.solid_types import SolidType, SolidTypes
 
-BUILDING_M = 9.0
-ROOF_M, ROOF_THICKNESS_M = 5.0, 0.5
-
-_ROOFS = {"roof", "carport", "canopy"}
-_TOWERS = {"tower", "chimney", "silo", "storage_tank", "water_tower", "gasometer"}
+_TYPES = SolidTypes()
 
 
 def buildings(extract: Extract, xy: dict[int, XY], counts: ImportCounts) -> Iterator[MappedSolid]:
@@ -41,40 +36,45 @@ def buildings(extract: Extract, xy: dict[int, XY], counts: ImportCounts) -> Iter
         if not pieces:
             counts.drop("building", "covered_by_parts" if over else "degenerate")
             continue
-        height_m, base_m, source, kind = _building_height(tags, counts)
-        yield MappedSolid(name, kind, shapely.MultiPolygon(pieces), height_m, source, base_m)
+        solid = _solid(tags)
+        extent, kind = extent_counted(tags, solid, counts), "roof" if solid.thickness_m else "building"
+        source = "type" if extent.source == "default" and solid.height_m else extent.source
+        yield MappedSolid(name, kind, shapely.MultiPolygon(pieces), extent.top_m, source, extent.base_m)
+
+
+def _named(tags: Tags, key: str) -> SolidType | None:
+    """How the thing that ``key`` names stands; None where it is none, or not solid."""
+    value = tags.get(key, "no")
+    return _TYPES.named(f"{key.removesuffix(':part')}.{value}") if value != "no" else None
 
 
 def _is_outline(tags: Tags) -> bool:
-    return tags.get("building", "no") not in ("no", "entrance") or tags.get("man_made") in _TOWERS
+    return _named(tags, "building") is not None or _named(tags, "man_made") is not None
 
 
 def _is_building(tags: Tags) -> bool:
-    return _is_outline(tags) or tags.get("building:part", "no") != "no"
+    return _is_outline(tags) or _named(tags, "building:part") is not None
+
+
+def _is_none(tags: Tags, counts: ImportCounts) -> bool:
+    """Whether a way is no building; what a map calls a building that is none (any more) is counted."""
+    none = not _is_building(tags)
+    if none and "building" in tags:
+        counts.not_modelled[f"building={tags['building']}"] += 1
+    return none
+
+
+def _solid(tags: Tags) -> SolidType:
+    """How a building stands: as an open roof or low house where one of its tags says so, else as any building."""
+    kinds = [kind for key in ("building:part", "building", "man_made") if (kind := _named(tags, key)) is not None]
+    return next((kind for kind in kinds if kind.height_m), kinds[0])
 
 
 def _is_underground(tags: Tags, counts: ImportCounts) -> bool:
-    under = "underground" in (tags.get("location"), tags.get("building"))
+    under = is_underground(tags)
     if under:
         counts.drop("building", "underground")
     return under
-
-
-def _building_height(tags: Tags, counts: ImportCounts) -> tuple[float, float, str, str]:
-    """Top, base, source of the top, kind."""
-    kind = "roof" if {tags.get("building"), tags.get("building:part")} & _ROOFS else "building"
-    default_m = ROOF_M if kind == "roof" else BUILDING_M
-    height_m, source = top_of(tags, default_m, counts)
-    low_m = tag_value(tags, "min_height", length_m, counts)
-    if low_m is None:
-        levels = tag_value(tags, "building:min_level", number, counts)
-        low_m = LEVEL_M * levels if levels is not None else None
-    if low_m is None:
-        low_m = height_m - ROOF_THICKNESS_M if kind == "roof" else 0.0
-    if low_m >= height_m:
-        counts.unreadable["base above top"] += 1
-        low_m = 0.0
-    return height_m, max(0.0, low_m), source, kind
 
 
 def _shapes(extract: Extract, xy: dict[int, XY], counts: ImportCounts) -> Iterator[tuple[str, Tags, BaseGeometry]]:
@@ -94,7 +94,7 @@ def _shapes(extract: Extract, xy: dict[int, XY], counts: ImportCounts) -> Iterat
         else:
             yield f"relation/{relation.id}", tags, outer.difference(inner)
     for way in extract.ways.values():
-        if way.id in outer_ways or not _is_building(way.tags) or _is_underground(way.tags, counts):
+        if way.id in outer_ways or _is_none(way.tags, counts) or _is_underground(way.tags, counts):
             continue
         if not way.closed or any(n not in xy for n in way.nodes):
             counts.drop("building", "incomplete")

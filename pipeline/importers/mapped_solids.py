@@ -1,10 +1,7 @@
 """What the importer takes from a map: solids with heights from tags, and counts of what happened to the mapped objects.
 
-Heights (Simple 3D Buildings, https://wiki.openstreetmap.org/wiki/Simple_3D_Buildings):
-
-    top  = height         or building:levels * 3 m         or the default of the kind (a building: 9 m)
-
-Frame: the network's x (east), y (north) in metres; heights in metres above the flat ground.
+Heights are those of :mod:`pipeline.world.mapped_heights`, defaults stand in :mod:`pipeline.world.solid_types`. Frame:
+the network's x (east), y (north) in metres; heights in metres above the flat ground.
 """
 
 from __future__ import annotations
@@ -17,17 +14,21 @@ from typing import Any
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from pipeline.formats.osm import Tags, length_m, number
+from pipeline.formats.osm import Tags
+from pipeline.scenario.models import StaticsModel
+from pipeline.world.mapped_heights import Extent, extent_of
+from pipeline.world.solid_types import SolidType
 
-LEVEL_M = 3.0
-"""A storey of a building."""
+BUILDING_M: float = StaticsModel.model_fields["polygon_height_m"].default
+"""The top of a building that the map does not say, and that is of no special type."""
 
 
 @dataclass(frozen=True)
 class MappedSolid:
     """An area, line or point of the map, extruded from ``base_m`` to ``height_m``.
 
-    Lines and points reach ``radius_m`` to each side. ``height_source`` is height, levels (tags of the map) or default.
+    Lines and points reach ``radius_m`` to each side. ``height_source`` is height, levels (tags of the map), type or
+    default.
     """
 
     name: str
@@ -84,23 +85,11 @@ class ImportCounts:
         return {key: _sorted(value) for key, value in vars(self).items()}
 
 
-def top_of(tags: Tags, default_m: float, counts: ImportCounts) -> tuple[float, str]:
-    """Height of the top in metres, and its source: height, levels or default."""
-    if height_m := tag_value(tags, "height", length_above_zero_m, counts):
-        return height_m, "height"
-    if levels := tag_value(tags, "building:levels", _levels, counts):
-        return LEVEL_M * levels, "levels"
-    return default_m, "default"
-
-
-def length_above_zero_m(text: str) -> float | None:
-    """A length as OpenStreetMap writes it, in metres; None when it is none, or 0."""
-    return length_m(text) or None
-
-
-def _levels(text: str) -> float | None:
-    levels = number(text)
-    return levels if levels is not None and 0 < levels < 300 else None
+def extent_counted(tags: Tags, solid: SolidType, counts: ImportCounts) -> Extent:
+    """From where to where a thing stands up; tags that say nothing are counted."""
+    extent = extent_of(tags, solid, BUILDING_M)
+    counts.unreadable.update(extent.unreadable)
+    return extent
 
 
 def tag_value(tags: Tags, key: str, parse: Callable[[str], float | None], counts: ImportCounts) -> float | None:

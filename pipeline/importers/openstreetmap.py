@@ -32,9 +32,8 @@ from pipeline.core.errors import InputError, RunError
 from pipeline.formats.osm import Extract, write_streets
 from pipeline.formats.osm import read as read_extract
 from pipeline.importers import junctions, solids
-from pipeline.importers.buildings import BUILDING_M
 from pipeline.importers.junctions import HEIGHTS_M, ROI_HEIGHT_M, Junction, KerbPlace, Region, Streets
-from pipeline.importers.mapped_solids import ImportCounts, MappedSolid
+from pipeline.importers.mapped_solids import BUILDING_M, ImportCounts, MappedSolid
 from pipeline.scenario.loading import load
 from pipeline.scenario.models import FILE, RoiModel, ScoreModel
 from pipeline.scenario.traffic import TrafficModel

@@ -1,6 +1,6 @@
 """Trees of a map, mapped one by one or as a row: a trunk and a crown each (hedges are barriers).
 
-The default sizes are round figures, not measurements. Frame: the network's x, y in metres.
+The default sizes stand in :mod:`pipeline.world.solid_types`. Frame: the network's x, y in metres.
 """
 
 from __future__ import annotations
@@ -12,10 +12,12 @@ import shapely
 from shapely.geometry import LineString, Point
 
 from pipeline.formats.osm import Extract, Tags
-from pipeline.importers.mapped_solids import ImportCounts, MappedSolid, length_above_zero_m, tag_value, top_of
+from pipeline.importers.mapped_solids import ImportCounts, MappedSolid, extent_counted, tag_value
 from pipeline.importers.shapes import XY, lines_of, point_at
+from pipeline.world.mapped_heights import length_above_zero_m
+from pipeline.world.solid_types import CROWN_BASE_SHARE, SOLID, TRUNK_RADIUS_M
 
-TREE_M, CROWN_RADIUS_M, TRUNK_RADIUS_M, CROWN_BASE_SHARE = 8.0, 2.0, 0.15, 0.3
+TREE = SOLID["natural.tree"]
 ROW_SPACING_M = 8.0
 
 
@@ -43,11 +45,11 @@ def _row_points(line: LineString) -> list[Point]:
 
 
 def _tree(name: str, at: Point, tags: Tags, counts: ImportCounts) -> tuple[MappedSolid, MappedSolid]:
-    height_m, source = top_of(tags, TREE_M, counts)
+    extent = extent_counted(tags, TREE, counts)
     girth_m = tag_value(tags, "circumference", length_above_zero_m, counts)
     crown_m = tag_value(tags, "diameter_crown", length_above_zero_m, counts)
     trunk_radius_m = min(max(girth_m / (2 * math.pi), 0.05), 1.5) if girth_m else TRUNK_RADIUS_M
-    crown_radius_m = min(max(crown_m / 2, 2 * trunk_radius_m), 15.0) if crown_m else CROWN_RADIUS_M
-    base_m = CROWN_BASE_SHARE * height_m
-    trunk = MappedSolid(f"{name}/trunk", "tree_trunk", at, base_m, source, 0.0, trunk_radius_m)
-    return trunk, MappedSolid(f"{name}/crown", "tree_crown", at, height_m, source, base_m, crown_radius_m)
+    crown_radius_m = min(max(crown_m / 2, 2 * trunk_radius_m), 15.0) if crown_m else TREE.half_width_m
+    base_m = CROWN_BASE_SHARE * extent.top_m
+    trunk = MappedSolid(f"{name}/trunk", "tree_trunk", at, base_m, extent.source, 0.0, trunk_radius_m)
+    return trunk, MappedSolid(f"{name}/crown", "tree_crown", at, extent.top_m, extent.source, base_m, crown_radius_m)

@@ -7,10 +7,13 @@ models; :mod:`pipeline.scenario.loading` reads the file.
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterator
+from math import inf
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, PrivateAttr, model_validator
+from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Grid, Roi
@@ -57,10 +60,35 @@ class StaticsModel(StrictModel):
     footprints: tuple[str, ...] = Field(
         (), description="GeoJSON files in world-frame metres; features have height_m and may have base_m, radius_m"
     )
-    polygons: tuple[str, ...] = Field((), description="SUMO .poly.xml files")
-    polygon_height_m: Positive = Field(9.0, description="Height of polygons that name none")
+    polygons: tuple[str, ...] = Field((), description="SUMO .poly.xml files; what is solid in them goes by type")
+    polygon_height_m: Positive = Field(
+        9.0, description="Height of solid polygons that name none and whose type has none"
+    )
+    polygon_types: dict[str, Positive | Literal["solid", "ignore"]] = Field(
+        default_factory=dict,
+        description="Which types of polygons are solid, in place of the program's own table: a height in metres, "
+        '"solid" or "ignore" for each, as in "building.shed" = 2.2; "" is any type that no table names',
+    )
     meshes: tuple[MeshModel, ...] = ()
     ground: bool = Field(True, description="A ground plane at z = 0")
+
+    @field_validator("polygon_types", mode="before")
+    @classmethod
+    def _types_by_their_whole_names(cls, values: Any) -> Any:
+        """``building.shed = 2.2`` without quotes is a table in a table; it means the same."""
+        return dict(_flattened(values, "")) if isinstance(values, dict) else values
+
+
+def _flattened(values: dict[str, Any], above: str) -> Iterator[tuple[str, Any]]:
+    for key, value in values.items():
+        if isinstance(value, dict):
+            yield from _flattened(value, f"{above}{key}.")
+            continue
+        is_number = isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < inf
+        if not is_number and value not in ("solid", "ignore"):
+            right = '"solid", "ignore" or a height in metres above 0'
+            raise ValueError(f"{json.dumps(above + key)} = {json.dumps(value)}; {right}")
+        yield above + key, value
 
 
 class TpogModel(StrictModel):

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.core.errors import InputError
+from pipeline.core.findings import Finding
 from pipeline.scenario.types import FARTHEST_M
 
 if TYPE_CHECKING:
@@ -40,11 +41,12 @@ class Footprint:
 
 @dataclass(frozen=True)
 class FootprintFile:
-    """What a file holds; what was mended in it, and what was left out, each with how often."""
+    """What a file holds; what was mended in it and left out, each with how often; what to know before trusting it."""
 
     footprints: list[Footprint] = field(default_factory=list)
     mended: Counter[str] = field(default_factory=Counter)
     left_out: Counter[str] = field(default_factory=Counter)
+    warnings: list[Finding] = field(default_factory=list)
 
 
 def read_geojson(path: Path) -> FootprintFile:

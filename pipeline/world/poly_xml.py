@@ -1,38 +1,244 @@
-"""Reads the polygons of a SUMO .poly.xml as footprints. World frame, metres."""
+"""Reads what is solid in a SUMO .poly.xml as footprints; everything else is counted by its type.
+
+Steps: look each shape's type up in the table of solids (:mod:`pipeline.world.solid_types`); widen lines of walls and
+barriers; cut out the courtyards that polyconvert hands over as polygons of type ``inner``. Heights are the shape's own
+(attribute or parameter ``height``, or what ``polyconvert --all-attributes`` kept of the map), else those of its type.
+World frame, metres.
+"""
 
 from __future__ import annotations
 
+import math
+from collections import Counter
+from dataclasses import replace
 from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import numpy as np
+import shapely
+from shapely import Polygon
 
 from pipeline.core.errors import InputError
+from pipeline.core.findings import Finding
 from pipeline.formats import safe_xml
 from pipeline.world.footprints import Footprint, FootprintFile, polygons_of
+from pipeline.world.mapped_heights import extent_of, is_underground
+from pipeline.world.solid_types import POLES, TRUNK_RADIUS_M, SolidType, SolidTypes
+
+_INNER = "inner"
+_WHITE = ("white", "255,255,255")  # polyconvert's colour of courtyards, which --osm.keep-full-type gives another type
+_NO_TYPE = "(none)"
+_SHOWN = 12  # types that a warning names
 
 
-def read_poly_xml(path: Path, height_m: float) -> FootprintFile:
-    """Footprints of a SUMO .poly.xml; a ``height`` parameter overrides the default height.
+def read_poly_xml(path: Path, types: SolidTypes, height_m: float) -> FootprintFile:
+    """Footprints of what is solid; ``height_m`` is the top of what has no height of its own, nor one by its type.
 
-    InputError names the polygon that is not in metres, or not sound.
+    What is left out is counted by type; types that no table knows, and outlines of solids that are not closed, are
+    warned of. InputError names the solid that is not in metres, or not sound.
     """
-    file = FootprintFile()
+    reader = _Reader(path, types, height_m)
     for number, element in enumerate(safe_xml.children(path, "additional")):
-        if element.tag != "poly":
-            file.left_out[f"<{element.tag}> of .poly.xml"] += 1
-            continue
-        name = element.get("id", f"{path.stem}_{number}")
-        place = f"{path}: poly {name}"
-        if element.get("geo", "false").lower() in ("true", "1"):
-            raise InputError(place, "has longitude and latitude (geo)", "a shape in the network's metres")
-        try:
-            points = [tuple(float(v) for v in pair.split(",")[:2]) for pair in element.get("shape", "").split()]
-            top = next((float(p.get("value", "")) for p in element if p.get("key") == "height"), height_m)
-        except ValueError as error:
-            what = f"has a value that is no number ({error})"
-            raise InputError(place, what, "shape='x,y x,y ...' in metres") from None
-        if element.get("fill", "false").lower() not in ("true", "1") or len(points) < 3:
-            file.left_out["lines of .poly.xml"] += 1
-            continue
-        ring = [*points, points[0]]
-        for part in polygons_of({"type": "Polygon", "coordinates": [ring]}, {}, place, file.mended):
-            file.footprints.append(Footprint(name, element.get("type", "polygon"), part, 0.0, top))
-    return file
+        reader.take(number, element)
+    return reader.done()
+
+
+class _Reader:
+    """Takes the shapes of one file, one by one."""
+
+    def __init__(self, path: Path, types: SolidTypes, height_m: float) -> None:
+        self._path, self._types, self._height_m = path, types, height_m
+        self._file = FootprintFile()
+        self._unknown, self._open, self._polygons = Counter[str](), Counter[str](), 0
+        self._inner: list[Polygon] = []
+        self._white: list[Footprint] = []
+        self._seen = set[tuple[bytes, float, float]]()
+
+    def take(self, number: int, element: Element) -> None:
+        if element.tag not in ("poly", "poi"):
+            if element.tag != "location":
+                self._file.left_out[f"<{element.tag}> of .poly.xml"] += 1
+            return
+        name = element.get("id", f"{self._path.stem}_{number}")
+        place = f"{self._path}: {element.tag} {name}"
+        tags = {p.get("key", ""): p.get("value", "") for p in element if p.tag == "param"}
+        kind = _type_of(element, tags)
+        if element.tag == "poi":
+            self._take_point(place, name, kind, element, tags)
+            return
+        self._polygons += 1
+        if kind == _INNER:
+            self._inner += self._areas(place, _points(element, place))
+            return
+        if is_underground(tags):
+            self._leave_out("underground polygons", kind)
+            return
+        solid = self._types.named(kind)
+        if solid is None:
+            self._leave_out("polygons", kind)
+            if not self._types.knows(kind):
+                self._unknown[kind or _NO_TYPE] += 1
+            return
+        points = _points(element, place)
+        closed = points[0] == points[-1] or _is_filled(element)
+        if len(set(points)) > 2 and closed and (solid.half_width_m is None or _is_filled(element)):
+            areas = self._areas(place, points)
+        elif solid.half_width_m is not None:
+            areas = self._strips(place, points, solid.half_width_m)
+        else:
+            self._leave_out("open lines", kind)
+            self._open[kind] += 1
+            return
+        self._add(place, name, kind, solid, areas, element, tags)
+
+    def _take_point(self, place: str, name: str, kind: str, element: Element, tags: dict[str, str]) -> None:
+        """A pole, or a tree with its trunk; all other points of interest are none."""
+        solid = POLES.get(kind) or self._types.named(kind)
+        radius_m = solid.half_width_m if solid is not None and (kind in POLES or solid.is_tree) else None
+        if solid is None or radius_m is None or element.get("x") is None or element.get("y") is None:
+            self._leave_out("points", kind.partition(".")[0])
+            return
+        at = _numbers(f"{element.get('x')},{element.get('y')}", place)[0]
+        disc = polygons_of({"type": "Point", "coordinates": at}, {"radius_m": radius_m}, place, self._file.mended)
+        base_m = self._add(place, name, kind, solid, disc, element, tags)
+        if solid.is_tree and base_m > 0:
+            properties = {"radius_m": TRUNK_RADIUS_M}
+            trunk = polygons_of({"type": "Point", "coordinates": at}, properties, place, self._file.mended)
+            self._file.footprints.append(Footprint(f"{name}/trunk", "tree_trunk", trunk[0], 0.0, base_m))
+
+    def _areas(self, place: str, points: list[tuple[float, float]]) -> list[Polygon]:
+        ring = {"type": "Polygon", "coordinates": [points if points[0] == points[-1] else [*points, points[0]]]}
+        return polygons_of(ring, {}, place, self._file.mended)
+
+    def _strips(self, place: str, points: list[tuple[float, float]], half_width_m: float) -> list[Polygon]:
+        line = {"type": "LineString", "coordinates": points}
+        return polygons_of(line, {"radius_m": half_width_m}, place, self._file.mended)
+
+    def _add(
+        self, place: str, name: str, kind: str, solid: SolidType, areas: list[Polygon], element: Element,
+        tags: dict[str, str],
+    ) -> float:  # fmt: skip
+        """Add a solid, and give the z of its underside."""
+        if (own := element.get("height")) is not None:
+            tags = {**tags, "height": _height(own, place)}
+        extent = extent_of(tags, solid, self._height_m)
+        for what in extent.unreadable:
+            self._file.mended[f"{what} that cannot be read, taken as not there"] += 1
+        shown = "tree_crown" if solid.is_tree else "roof" if solid.thickness_m else kind.partition(".")[0]
+        for area in areas:
+            if (same := (area.wkb, extent.base_m, extent.top_m)) in self._seen:
+                self._file.mended["solids that are there twice"] += 1
+                continue
+            self._seen.add(same)
+            into = self._white if element.get("color") in _WHITE else self._file.footprints
+            into.append(Footprint(name, shown or "polygon", area, extent.base_m, extent.top_m))
+        return extent.base_m
+
+    def _leave_out(self, what: str, kind: str) -> None:
+        self._file.left_out[f"{what} of type {kind or _NO_TYPE}"] += 1
+
+    def done(self) -> FootprintFile:
+        """The footprints with courtyards cut out, and what to know before trusting them."""
+        file = self._file
+        self._cut_courtyards()
+        place = str(self._path)
+        if self._unknown:
+            found = f"{_listed(self._unknown)}: left out, for no table says whether this is solid"
+            cure = 'say it in [statics.polygon_types]: "solid", "ignore" or a height in metres for each type'
+            file.warnings.append(Finding("polygon types", place, f"polygons of type {found}", cure))
+        if self._open:
+            found = f"outlines of type {_listed(self._open)} are not closed: left out"
+            cure = "polyconvert --osm.merge-relations 1 joins outlines that come in several ways"
+            file.warnings.append(Finding("open outlines", place, found, cure))
+        if self._polygons and not file.footprints:
+            found = f"none of its {self._polygons} polygons is solid"
+            cure = "name the types that are in [statics.polygon_types], or leave the file out of statics.polygons"
+            file.warnings.append(Finding("polygon types", place, found, cure))
+        if inside := len(_pairs_inside(file.footprints)):
+            found = f"solids inside another of their kind and height: {inside}; they may be courtyards that are filled"
+            cure = "polyconvert --osm.merge-relations 1 tells courtyards from buildings"
+            file.warnings.append(Finding("filled courtyards", place, found, cure))
+        return file
+
+    def _cut_courtyards(self) -> None:
+        """Cut polygons of type ``inner``, and white ones inside their own kind, out of what surrounds them."""
+        footprints = self._file.footprints
+        inner = [(polygon, None) for polygon in self._inner] + [(white.polygon, white) for white in self._white]
+        tree = shapely.STRtree([footprint.polygon for footprint in footprints])
+        for polygon, white in inner:
+            around = [int(n) for n in tree.query(polygon, predicate="covered_by")]
+            cut = {
+                n: rest
+                for n in sorted(around)
+                if (white is None or white.kind == footprints[n].kind)
+                and (rest := _without(footprints[n], polygon)) is not None
+            }
+            for number, rest in cut.items():
+                footprints[number] = rest
+            if cut:
+                self._file.mended["courtyards cut out"] += len(cut)
+            elif white is not None:
+                footprints.append(white)
+
+
+def _type_of(element: Element, tags: dict[str, str]) -> str:
+    """The shape's type; "building" with a parameter ``building = garage`` is a ``building.garage``."""
+    kind = element.get("type", "")
+    return f"{kind}.{tags[kind]}" if "." not in kind and kind in tags else kind
+
+
+def _is_filled(element: Element) -> bool:
+    return element.get("fill", "false").lower() in ("true", "1")
+
+
+def _points(element: Element, place: str) -> list[tuple[float, float]]:
+    if element.get("geo", "false").lower() in ("true", "1"):
+        raise InputError(place, "has longitude and latitude (geo)", "a shape in the network's metres")
+    points = _numbers(element.get("shape", ""), place)
+    if len(points) < 2:
+        raise InputError(f"{place}: shape", f"{element.get('shape')!r}", "three points for an area, two for a line")
+    return points
+
+
+def _numbers(text: str, place: str) -> list[tuple[float, float]]:
+    try:
+        return [(float(x), float(y)) for x, y in (pair.split(",")[:2] for pair in text.split())]
+    except ValueError as error:
+        what = f"has a value that is no number ({error})"
+        raise InputError(place, what, "shape='x,y x,y ...' in metres") from None
+
+
+def _height(text: str, place: str) -> str:
+    """SUMO's own attribute: a number of metres, else refused."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise InputError(f"{place}: height", repr(text), "a number of metres above 0")
+    return text
+
+
+def _without(footprint: Footprint, inner: Polygon) -> Footprint | None:
+    """The footprint with a courtyard cut out; None where it does not surround it."""
+    if not footprint.polygon.covers(inner) or footprint.polygon.equals(inner):
+        return None
+    rest = footprint.polygon.difference(inner)
+    return replace(footprint, polygon=shapely.orient_polygons(rest)) if rest.geom_type == "Polygon" else None
+
+
+def _pairs_inside(footprints: list[Footprint]) -> list[tuple[int, int]]:
+    """Which footprint lies wholly inside which other of its kind that stands as high from as low."""
+    shapes = np.array([footprint.polygon for footprint in footprints], dtype=object)
+    pairs = zip(*shapely.STRtree(shapes).query(shapes, predicate="within").tolist(), strict=True)
+    return [(a, b) for a, b in pairs if a != b and _stands(footprints[a]) == _stands(footprints[b])]
+
+
+def _stands(footprint: Footprint) -> tuple[str, float, float]:
+    return footprint.kind, footprint.base_m, footprint.height_m
+
+
+def _listed(counts: Counter[str]) -> str:
+    """Types with how often each occurs, the most frequent first."""
+    shown = [f"{name} ({count})" for name, count in sorted(counts.items(), key=lambda item: (-item[1], item[0]))]
+    return ", ".join(shown[:_SHOWN]) + (f" and {len(shown) - _SHOWN} more types" if len(shown) > _SHOWN else "")

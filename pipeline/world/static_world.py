@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core.errors import InputError
+from pipeline.core.findings import WARNINGS, Finding
 from pipeline.core.progress import Progress, silent
 from pipeline.scenario.models import MeshModel, Scenario
 from pipeline.scenario.types import FARTHEST_M
@@ -26,6 +27,7 @@ from pipeline.world.footprints import Footprint, read_geojson
 from pipeline.world.ground import GroundSource
 from pipeline.world.mesh import World
 from pipeline.world.poly_xml import read_poly_xml
+from pipeline.world.solid_types import SolidTypes
 from pipeline.world.terrain import Surface
 
 Floats = NDArray[np.float64]
@@ -36,15 +38,18 @@ GROUND_MARGIN_M = 500.0
 
 @dataclass(frozen=True)
 class BuildCounts:
-    """What was built (solids a kind), mended and left out; shown to the user and kept in ``run.json``."""
+    """What was built (solids a kind), mended, left out, and is doubtful; shown to the user, kept in ``run.json``."""
 
     built: Counter[str] = field(default_factory=Counter)
     mended: Counter[str] = field(default_factory=Counter)
     left_out: Counter[str] = field(default_factory=Counter)
+    warnings: list[Finding] = field(default_factory=list)
 
     def to_json(self) -> dict[str, Any]:
         """As the stage reports it."""
-        return {key: dict(sorted(counts.items())) for key, counts in vars(self).items()}
+        counts = {"built": self.built, "mended": self.mended, "left_out": self.left_out}
+        told = {WARNINGS: [warning.to_json() for warning in self.warnings]} if self.warnings else {}
+        return {key: dict(sorted(counter.items())) for key, counter in counts.items()} | told
 
 
 def build(
@@ -56,10 +61,13 @@ def build(
     """
     model, builder = scenario.statics, _Builder()
     read = [read_geojson(scenario.find(name, "statics.footprints")) for name in model.footprints]
-    read += [read_poly_xml(scenario.find(name, "statics.polygons"), model.polygon_height_m) for name in model.polygons]
+    types = SolidTypes(model.polygon_types)
+    polygons = [scenario.find(name, "statics.polygons") for name in model.polygons]
+    read += [read_poly_xml(path, types, model.polygon_height_m) for path in polygons]
     for file in read:
         builder.counts.mended.update(file.mended)
         builder.counts.left_out.update(file.left_out)
+        builder.counts.warnings.extend(file.warnings)
     footprints = [footprint for file in read for footprint in file.footprints]
     surface = None if ground is None else ground.ground(scenario, *_extent_m(scenario, footprints))
     for done, footprint in enumerate(footprints):

@@ -86,7 +86,7 @@ def edited(tmp_path: Path, *changes: tuple[str, str]) -> Path:
 def test_heights_by_source(made: Made) -> None:
     heights = made[1].statics.heights
     assert heights["building"] == {"height": 5, "levels": 3, "default": 3}
-    assert heights["roof"] == {"default": 1}
+    assert heights["roof"] == {"type": 1}
     assert heights["tree"] == {"height": 1, "default": 7}
     assert heights["barrier"] == {"height": 1, "default": 3}
     assert heights["pole"] == {"default": 3}
@@ -124,7 +124,7 @@ def test_every_object_is_kept_or_counted(footprints: dict[str, Any], made: Made)
         ("way/2005", 6.0, 0.0, "levels"),
         ("way/2006", 9.0, 3.0, "height"),
         ("way/2014", 20.0, 0.0, "height"),
-        ("way/2015", 5.0, 4.5, "default"),
+        ("way/2015", 5.0, 4.5, "type"),
         ("relation/3001", 12.0, 0.0, "levels"),
         ("node/4001/trunk", 3.0, 0.0, "height"),
         ("node/4001/crown", 10.0, 3.0, "height"),

@@ -171,13 +171,14 @@ def test_poly_xml(tmp_path):
     shapes = {"a": "0,0 4,0 4,4 0,4", "b": "0,0 4,4 4,0 0,4", "c": "0,0 5,5", "d": "0,0 nan,0 4,4 0,4"}
     (tmp_path / "s.poly.xml").write_text(
         '<additional><poly id="a" type="building" fill="1" shape="{a}"><param key="height" value="3"/></poly>'
-        '<poly id="c" fill="0" shape="{c}"/><poi id="p" x="0" y="0"/></additional>'.format(**shapes)
+        '<poly id="c" type="building" fill="0" shape="{c}"/><poi id="p" x="0" y="0"/></additional>'.format(**shapes)
     )
     world, counts = static_world.build(load(tmp_path, polygons=["s.poly.xml"]))
     assert volumes(world) == pytest.approx([48], rel=1e-12)
     assert sum(counts.left_out.values()) == 2
     for name in "bd":
-        (tmp_path / "s.poly.xml").write_text(f'<additional><poly id="x" fill="1" shape="{shapes[name]}"/></additional>')
+        shape = f'<poly id="x" type="building" fill="1" shape="{shapes[name]}"/>'
+        (tmp_path / "s.poly.xml").write_text(f"<additional>{shape}</additional>")
         with pytest.raises(InputError, match="poly x"):
             static_world.build(load(tmp_path, polygons=["s.poly.xml"]))
 

@@ -1,0 +1,391 @@
+"""Is what stands in a SUMO .poly.xml solid when its type is, at its own height, and everything else counted?
+
+Shapes are squares of whole metres, so that volumes can be worked out by hand."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+
+from pipeline.core.errors import InputError
+from pipeline.core.sumo_home import sumo_home
+from pipeline.formats import osm
+from pipeline.scenario.loading import from_values
+from pipeline.world import static_world
+from pipeline.world.footprints import FootprintFile
+from pipeline.world.mesh import World
+from pipeline.world.poly_xml import read_poly_xml
+from pipeline.world.solid_types import SolidTypes
+
+SMALL = Path(__file__).parents[1] / "importers" / "data" / "small.osm"
+SQUARE = "0,0 4,0 4,4 0,4"
+
+
+def poly(
+    kind: str | None, shape: str = SQUARE, fill: str = "1", tags: dict[str, str] | None = None, **more: str
+) -> str:
+    given = {"type": kind, "fill": fill, "shape": shape} | more
+    attributes = " ".join(f'{key}="{value}"' for key, value in given.items() if value is not None)
+    params = "".join(f'<param key="{key}" value="{value}"/>' for key, value in (tags or {}).items())
+    return f'<poly id="x" {attributes}>{params}</poly>'
+
+
+def read(folder: Path, *shapes: str, types: dict[str, Any] | None = None, height_m: float = 9.0) -> FootprintFile:
+    path = folder / "s.poly.xml"
+    path.write_text(f"<additional>{''.join(shapes)}</additional>", encoding="utf-8")
+    return read_poly_xml(path, SolidTypes(types), height_m)
+
+
+def extents(file: FootprintFile) -> list[tuple[str, float, float, float]]:
+    """Kind, underside, top and area of each footprint."""
+    return [(f.kind, f.base_m, f.height_m, round(f.polygon.area, 6)) for f in file.footprints]
+
+
+# ---- which are solid
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected"),
+    [
+        ("building", ("building", 0.0, 9.0, 16.0)),
+        ("building.yes", ("building", 0.0, 9.0, 16.0)),
+        ("building.garage", ("building", 0.0, 2.5, 16.0)),
+        ("building.garages.row", ("building", 0.0, 2.5, 16.0)),
+        ("building.shed", ("building", 0.0, 2.5, 16.0)),
+        ("building.hut", ("building", 0.0, 2.5, 16.0)),
+        ("building.kiosk", ("building", 0.0, 3.0, 16.0)),
+        ("building.greenhouse", ("building", 0.0, 3.0, 16.0)),
+        ("building.roof", ("roof", 4.5, 5.0, 16.0)),
+        ("building.carport", ("roof", 2.2, 2.5, 16.0)),
+        ("man_made.chimney", ("man_made", 0.0, 9.0, 16.0)),
+        ("barrier.wall", ("barrier", 0.0, 2.0, 16.0)),
+        ("barrier", ("barrier", 0.0, 1.5, 16.0)),
+        ("wall", ("wall", 0.0, 2.0, 16.0)),
+        ("natural.tree", ("tree_crown", 2.4, 8.0, 16.0)),
+    ],
+)
+def test_a_type_that_is_solid(tmp_path: Path, kind: str, expected: tuple[str, float, float, float]) -> None:
+    assert extents(read(tmp_path, poly(kind))) == [pytest.approx(expected)]
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        *("parking", "amenity.parking", "landuse", "residential", "landuse.forest", "forest", "park", "leisure.garden"),
+        *("water", "natural", "natural.water", "shop", "amenity", "tourism", "historic", "man_made", "man_made.pier"),
+        *("building.no", "building.demolished", "building.underground", "barrier.kerb", "barrier.gate", "school"),
+    ],
+)
+def test_a_type_that_is_none_is_counted(tmp_path: Path, kind: str) -> None:
+    file = read(tmp_path, poly("building", "9,9 10,9 10,10"), poly(kind), poly(kind, "7,7 8,8", fill="0"))
+    assert len(file.footprints) == 1
+    assert file.left_out == {f"polygons of type {kind}": 2}
+    assert not file.warnings
+
+
+def test_every_type_of_polyconvert_is_in_the_table() -> None:
+    """Those that its own type file makes, under the names that it gives by default and with the full ones."""
+    from defusedxml.ElementTree import parse
+
+    types = SolidTypes()
+    home = sumo_home()
+    for element in parse(home / "data" / "typemap" / "osmPolyconvert.typ.xml").getroot():
+        assert types.knows(element.get("id")) or element.get("id") == "inner", element.get("id")
+        assert types.knows(element.get("name")) or element.get("name") == "inner", element.get("name")
+
+
+def test_a_type_that_no_table_names_is_left_out_and_warned_of(tmp_path: Path) -> None:
+    file = read(tmp_path, poly("building"), poly("sculpture"), poly("sculpture"), poly(None), poly("mine.own"))
+    assert len(file.footprints) == 1
+    assert file.left_out == {
+        "polygons of type sculpture": 2,
+        "polygons of type (none)": 1,
+        "polygons of type mine.own": 1,
+    }
+    assert [(w.rule, w.is_error) for w in file.warnings] == [("polygon types", False)]
+    assert str(file.warnings[0]) == (
+        f"{tmp_path / 's.poly.xml'}: polygons of type sculpture (2), (none) (1), mine.own (1): left out, for no table "
+        'says whether this is solid; say it in [statics.polygon_types]: "solid", "ignore" or a height in metres for '
+        "each type"
+    )
+
+
+def test_a_file_without_anything_solid_is_warned_of(tmp_path: Path) -> None:
+    file = read(tmp_path, poly("parking"), poly("landuse"))
+    assert [w.found for w in file.warnings] == ["none of its 2 polygons is solid"]
+
+
+def test_a_shape_that_is_not_solid_need_not_be_sound(tmp_path: Path) -> None:
+    assert not read(tmp_path, poly("landuse", "0,0 4,4 4,0 0,4"), poly("landuse", "")).footprints
+    with pytest.raises(InputError, match=r"poly x: geometry: is not a sound polygon \(Self-intersection"):
+        read(tmp_path, poly("building", "0,0 4,4 4,0 0,4"))
+
+
+# ---- the user's own table
+
+
+@pytest.mark.parametrize(
+    ("types", "kind", "top_m"),
+    [
+        ({"parking": 12.0}, "parking", 12.0),
+        ({"parking": "solid"}, "parking", 9.0),
+        ({"building": "ignore"}, "building.garage", None),
+        ({"building": "ignore", "building.garage": "solid"}, "building.garage", 2.5),
+        ({"building": "ignore", "building.garage": "solid"}, "building.church", None),
+        ({"building": 15.0}, "building.church", 15.0),
+        ({"building": 15.0}, "building.garage", 2.5),
+        ({"building.garage": 3.5}, "building.garage", 3.5),
+        ({"building.no": 5.0}, "building.no", 5.0),
+        ({"building.no": 5.0}, "building.demolished", None),
+        ({"": "solid"}, "sculpture", 9.0),
+        ({"": 3.0}, None, 3.0),
+        ({"": 3.0}, "parking", None),
+        ({"": "ignore"}, "sculpture", None),
+        ({"landuse": "solid"}, "landuse.forest", 9.0),
+    ],
+)
+def test_the_users_table_stands_before_the_programs(
+    tmp_path: Path, types: dict[str, Any], kind: str | None, top_m: float | None
+) -> None:
+    file = read(tmp_path, poly("fence"), poly(kind), types=types)
+    assert [f.height_m for f in file.footprints[1:]] == ([] if top_m is None else [top_m])
+    assert not file.warnings
+
+
+def test_a_height_of_the_user_leaves_a_roof_open(tmp_path: Path) -> None:
+    assert extents(read(tmp_path, poly("building.roof"), types={"building.roof": 6.0})) == [("roof", 5.5, 6.0, 16.0)]
+
+
+def load(folder: Path, **settings: Any) -> Any:
+    values = {
+        "roi": {"center_m": [20, 20, 2.5], "size_m": [80, 80, 5], "voxel_m": 0.5},
+        "traffic": {"fcd": "none.csv"},
+        "sites": {"file": "sites.csv"},
+        "statics": {"ground": False, **settings},
+    }
+    return from_values(values, folder, "scenario.toml")
+
+
+def test_types_without_quotes_mean_the_same(tmp_path: Path) -> None:
+    nested = {"building": {"shed": 2.2, "yes": {"old": "ignore"}}, "parking": "solid"}
+    flat = {"building.shed": 2.2, "building.yes.old": "ignore", "parking": "solid"}
+    assert load(tmp_path, polygon_types=nested).statics.polygon_types == flat
+
+
+@pytest.mark.parametrize("value", ["yes", -1.0, 0, True, None, [3.0]])
+def test_a_value_that_says_nothing_is_refused(tmp_path: Path, value: Any) -> None:
+    with pytest.raises(
+        InputError, match=r'statics.polygon_types: .*"building.shed" = .*; "solid", "ignore" or a height'
+    ):
+        load(tmp_path, polygon_types={"building.shed": value})
+
+
+def test_the_stage_counts_and_warns(tmp_path: Path) -> None:
+    (tmp_path / "s.poly.xml").write_text(
+        f"<additional>{poly('building')}{poly('parking')}{poly('odd')}</additional>", encoding="utf-8"
+    )
+    settings = {"polygons": ["s.poly.xml"], "polygon_height_m": 4.0}
+    world, counts = static_world.build(load(tmp_path, **settings))
+    assert volumes(world) == pytest.approx([64.0])
+    told = counts.to_json()
+    assert told["built"] == {"building": 1}
+    assert told["left_out"] == {"polygons of type odd": 1, "polygons of type parking": 1}
+    assert [warning["rule"] for warning in told["warnings"]] == ["polygon types"]
+    _, quiet = static_world.build(load(tmp_path, **settings, polygon_types={"odd": "ignore"}))
+    assert "warnings" not in quiet.to_json()
+
+
+def volumes(world: World) -> np.ndarray:
+    """Signed volume of each solid."""
+    t = world.triangles_m
+    each = (t[:, 0] * np.cross(t[:, 1], t[:, 2])).sum(axis=1) / 6
+    return np.bincount(world.solid_of_face, weights=each, minlength=len(world.solids))
+
+
+# ---- heights
+
+
+@pytest.mark.parametrize(
+    ("kind", "tags", "attributes", "base_top"),
+    [
+        ("building", {}, {"height": "5.00"}, (0, 5)),  # polyconvert writes the map's height so
+        ("building", {"height": "3"}, {}, (0, 3)),
+        ("building", {"height": "12 m"}, {}, (0, 12)),
+        ("building", {"height": "tall"}, {"height": "5"}, (0, 5)),
+        ("building.garage", {"height": "4"}, {}, (0, 4)),
+        ("building", {"building:levels": "3"}, {}, (0, 9)),
+        ("building", {"building:levels": "3", "roof:levels": "2"}, {}, (0, 15)),
+        ("building", {"building:levels": "3", "roof:levels": "2", "roof:height": "4"}, {}, (0, 13)),
+        ("building", {"height": "9", "min_height": "3"}, {}, (3, 9)),
+        ("building.roof", {"min_height": "3"}, {}, (3, 5)),
+        ("building.roof", {"height": "7"}, {}, (6.5, 7)),
+        ("building", {"building": "garage"}, {}, (0, 2.5)),  # what --all-attributes keeps says more than the type
+        ("building", {"building": "roof"}, {}, (4.5, 5)),
+    ],
+)
+def test_heights(
+    tmp_path: Path, kind: str, tags: dict[str, str], attributes: dict[str, str], base_top: tuple[float, float]
+) -> None:
+    file = read(tmp_path, poly(kind, tags=tags, **attributes))
+    assert [(f.base_m, f.height_m) for f in file.footprints] == [pytest.approx(base_top)]
+    assert not file.mended
+
+
+def test_a_tag_that_cannot_be_read_is_counted(tmp_path: Path) -> None:
+    file = read(tmp_path, poly("building", tags={"height": "tall", "building:levels": "2"}))
+    assert [f.height_m for f in file.footprints] == [6.0]
+    assert file.mended == {"height that cannot be read, taken as not there": 1}
+
+
+@pytest.mark.parametrize("height", ["tall", "0", "-3", "nan", "inf"])
+def test_a_height_of_sumos_own_that_is_none_is_refused(tmp_path: Path, height: str) -> None:
+    with pytest.raises(InputError, match=rf"poly x: height: '{height}'; a number of metres above 0"):
+        read(tmp_path, poly("building", height=height))
+
+
+# ---- lines, courtyards, points
+
+
+def test_a_wall_is_a_strip_and_a_closed_outline_an_area(tmp_path: Path) -> None:
+    file = read(
+        tmp_path,
+        poly("barrier.wall", "0,0 10,0", fill="0"),
+        poly("barrier.wall", "0,0 10,0 10,10 0,10 0,0", fill="0"),  # round a yard: the yard stays open
+        poly("building", "0,0 4,0 4,4 0,4 0,0", fill="0"),
+    )
+    assert extents(file)[0] == ("barrier", 0.0, 2.0, 3.0)
+    assert extents(file)[2] == ("building", 0.0, 9.0, 16.0)
+    assert not file.footprints[1].polygon.covers(shapely.Point(5, 5))
+
+
+def test_an_open_outline_of_a_building_is_left_out_and_warned_of(tmp_path: Path) -> None:
+    file = read(tmp_path, poly("fence"), poly("building.school", "0,0 4,0 4,4", fill="0"))
+    assert file.left_out == {"open lines of type building.school": 1}
+    assert [w.found for w in file.warnings] == ["outlines of type building.school (1) are not closed: left out"]
+    assert "--osm.merge-relations" in file.warnings[0].cure
+
+
+def test_a_courtyard_is_cut_out_of_what_surrounds_it(tmp_path: Path) -> None:
+    outer, inner = "0,0 20,0 20,20 0,20", "5,5 15,5 15,15 5,15"
+    shed, far = "6,6 8,6 8,8 6,8", "50,50 52,50 52,52 50,52"
+    file = read(
+        tmp_path, poly("inner", inner), poly("building", outer), poly("building.shed", shed), poly("building", far),
+        poly("inner", far),
+    )  # fmt: skip
+    assert [area for *_, area in extents(file)] == [300.0, 4.0, 4.0]  # the last is a hole in a wood: it stays
+    assert file.mended == {"courtyards cut out": 1}
+
+
+@pytest.mark.parametrize("color", ["white", "255,255,255"])
+def test_a_courtyard_that_full_types_hide_is_white(tmp_path: Path, color: str) -> None:
+    """With --osm.keep-full-type it has the type of its building; its colour alone tells it."""
+    outer, inner = "0,0 20,0 20,20 0,20", "5,5 15,5 15,15 5,15"
+    school = "building.school"
+    file = read(
+        tmp_path, poly(school, inner, color=color), poly(school, outer), poly(school, "50,50 52,50 52,52", color=color)
+    )
+    assert [area for *_, area in extents(file)] == [300.0, 2.0]
+    assert not file.warnings
+
+
+def test_a_solid_inside_another_is_warned_of(tmp_path: Path) -> None:
+    """Without --osm.merge-relations, polyconvert fills courtyards."""
+    file = read(tmp_path, poly("building", "0,0 20,0 20,20 0,20"), poly("building", "5,5 15,5 15,15 5,15"))
+    assert len(file.footprints) == 2
+    assert [w.found for w in file.warnings] == [
+        "solids inside another of their kind and height: 1; they may be courtyards that are filled"
+    ]
+    tower = poly("building", "5,5 15,5 15,15 5,15", height="30")
+    assert not read(tmp_path, poly("building", "0,0 20,0 20,20 0,20"), tower).warnings
+
+
+def test_trees_and_poles_among_the_points(tmp_path: Path) -> None:
+    file = read(
+        tmp_path,
+        '<poi id="t" type="natural.tree" x="5" y="6"><param key="height" value="10"/></poi>',
+        '<poi id="l" type="highway.street_lamp" x="1" y="2"/>',
+        '<poi id="s" type="shop.bakery" x="1" y="2"/>',
+        '<poi id="b" type="building.yes" x="1" y="2"/>',
+        '<poi id="g" type="natural.tree" lon="10" lat="50"/>',
+    )
+    assert [(f.name, f.kind, f.base_m, f.height_m) for f in file.footprints] == [
+        ("t", "tree_crown", 3.0, 10.0),
+        ("t/trunk", "tree_trunk", 0.0, 3.0),
+        ("l", "highway", 0.0, 6.0),
+    ]
+    assert file.footprints[0].polygon.centroid.coords[0] == pytest.approx((5, 6))
+    assert file.left_out == {"points of type shop": 1, "points of type building": 1, "points of type natural": 1}
+
+
+def test_what_stands_there_twice_is_built_once(tmp_path: Path) -> None:
+    """With full types, polyconvert writes a tower as a building and as a tower."""
+    file = read(tmp_path, poly("building.yes"), poly("man_made.tower"), poly("historic.yes"))
+    assert len(file.footprints) == 1
+    assert file.mended == {"solids that are there twice": 1}
+
+
+@pytest.mark.parametrize(
+    ("shape", "message"),
+    [
+        ("", "poly x: shape: ''; three points for an area"),
+        ("1,2", "poly x: shape: '1,2'; three points"),
+        ("0,0 a,0 4,4", "poly x: has a value that is no number"),
+        ("0,0 4 4,4", "poly x: has a value that is no number"),
+        ("0,0 nan,0 4,4 0,4", "poly x: geometry: .*no number"),
+    ],
+)
+def test_shapes_that_are_none_are_refused(tmp_path: Path, shape: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read(tmp_path, poly("building", shape))
+
+
+def test_a_tunnelled_garage_is_left_out(tmp_path: Path) -> None:
+    file = read(tmp_path, poly("fence"), poly("building.garage", tags={"location": "underground"}))
+    assert file.left_out == {"underground polygons of type building.garage": 1}
+
+
+# ---- a file that polyconvert made
+
+
+@pytest.mark.system
+def test_what_polyconvert_makes_of_a_map(tmp_path: Path) -> None:
+    """The corners of each building lie where the network says, at the heights of the map."""
+    (tmp_path / "m.osm").write_text(
+        SMALL.read_text(encoding="utf-8").replace('<nd ref="131"/><nd ref="132"/><nd ref="133"/>', '<nd ref="131"/>'),
+        encoding="utf-8",
+    )  # without the outline that crosses itself, which is refused
+    home = sumo_home()
+    types = home / "data" / "typemap" / "osmPolyconvert.typ.xml"
+    environment = os.environ | {"SUMO_HOME": str(home)}
+    for name, flags in (
+        ("netconvert", ["-o", "n.net.xml"]),
+        ("polyconvert", ["--type-file", types, "-n", "n.net.xml", "-o", "p.poly.xml", "--osm.keep-full-type",
+                         "--osm.merge-relations", "1", "--all-attributes"]),
+    ):  # fmt: skip
+        command = [home / "bin" / name, "--osm-files", "m.osm", *flags]
+        subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, env=environment)
+    file = read_poly_xml(tmp_path / "p.poly.xml", SolidTypes(), 9.0)
+    found = {f.name: (f.base_m, f.height_m) for f in file.footprints}
+    expected = {
+        "2001": (0, 12), "2002": (0, 12.19), "2003": (0, 9), "2004": (0, 9), "2005": (0, 6), "2006": (3, 9),
+        "2015": (4.5, 5), "3001": (0, 12), "4001": (3, 10), "4001/trunk": (0, 3),
+    }  # fmt: skip
+    assert {name: found[name] for name in expected} == {name: pytest.approx(v) for name, v in expected.items()}
+    areas = {f.name: f.polygon.area for f in file.footprints}
+    assert areas["3001"] == pytest.approx(40 * 40 - 20 * 20, rel=1e-2)
+    assert file.left_out["underground polygons of type building.garage"] == 1
+    assert not any("of type" in w.found and "solid" in w.found for w in file.warnings)
+    import sumolib
+
+    net = sumolib.net.readNet(str(tmp_path / "n.net.xml"))
+    extract = osm.read(SMALL)
+    corners = shapely.MultiPoint(next(f for f in file.footprints if f.name == "2001").polygon.exterior.coords)
+    for node in extract.ways[2001].nodes:
+        lat_deg, lon_deg = extract.nodes[node]
+        assert corners.distance(shapely.Point(net.convertLonLat2XY(lon_deg, lat_deg))) < 0.01
