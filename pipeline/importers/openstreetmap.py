@@ -36,7 +36,7 @@ from pipeline.importers.junctions import HEIGHTS_M, ROI_HEIGHT_M, Junction, Kerb
 from pipeline.importers.mapped_solids import BUILDING_M, ImportCounts, MappedSolid
 from pipeline.scenario.loading import load
 from pipeline.scenario.models import FILE, RoiModel, ScoreModel
-from pipeline.scenario.traffic import TrafficModel
+from pipeline.scenario.traffic import FRAMES, WARMUP_S, TrafficModel
 from pipeline.scenario.types import Name
 from pipeline.traffic import sumo
 
@@ -244,7 +244,8 @@ def _toml(name: str, made: NewScenario) -> str:
     title = made.junction.title
     document.update({"name": name} if name else {})
     document.update({"description": title[0].upper() + title[1:], "seed": 1})
-    traffic = {key: TrafficModel.model_fields[key].default for key in ("frames", "frame_period_s", "warmup_s")}
+    period_s = TrafficModel.model_fields["frame_period_s"].default
+    traffic = {"frames": FRAMES, "frame_period_s": period_s, "warmup_s": WARMUP_S}
     tables: dict[str, tuple[str, dict[str, Any]]] = {
         "roi": ("the box whose visibility counts; its size is a whole number of voxels along each axis", {
             "center_m": [*made.roi.center_m, ROI_HEIGHT_M / 2], "size_m": [*made.roi.size_m, ROI_HEIGHT_M],

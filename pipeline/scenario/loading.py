@@ -85,7 +85,7 @@ def _making_way(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
         source = next((key for key in sources if key in new), None)
         if source is None or all(key in new for key in sources if key in old):
             continue
-        idle = idle_beside(source) | {"routes"} if table == "traffic" else {"points"}
+        idle = _left_behind(source) if table == "traffic" else {"points"}
         left[table] = {key: value for key, value in old.items() if key not in idle and key not in sources}
     return left
 
@@ -124,6 +124,12 @@ def from_values(values: dict[str, Any], folder: Path, place: str) -> Scenario:
 def json_schema() -> str:
     """The JSON Schema that editors use to complete and check a scenario.toml."""
     return json.dumps(Scenario.model_json_schema(), indent=2, ensure_ascii=False) + "\n"
+
+
+def _left_behind(source: str) -> frozenset[str]:
+    """The keys of another traffic that a new source of it does not take over."""
+    simulated = {"frames", "warmup_s"} if source == "fcd" else set()  # a finished file is taken whole
+    return idle_beside(source) | {"routes"} | simulated
 
 
 def _lay_over(values: dict[str, Any], override: str) -> dict[str, Any]:

@@ -94,7 +94,9 @@ def _flattened(values: dict[str, Any], above: str) -> Iterator[tuple[str, Any]]:
 class TpogModel(StrictModel):
     """How frames are counted."""
 
-    blocks: int = Field(10, ge=1, le=65535, description="Blocks of consecutive frames; divides traffic.frames")
+    blocks: int = Field(
+        10, ge=1, le=65535, description="Blocks of consecutive frames; divides traffic.frames if that is given"
+    )
 
 
 class SiteGrid(StrictModel):
@@ -214,8 +216,9 @@ class Scenario(StrictModel):
 
     @model_validator(mode="after")
     def _across(self) -> Scenario:
-        if self.traffic.frames % self.tpog.blocks:
-            raise ValueError(f"tpog.blocks = {self.tpog.blocks} does not divide traffic.frames = {self.traffic.frames}")
+        frames, blocks = self.traffic.frames, self.tpog.blocks
+        if frames is not None and frames % blocks:
+            raise ValueError(f"tpog.blocks = {blocks} does not divide traffic.frames = {frames}")
         return self
 
     @property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -32,6 +32,15 @@ _FLEET = (
 )
 
 
+FRAMES, WARMUP_S = 5000, 300.0
+"""What is recorded where a scenario does not say it, and the time before; a finished file is taken whole."""
+
+
+def _is_finished(given: dict[str, Any]) -> bool:
+    """Whether the traffic of these keys comes from a finished file."""
+    return given.get("fcd") is not None
+
+
 SOURCES = ("network", "sumocfg", "fcd")
 """Keys that say where vehicles come from; a scenario has one of them."""
 
@@ -42,7 +51,7 @@ def idle_beside(source: str) -> frozenset[str]:
     simulated = frozenset({"vehicles", "hold", "step_s", "lateral_resolution_m", "max_depart_delay_s"})
     if source == "fcd":
         return simulated | drawn - {"kinds"} | {"routes"}
-    return {"sumocfg": drawn | {"routes"}, "routes": drawn}.get(source, frozenset())
+    return {"sumocfg": drawn | {"routes"}, "routes": drawn}.get(source, frozenset()) | {"vtypes"}
 
 
 class TrafficModel(StrictModel):
@@ -60,6 +69,9 @@ class TrafficModel(StrictModel):
     fcd: str | None = Field(
         None, description="A finished FCD file (XML, CSV or Parquet, may be gzipped); nothing is simulated"
     )
+    vtypes: tuple[str, ...] = Field(
+        (), description="SUMO files with <vType>s: the sizes in a finished FCD file; kinds come before them"
+    )
     vehicles: int | None = Field(
         None,
         ge=1,
@@ -72,10 +84,19 @@ class TrafficModel(StrictModel):
     hold: Literal["exactly", "at_most"] = Field(
         "exactly", description="Whether a frame with fewer vehicles than are to be held is an error"
     )
-    frames: int = Field(5000, ge=1, le=2**32 - 1, description="Frames to record")
+    frames: int | None = Field(
+        default_factory=lambda given: None if _is_finished(given) else FRAMES,
+        ge=1,
+        le=2**32 - 1,
+        description=f"Frames to record; {FRAMES} if not given, of a finished file all",
+    )
     frame_period_s: Positive = Field(1.0, description="Time between two frames; a whole number of steps")
     step_s: Positive = Field(0.25, description="SUMO's step length")
-    warmup_s: float = Field(300.0, ge=0, description="Time before the first frame")
+    warmup_s: float = Field(
+        default_factory=lambda given: 0.0 if _is_finished(given) else WARMUP_S,
+        ge=0,
+        description=f"Time before the first frame; {WARMUP_S:g} if not given, of a finished file 0",
+    )
     lateral_resolution_m: float = Field(
         0.8, ge=0, description="SUMO's sublane width; 0 makes lane changes instant jumps"
     )
@@ -110,15 +131,21 @@ class TrafficModel(StrictModel):
 
     @model_validator(mode="after")
     def _not_endless(self) -> TrafficModel:
-        lasts_s = self.warmup_s + self.frames * self.frame_period_s
+        frames = self.frames or 0
+        lasts_s = self.warmup_s + frames * self.frame_period_s
         for what, amount, most in (
-            ("frames", self.frames, 10_000_000),
+            ("frames", frames, 10_000_000),
             ("seconds of traffic", lasts_s, 1e7),
             ("drawn trips (trips_per_s times these seconds)", lasts_s * self.trips_per_s, 1e7),
         ):
             if amount > most:
                 raise ValueError(f"{amount:,.0f} {what}: at most {most:,.0f} can be handled")
         return self
+
+    @property
+    def own_kinds(self) -> tuple[VehicleKind, ...]:
+        """The kinds that the scenario itself names."""
+        return self.kinds if self.kinds != _FLEET else ()
 
     def idle_keys(self) -> tuple[str, set[str]]:
         """The source of the traffic, and the keys that the user set although they act on nothing with this source."""

@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 from pipeline.core.errors import InputError
-from pipeline.core.near_names import misspelt
+from pipeline.scenario.near_names import misspelt
 
 Value = str | int | float | bool | None
 

@@ -2,7 +2,8 @@
 
 Steps: read ``trajectories.parquet`` a few hundred frames at a time; count occupancy block by block
 (:mod:`pipeline.scoring.occupancy`); leave out the voxels that static geometry fills; write the sparse counts. Blocks
-are consecutive and of equal length; counts of several TPOGs on one grid add up.
+are consecutive and of equal length; counts of several TPOGs on one grid add up. Frames at the end of a finished file
+that fill no block are left out and told.
 """
 
 from __future__ import annotations
@@ -40,15 +41,17 @@ def run(work: Workspace, inputs: StageInputs) -> Summary:
     Returns
     -------
     dict
-        ``occupied_voxels``, ``static_voxels`` (left out), ``boxes_in_roi`` (mean a frame).
+        ``occupied_voxels``, ``static_voxels`` (left out), ``boxes_in_roi`` (mean a frame); ``left_over`` where a
+        finished file's frames are no whole number of blocks.
     """
     source, scenario = work.path("trajectories.parquet"), work.scenario
     grid, blocks = scenario.roi.grid, scenario.tpog.blocks
     frames = int(tables.read_metadata(source, "trajectories")["frames"])
-    if frames % blocks:
-        raise InputError(
-            f"{scenario.file}: tpog.blocks", f"{blocks} does not divide the {frames} frames recorded", "a divisor"
-        )
+    left_over = frames % blocks
+    if left_over == frames or (left_over and scenario.traffic.frames is not None):
+        found = f"{blocks} does not divide the {frames} frames recorded"
+        raise InputError(f"{scenario.file}: tpog.blocks", found, f"a divisor, or at most {frames}")
+    frames -= left_over
     filled = static_voxels(world_of(work), grid)
     block_frames, in_roi, ever = frames // blocks, 0, np.zeros(grid.shape, dtype=np.bool_)
     with tables.writer(work.path(ARTEFACTS[0]), "tpog") as file:
@@ -60,11 +63,14 @@ def run(work: Workspace, inputs: StageInputs) -> Summary:
             in_roi += boxes_near
             work.progress("blocks", block + 1, blocks)
         file.describe(work.metadata(inputs, grid=grid.to_json(), frames=frames, block_frames=block_frames))
-    return {
+    summary: Summary = {
         "occupied_voxels": int(ever.sum()),
         "static_voxels": int(filled.sum()),
         "boxes_in_roi": in_roi / frames,
     }
+    if left_over:
+        summary["left_over"] = f"the last {left_over} of {frames + left_over} frames, so that {blocks} blocks are alike"
+    return summary
 
 
 def _sparse(block: int, counts: NDArray[np.int32]) -> dict[str, Any]:

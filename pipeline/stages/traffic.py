@@ -24,6 +24,7 @@ from pipeline.effects import on_traffic, registry
 from pipeline.scenario.models import Scenario
 from pipeline.stages.base import StageInputs, Summary, Workspace
 from pipeline.traffic import recording, sumo, sumo_folder, trajectories
+from pipeline.traffic.finished import sizes
 
 NAME = "traffic"
 ARTEFACTS = ("trajectories.parquet",)
@@ -34,7 +35,7 @@ def inputs(work: Workspace) -> StageInputs:
     """Everything that the trajectories depend on."""
     scenario, traffic = work.scenario, work.scenario.traffic
     if traffic.fcd is not None:
-        sources = [scenario.find(traffic.fcd, "traffic.fcd")]
+        sources = [scenario.find(traffic.fcd, "traffic.fcd"), *sizes.files(scenario)]
     else:
         sources = sumo_folder.sources(scenario).all()
         if traffic.sumocfg is not None:
@@ -45,7 +46,7 @@ def inputs(work: Workspace) -> StageInputs:
     if named := registry.settings(effect for effect in effects if not effect.SELF_ACTING):
         settings["effects"] = named
     hashes = {_label(path, scenario): files.sha256_of(path) for path in sources}
-    version = None if traffic.fcd is not None else sumo.version()
+    version = None if traffic.fcd is not None and not traffic.vtypes else sumo.version()
     return StageInputs(settings, hashes, {"sumo": version}, registry.modules(effects))
 
 
@@ -81,7 +82,7 @@ def run(work: Workspace, inputs: StageInputs, traci: tuple[str, int] | None = No
     source = recording.record(scenario, work.path(COMPANIONS[0]), effects, work.progress, traci)
     with source as recorded, tables.writer(work.path(ARTEFACTS[0]), "trajectories") as file:
         tally, reports = trajectories.write(scenario, recorded, effects, file, work.progress)
-        period_s, frames = recorded.window.period_ms / 1000.0, scenario.traffic.frames
+        period_s, frames = recorded.window.period_ms / 1000.0, recorded.window.count
         file.describe(work.metadata(inputs, frames=frames, frame_period_s=period_s, sumo=inputs.more["sumo"]))
         summary = recorded.summary()
     result = tally.to_json(period_s) | ({} if summary is None else asdict(summary))

@@ -253,9 +253,12 @@ def _fault(runner: SettingRunner, setting: Setting) -> str | None:
 
 def _is_shorter(runner: SettingRunner, setting: Setting, longest: Setting) -> bool:
     """Whether a setting is worth comparing with the reference: not the same, and not watched for longer."""
-    ours, its = (runner.scenario(s).traffic for s in (setting, longest))
-    watched_s = ours.frames * ours.frame_period_s
-    return setting.overrides != longest.overrides and watched_s <= its.frames * its.frame_period_s * (1 + 1e-9)
+    ours_s, its_s = (_watched_s(runner.scenario(s)) for s in (setting, longest))
+    return setting.overrides != longest.overrides and ours_s <= its_s * (1 + 1e-9)
+
+
+def _watched_s(scenario: Scenario) -> float:
+    return study_settings.counted_frames(scenario) * scenario.traffic.frame_period_s
 
 
 def _times(runner: SettingRunner, scenario: Scenario, own: SettingScores, budget_s: float) -> int:
@@ -287,7 +290,8 @@ class _Expected:
         other, own, took = self._runner.scenario(setting), self._scenario, self._took
         finer = own.roi.voxel_m / other.roi.voxel_m
         stepped = _steps(other) / _steps(own) if _traffic(other) != _traffic(own) else 0.0
-        watched = other.traffic.frames / own.traffic.frames * max(1.0, finer**3)
+        frames, own_frames = (study_settings.counted_frames(scenario) for scenario in (other, own))
+        watched = frames / own_frames * max(1.0, finer**3)
         counted = watched if stepped or finer != 1.0 else 0.0
         cast = 1.0 if other.sensors != own.sensors or other.effects != own.effects else 0.0
         beams = _copies(other) / _copies(own)
@@ -306,8 +310,7 @@ def _traffic(scenario: Scenario) -> tuple[object, ...]:
 
 
 def _steps(scenario: Scenario) -> float:
-    traffic = scenario.traffic
-    return (traffic.warmup_s + traffic.frames * traffic.frame_period_s) / traffic.step_s
+    return (scenario.traffic.warmup_s + _watched_s(scenario)) / scenario.traffic.step_s
 
 
 def _write(path: Path, scenario: Scenario, rows: list[Row], own: SettingScores, times: int, tolerance: float) -> None:

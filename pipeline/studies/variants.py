@@ -26,9 +26,11 @@ from pipeline.effects import registry
 from pipeline.effects.on_traffic import SELF_ACTING
 from pipeline.effects.scene_building import build_scene
 from pipeline.scenario.models import Scenario
+from pipeline.scenario.traffic import FRAMES as FRAMES_OF_A_SCENARIO
 from pipeline.scenario.traffic import TrafficModel
 from pipeline.sensing import sites
 from pipeline.sensing.sensors import Sensor, resolve
+from pipeline.traffic.finished.survey import recorded_frames
 
 APPROXIMATES, MEASURES, REFERENCE, SCENARIO = "approximates", "measures", "reference", "scenario"
 WITHOUT, WITH = "without ", "with "
@@ -84,13 +86,20 @@ OWN = Setting(SCENARIO, SCENARIO, "")
 
 def reference(scenario: Scenario, times: int) -> Setting:
     """The scenario with its traffic watched for ``times`` as long."""
-    frames = scenario.traffic.frames * times
+    frames = counted_frames(scenario) * times
     return Setting(REFERENCE, REFERENCE, "frames", (f"traffic.frames={frames}",) if times > 1 else ())
+
+
+def counted_frames(scenario: Scenario) -> int:
+    """Frames that the TPOG counts: as the scenario says, or the whole blocks of a finished file."""
+    frames = recorded_frames(scenario)
+    return frames - frames % scenario.tpog.blocks
 
 
 def is_default(scenario: Scenario, own: Scenario) -> bool:
     """Whether traffic is watched as a scenario that says nothing about it has it, and all else is as in ``own``."""
-    defaults = {key: TrafficModel.model_fields[key].default for key in ("frames", "frame_period_s", "step_s")}
+    defaults = {key: TrafficModel.model_fields[key].default for key in ("frame_period_s", "step_s")}
+    defaults["frames"] = FRAMES_OF_A_SCENARIO
     return own.traffic.fcd is None and scenario == own.model_copy(
         update={"traffic": own.traffic.model_copy(update=defaults)}
     )
@@ -107,9 +116,9 @@ def settings(scenario: Scenario) -> list[Setting]:
 
 def _watched(scenario: Scenario) -> Iterator[Setting]:
     """How long and how finely traffic is watched."""
-    own, blocks = scenario.traffic, scenario.tpog.blocks
+    own, blocks, own_frames = scenario.traffic, scenario.tpog.blocks, counted_frames(scenario)
     for frames in FRAMES:
-        if frames < own.frames and frames % blocks == 0:
+        if frames < own_frames and frames % blocks == 0:
             yield Setting(f"{frames} frames", APPROXIMATES, "frames", (f"traffic.frames={frames}",))
     for period_s in PERIODS_S:
         yield from _traffic(scenario, "period", 1, None, period_s)
@@ -135,13 +144,13 @@ def _traffic(
     scenario: Scenario, knob: str, times: int, step_s: float | None, period_s: float | None
 ) -> Iterator[Setting]:
     """Traffic ``times`` as long as the scenario's, so stepped and watched; nothing where times do not divide."""
-    own, blocks = scenario.traffic, scenario.tpog.blocks
+    own, blocks, own_frames = scenario.traffic, scenario.tpog.blocks, counted_frames(scenario)
     step, period = step_s or own.step_s, period_s or own.frame_period_s
-    frames = round(own.frames * own.frame_period_s * times / period / blocks) * blocks
+    frames = round(own_frames * own.frame_period_s * times / period / blocks) * blocks
     if frames == 0 or (own.fcd is None and not (_divides(step, period) and _divides(step, own.warmup_s))):
         return
     name, overrides = f"{frames} frames", []
-    if frames != own.frames:
+    if frames != own_frames:
         overrides.append(f"traffic.frames={frames}")
     if period != own.frame_period_s:
         name += f" every {period:g} s"

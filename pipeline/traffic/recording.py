@@ -21,6 +21,9 @@ from pipeline.scenario.models import Scenario
 from pipeline.traffic import fcd, live, network, sumo, sumo_folder
 from pipeline.traffic.boxes import Size
 from pipeline.traffic.extensions import TrafficExtension
+from pipeline.traffic.finished import sizes as finished_sizes
+from pipeline.traffic.finished import survey
+from pipeline.traffic.finished.sizes import kind_sizes
 from pipeline.traffic.frames import Window
 from pipeline.traffic.sumo_folder import COLLISIONS, CONFIG, FCD, LOG, PERSONS, STOPS, Prepared, as_flags
 
@@ -94,13 +97,11 @@ def record(
 @contextmanager
 def _finished(scenario: Scenario) -> Iterator[Recording]:
     """From a file; nothing is simulated, so nothing is promised about it."""
-    traffic, place = scenario.traffic, sumo_folder.place_of(scenario)
-    assert traffic.fcd is not None
-    path = scenario.find(traffic.fcd, "traffic.fcd")
-    period_ms = max(1, sumo_folder.milliseconds(traffic.frame_period_s, f"{place}.frame_period_s"))
-    skip_ms = sumo_folder.milliseconds(traffic.warmup_s, f"{place}.warmup_s")
-    window = Window(traffic.frames, period_ms, skip_ms=skip_ms)
-    yield Recording(fcd.read(path), window, kind_sizes(scenario), place)
+    name, place = scenario.traffic.fcd, sumo_folder.place_of(scenario)
+    assert name is not None
+    when, held = survey.window(scenario)
+    path, sizes = scenario.find(name, "traffic.fcd"), finished_sizes.of_types(scenario, held.types)
+    yield Recording(fcd.read(path), when, sizes, place)
 
 
 @contextmanager
@@ -109,7 +110,7 @@ def _simulated(
 ) -> Iterator[Recording]:
     """From SUMO as a subprocess; its FCD file is removed once it is read."""
     prepared = sumo_folder.prepare(scenario, folder, extensions)
-    sizes = kind_sizes(scenario) if prepared.drawn else type_sizes(prepared)
+    sizes = kind_sizes(scenario.traffic.kinds) if prepared.drawn else type_sizes(prepared)
     for extension in extensions:
         sizes |= extension.sizes()
     path, persons = folder / FCD, folder / PERSONS
@@ -153,11 +154,6 @@ def _running(scenario: Scenario, host: str, port: int, extensions: Sequence[Traf
             observations.stopped_on_purpose,
             summary=lambda: RecordingSummary(version, None, None, len(observations.collided)),
         )
-
-
-def kind_sizes(scenario: Scenario) -> dict[str, Size]:
-    """Sizes of the fleet's kinds."""
-    return {k.name: Size(k.length_m, k.width_m, k.height_m, k.vclass) for k in scenario.traffic.kinds}
 
 
 def patience_s(cycle_s: float) -> float:

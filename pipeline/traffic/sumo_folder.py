@@ -117,6 +117,7 @@ def timing(traffic: TrafficModel, begin_s: float, place: str) -> Timing:
             raise InputError(f"{place}.{key} = {value / 1000:g}", what, right)
         values.append(value)
     begin = milliseconds(begin_s, f"{place}: begin")
+    assert traffic.frames is not None, "what is simulated has an end"
     return Timing(begin, begin + values[1], values[0], step, traffic.frames)
 
 

@@ -37,7 +37,7 @@ def write(
     InputError when a vehicle's size is unknown, or the file has too few frames; RunError when N vehicles are not held,
     or a vehicle stands without end.
     """
-    tally, period_s = TrafficTally(scenario.traffic.frames), recording.window.period_ms / 1000.0
+    tally, period_s = TrafficTally(recording.window.count), recording.window.period_ms / 1000.0
     changes: list[BoxChange] | None = None
     for group in _groups(recording):
         uncounted = frozenset[str]().union(*(extension.uncounted_types(recording.sizes) for extension in extensions))

@@ -9,7 +9,7 @@ import pytest
 
 import pipeline
 from pipeline.artefacts.foreign_columns import foreign_columns
-from pipeline.core.near_names import misspelt
+from pipeline.scenario.near_names import misspelt
 from pipeline.sensing import sites
 from tests.conftest import collection, feature
 

@@ -43,7 +43,7 @@ from pipeline.effects.base import Traffic
 from pipeline.scenario.effects import ArticulatedParameters, EffectParameters, VehicleParts
 from pipeline.scenario.models import Scenario
 from pipeline.traffic.boxes import Size, VehicleBoxes, tidy_m, tidy_rad
-from pipeline.traffic.recording import kind_sizes
+from pipeline.traffic.finished.sizes import kind_sizes
 
 Floats = NDArray[np.float64]
 
@@ -79,8 +79,8 @@ class Articulated(Traffic[ArticulatedParameters]):
 
         Of a user's own SUMO demand the kinds are not known beforehand.
         """
-        own = scenario.traffic.sumocfg is not None or scenario.traffic.routes
-        if not own and not self.geometries(kind_sizes(scenario), self.place(scenario)):
+        own = scenario.traffic.sumocfg is not None or scenario.traffic.routes or scenario.traffic.vtypes
+        if not own and not self.geometries(kind_sizes(scenario.traffic.kinds), self.place(scenario)):
             return False, "no kind of vehicle has more than one part"
         return True, "named"
 

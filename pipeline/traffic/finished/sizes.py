@@ -1,0 +1,112 @@
+"""Finds how large the vehicles of a finished FCD file are, which itself names their types alone.
+
+Steps: read the ``<vType>``\\ s of the user's SUMO files (``traffic.vtypes``); ask SUMO for what they leave to its
+defaults, which follow from the vClass; lay the scenario's own kinds over them; name every type that is still missing.
+Metres.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from xml.etree.ElementTree import Element, SubElement, tostring
+
+from pipeline.core.errors import InputError
+from pipeline.formats import safe_xml
+from pipeline.scenario.models import Scenario
+from pipeline.scenario.traffic import VehicleKind
+from pipeline.traffic import live, sumo, sumo_folder
+from pipeline.traffic.boxes import Size
+
+_SIZES = ("length", "width", "height")
+_SUMO_OWN = "DEFAULT_"
+"""What the types begin with that SUMO has without being told."""
+
+_NETWORK = """\
+<net version="1.20">
+    <location netOffset="0,0" convBoundary="0,0,9,0" origBoundary="0,0,9,0" projParameter="!"/>
+    <edge id="e" from="a" to="b" priority="-1"><lane id="e_0" index="0" speed="9" length="9" shape="0,0 9,0"/></edge>
+    <junction id="a" type="dead_end" x="0" y="0" incLanes="" intLanes="" shape="0,0"/>
+    <junction id="b" type="dead_end" x="9" y="0" incLanes="e_0" intLanes="" shape="9,0"/>
+</net>
+"""
+"""The least that SUMO starts with."""
+
+
+def files(scenario: Scenario) -> list[Path]:
+    """The files that the scenario names for sizes."""
+    return [scenario.find(name, "traffic.vtypes") for name in scenario.traffic.vtypes]
+
+
+def kind_sizes(kinds: Collection[VehicleKind]) -> dict[str, Size]:
+    """Sizes of the fleet's kinds."""
+    return {k.name: Size(k.length_m, k.width_m, k.height_m, k.vclass) for k in kinds}
+
+
+def of_types(scenario: Scenario, types: Collection[str]) -> dict[str, Size]:
+    """The sizes of the vehicles of a finished file, which are of these ``types``.
+
+    InputError naming all types without a known size, or what is wrong with a file of vTypes.
+    """
+    traffic, paths = scenario.traffic, files(scenario)
+    sizes = kind_sizes(traffic.kinds)
+    if paths or any(name.startswith(_SUMO_OWN) and name not in sizes for name in types):
+        sizes |= _asked(list(_vtypes(paths))) | kind_sizes(traffic.own_kinds)
+    if missing := sorted(set(types) - set(sizes)):
+        many = len(missing) > 1
+        names = ", ".join(map(repr, missing))
+        known = ", ".join(sorted(name for name in sizes if not name.startswith(_SUMO_OWN)))
+        raise InputError(
+            f"{sumo_folder.place_of(scenario)}.kinds",
+            f"vehicle type{'s' if many else ''} {names} of {traffic.fcd} {'have' if many else 'has'} no known size",
+            f"a kind of {'each' if many else 'that'} name with length_m, width_m and height_m, or the SUMO file with"
+            f" their <vType> in vtypes (known: {known})",
+        )
+    return sizes
+
+
+def _vtypes(paths: Collection[Path]) -> Iterator[Element]:
+    """Identifier, vClass and sizes of every ``<vType>``, wherever it stands in a file; InputError for a wrong one."""
+    seen: dict[str, Path] = {}
+    for path in paths:
+        before = len(seen)
+        for child in safe_xml.children(path, ""):
+            for vtype in child.iter("vType"):
+                name = vtype.get("id", "")
+                if not name or name in seen:
+                    found = f"a second <vType> {name!r}" if name else "a <vType> without id"
+                    raise InputError(path, found, "each <vType> once, with an id")
+                seen[name] = path
+                yield _checked(vtype, f"{path}: vType {name}")
+        if len(seen) == before:
+            raise InputError(path, "has no <vType>", "a SUMO file with <vType id=... vClass=... length=.../>")
+
+
+def _checked(vtype: Element, place: str) -> Element:
+    kept = Element("vType", {key: vtype.attrib[key] for key in ("id", "vClass", *_SIZES) if key in vtype.attrib})
+    if (vclass := kept.get("vClass", "passenger")) not in sumo.vehicle_classes():
+        raise InputError(f"{place}: vClass", repr(vclass), "a vClass of SUMO, e.g. passenger, truck, bus or bicycle")
+    for key in _SIZES:
+        try:
+            size_m = float(kept.get(key, "1"))
+        except ValueError:
+            size_m = math.nan
+        if not 0 < size_m < math.inf:
+            raise InputError(f"{place}: {key}", repr(kept.get(key)), "a length above 0 m")
+    return kept
+
+
+def _asked(vtypes: Collection[Element]) -> dict[str, Size]:
+    """The sizes that SUMO gives these types, and its own ones."""
+    document = Element("additional")
+    for vtype in vtypes:
+        SubElement(document, vtype.tag, vtype.attrib)
+    with tempfile.TemporaryDirectory(prefix="egvs-vtypes-") as temporary:
+        folder = Path(temporary)
+        (folder / "least.net.xml").write_text(_NETWORK, encoding="utf-8")
+        (folder / "types.add.xml").write_bytes(tostring(document, encoding="utf-8"))
+        named = ["-n", "least.net.xml", "-a", "types.add.xml", "--route-steps", "0"]
+        with sumo.served(named, folder) as connection:
+            return {name: live.ask_size(connection, name) for name in connection.vehicletype.getIDList()}

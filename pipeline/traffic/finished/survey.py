@@ -1,0 +1,72 @@
+"""Looks a finished file of floating car data through before its rows are taken. Times are whole milliseconds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pyarrow.compute as pc
+
+from pipeline.core.errors import InputError
+from pipeline.scenario.models import Scenario
+from pipeline.traffic import fcd, sumo_folder
+from pipeline.traffic.frames import Window
+
+
+@dataclass(frozen=True)
+class FcdSurvey:
+    """What a finished file holds: the time from its first row to its last, and the types of its vehicles."""
+
+    lasts_ms: int
+    types: frozenset[str]
+
+
+def survey(path: Path, until_ms: int | None = None) -> FcdSurvey:
+    """Look a finished file through, to ``until_ms`` after its first row or to its end.
+
+    InputError as :func:`pipeline.traffic.fcd.read`, and when it holds no vehicle.
+    """
+    first_ms, last_ms, types = None, 0, set[str]()
+    for table in fcd.read(path):
+        time_ms = table["time_ms"].to_numpy()
+        first_ms = int(time_ms[0]) if first_ms is None else first_ms
+        if until_ms is not None:
+            table = table.slice(0, int(np.searchsorted(time_ms, first_ms + until_ms, side="right")))
+        types.update(pc.unique(table["type"]).to_pylist())
+        last_ms = int(time_ms[-1])
+        if until_ms is not None and last_ms > first_ms + until_ms:
+            break
+    if first_ms is None:
+        raise InputError(path, "holds no vehicle", fcd.RIGHT)
+    return FcdSurvey(last_ms - first_ms, frozenset(types))
+
+
+def window(scenario: Scenario) -> tuple[Window, FcdSurvey]:
+    """Which rows of a scenario's finished file are frames, and what the file holds as far as they reach.
+
+    InputError when the file ends before the first frame, or is no sound file.
+    """
+    traffic, place = scenario.traffic, sumo_folder.place_of(scenario)
+    assert traffic.fcd is not None
+    path = scenario.find(traffic.fcd, "traffic.fcd")
+    period_ms = max(1, sumo_folder.milliseconds(traffic.frame_period_s, f"{place}.frame_period_s"))
+    skip_ms = sumo_folder.milliseconds(traffic.warmup_s, f"{place}.warmup_s")
+    until_ms = None if traffic.frames is None else skip_ms + (traffic.frames - 1) * period_ms
+    found = _remembered(path, path.stat().st_mtime_ns, until_ms)
+    frames = traffic.frames or (found.lasts_ms - skip_ms) // period_ms + 1
+    if frames < 1:
+        lasts = f"{path.name} lasts {found.lasts_ms / 1000:g} s"
+        raise InputError(f"{place}.warmup_s = {traffic.warmup_s:g}", lasts, "a shorter warm-up")
+    return Window(frames, period_ms, skip_ms=skip_ms), found
+
+
+@lru_cache(maxsize=4)
+def _remembered(path: Path, _modified_ns: int, until_ms: int | None) -> FcdSurvey:
+    return survey(path, until_ms)
+
+
+def recorded_frames(scenario: Scenario) -> int:
+    """Frames that a scenario records: as it says, or all of a finished file."""
+    return window(scenario)[0].count if scenario.traffic.frames is None else scenario.traffic.frames

@@ -1,0 +1,153 @@
+"""A finished file of FCD taken whole, and the sizes of its vehicles from SUMO's own files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import pipeline
+from pipeline.artefacts import tables
+from pipeline.core.errors import InputError
+from pipeline.scenario.traffic import TrafficModel
+from pipeline.studies.variants import counted_frames
+from tests.conftest import fcd
+
+LORRY = '<vType id="lorry" vClass="truck"/>'
+CAR = '<vType id="car" length="4" width="1.7" height="1.4"/>'
+
+
+def unsaid(mini: Path, *also: tuple[str, str]) -> Path:
+    """The scenario without frames and warm-up; its file lasts 19.5 s in steps of 0.5 s."""
+    text = (mini / "scenario.toml").read_text()
+    for old, new in (("frames = 40\n", ""), ("warmup_s = 0\n", ""), *also):
+        assert old in text
+        text = text.replace(old, new)
+    (mini / "scenario.toml").write_text(text)
+    return mini
+
+
+def retyped(mini: Path, *types: str) -> None:
+    """Name the file's vehicles, which are cars, as these types, in turn."""
+    head, *rows = (mini / "fcd.csv").read_text().splitlines()
+    rows = [row.replace(";car;", f";{types[i % len(types)]};") for i, row in enumerate(rows)]
+    (mini / "fcd.csv").write_text("\n".join([head, *rows]) + "\n")
+
+
+def vtypes(mini: Path, *files: str) -> list[str]:
+    """Write files of vTypes; the override that names them."""
+    for number, text in enumerate(files):
+        (mini / f"types{number}.xml").write_text(text)
+    return [f"traffic.vtypes={[f'types{number}.xml' for number in range(len(files))]}"]
+
+
+# ---- how long
+
+
+def test_without_frames_all_of_a_file_is_taken(mini: Path, tmp_path: Path, egvs) -> None:
+    assert egvs("run", mini, "--out", tmp_path / "said")[0] == 0
+    code, printed, said = egvs("run", unsaid(mini), "--out", tmp_path / "unsaid")
+    assert code == 0, said
+    assert "left over" not in said + printed
+    for name, read in (("trajectories", pipeline.read_trajectories), ("scores", pipeline.read_scores)):
+        ours, its = (read(tmp_path / way / f"{name}.parquet") for way in ("said", "unsaid"))
+        assert ours.equals(its)
+    assert egvs("verify", tmp_path / "unsaid")[0] == 0
+
+
+def test_what_fills_no_block_is_left_over_and_told(mini: Path, tmp_path: Path, egvs) -> None:
+    code, printed, said = egvs("run", unsaid(mini, ("blocks = 4", "blocks = 3")), "--out", tmp_path / "three")
+    assert code == 0, said
+    assert "left over the last 1 of 40 frames, so that 3 blocks are alike" in said + printed
+    about = tables.read_metadata(tmp_path / "three" / "tpog.parquet", "tpog")
+    assert (about["frames"], about["block_frames"]) == (39, 13)
+    assert egvs("run", mini, "--set", "traffic.frames=39", "--out", tmp_path / "given")[0] == 0
+    ours, its = (pipeline.read_tpog(tmp_path / way / "tpog.parquet") for way in ("three", "given"))
+    assert (ours.counts == its.counts).all()
+
+
+def test_warm_up_and_period_still_act(mini: Path, tmp_path: Path) -> None:
+    scenario = pipeline.load(unsaid(mini), ["traffic.warmup_s=4", "traffic.frame_period_s=1", "tpog.blocks=2"])
+    assert counted_frames(scenario) == 16  # 4, 5, ... 19 s
+    assert counted_frames(pipeline.load(mini, ["tpog.blocks=7"])) == 35
+    record = pipeline.run(scenario, tmp_path)
+    assert record.stages["traffic"].summary["frames"] == 16
+
+
+def test_too_few_frames_for_the_blocks_are_told(mini: Path, tmp_path: Path, egvs) -> None:
+    code, _, said = egvs("run", unsaid(mini, ("blocks = 4", "blocks = 50")), "--out", tmp_path)
+    assert code == 2
+    assert "tpog.blocks: 50 does not divide the 40 frames recorded; a divisor, or at most 40" in said
+
+
+def test_a_warm_up_longer_than_the_file_is_told(mini: Path, tmp_path: Path, egvs) -> None:
+    code, _, said = egvs("run", unsaid(mini), "--set", "traffic.warmup_s=20", "--out", tmp_path)
+    assert code == 2
+    assert "traffic.warmup_s = 20: fcd.csv lasts 19.5 s; a shorter warm-up" in said
+
+
+def test_a_simulation_still_has_its_default_length() -> None:
+    traffic = TrafficModel.of({"network": "n.net.xml"})
+    assert (traffic.frames, traffic.warmup_s) == (5000, 300.0)
+
+
+# ---- how large
+
+
+def test_sizes_come_from_sumos_own_files_and_its_defaults(mini: Path, tmp_path: Path) -> None:
+    retyped(mini, "lorry", "DEFAULT_VEHTYPE", "car", "coach")
+    wanted = vtypes(mini, f"<additional>{LORRY}</additional>",
+                    f"<routes><vTypeDistribution id='d'>{CAR}</vTypeDistribution>"
+                    "<route id='r' edges='no'/><vType id='coach' vClass='bus' length='12.5'/></routes>")  # fmt: skip
+    pipeline.run(pipeline.load(mini, wanted), tmp_path / "out")
+    rows = pipeline.read_trajectories(tmp_path / "out" / "trajectories.parquet").to_pylist()
+    found = {(row["kind"], row["length_m"], row["width_m"], row["height_m"]) for row in rows}
+    truck, passenger = ("truck", 7.1, 2.4, 2.4), ("passenger", 5.0, 1.8, 1.5)  # SUMO's defaults, its documentation
+    car = ("passenger", 4.5, 1.8, 1.5)  # the scenario's kind comes before the file's
+    assert found == {truck, passenger, car, ("bus", 12.5, 2.5, 3.4)}
+
+
+def test_a_file_of_vtypes_comes_before_the_default_fleet(mini: Path, tmp_path: Path) -> None:
+    text = (mini / "scenario.toml").read_text()
+    kind = text[text.index("[[traffic.kinds]]") : text.index("[statics]")]
+    (mini / "scenario.toml").write_text(text.replace(kind, ""))
+    pipeline.run(pipeline.load(mini, vtypes(mini, f"<additional>{CAR}</additional>")), tmp_path / "out")
+    rows = pipeline.read_trajectories(tmp_path / "out" / "trajectories.parquet").to_pylist()
+    assert {row["length_m"] for row in rows} == {4.0}
+
+
+def test_all_missing_kinds_are_asked_for_at_once(mini: Path, tmp_path: Path, egvs) -> None:
+    retyped(mini, "tram", "car", "lorry", "car")
+    code, _, said = egvs("run", mini, "--out", tmp_path)
+    assert code == 2
+    assert "traffic.kinds: vehicle types 'lorry', 'tram' of fcd.csv have no known size; a kind of each name" in said
+    assert "vtypes (known: car)" in said
+    head, _, _ = fcd().rpartition(";car;")
+    (mini / "fcd.csv").write_text(f"{head};tram;1.7\n")  # at 19.5 s, beyond the frames that are asked for below
+    assert egvs("run", mini, "--out", tmp_path)[0] == 2
+    assert egvs("run", mini, "--set", "traffic.frames=36", "--out", tmp_path)[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("files", "message"),
+    [
+        (["<additional/>"], r"types0\.xml: has no <vType>; a SUMO file"),
+        (["<additional><vType/></additional>"], "a <vType> without id; each <vType> once, with an id"),
+        ([f"<a>{LORRY}{LORRY}</a>"], "a second <vType> 'lorry'"),
+        ([f"<a>{LORRY}</a>"] * 2, r"types1\.xml: a second <vType> 'lorry'"),
+        (["<a><vType id='x' vClass='lorry'/></a>"], "vType x: vClass: 'lorry'; a vClass of SUMO"),
+        *(([f"<a><vType id='x' height='{height}'/></a>"], f"vType x: height: '{height}'; a length above 0 m")
+          for height in ("tall", "0", "-1", "nan", "inf")),
+        (["<a><vType id='x'></a>"], "is not well-formed XML"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_with_a_file_of_vtypes_is_said(
+    mini: Path, tmp_path: Path, files: list[str], message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        pipeline.run(pipeline.load(mini, vtypes(mini, *files)), tmp_path / "out")
+
+
+def test_vtypes_act_on_a_finished_file_alone(mini: Path) -> None:
+    with pytest.raises(InputError, match=r"vtypes.* would act on nothing beside network"):
+        pipeline.load(mini, ["traffic.network=n.net.xml", 'traffic.vtypes=["x.xml"]'])
