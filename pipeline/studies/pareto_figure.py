@@ -10,11 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pipeline.core import files
 from pipeline.studies.comparison import Row
 from pipeline.studies.variants import APPROXIMATES, MEASURES, SCENARIO
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000", "#999999")
 _SHAPES = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "p", "h")
@@ -25,6 +28,12 @@ _LEAST_ERROR = 1e-4
 
 def draw_figure(settings: Sequence[Row], tolerance: float, title: str, path: Path) -> None:
     """Write the figure as a PNG."""
+    with files.aside(path) as partial:
+        make_figure(settings, tolerance, title).savefig(partial, dpi=150, format="png", metadata={"Software": None})
+
+
+def make_figure(settings: Sequence[Row], tolerance: float, title: str) -> Figure:
+    """The figure, laid out; its first panel holds the settings that approximate, its second the others."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -38,8 +47,7 @@ def draw_figure(settings: Sequence[Row], tolerance: float, title: str, path: Pat
     figure.suptitle(f"What accuracy costs in time: {title}", fontsize=12)
     figure.draw_without_rendering()  # places the panels, so that names can be placed in them
     _name_settings(left, approximations)
-    with files.aside(path) as partial:
-        figure.savefig(partial, dpi=150, format="png", metadata={"Software": None})
+    return figure
 
 
 def _styles(settings: Sequence[Row]) -> dict[str, tuple[str, str]]:
@@ -64,7 +72,9 @@ def _draw_approximations(axes: Any, settings: Sequence[Row], tolerance: float) -
     if recommended := [s for s in settings if s.recommended]:
         axes.scatter(*_places(recommended), s=230, facecolors="none", edgecolors="black", linewidths=1.6, zorder=4)
     axes.margins(x=0.08, y=0.12)
-    axes.legend(fontsize=8, loc="upper right", framealpha=0.9, title="knob", title_fontsize=8)
+    # below the panel: inside, there is no corner that a setting may not lie in
+    below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.1), "ncols": 4}
+    axes.legend(fontsize=8, title="knob", title_fontsize=8, frameon=False, **below)
 
 
 def _write_ticks_plainly(axes: Any) -> None:
@@ -120,7 +130,7 @@ def _places(settings: Sequence[Row]) -> tuple[list[float], list[float]]:
 def _name_settings(axes: Any, settings: Sequence[Row]) -> None:
     """Name the recommended setting, the default and the front, each where it covers no other name and no marker."""
     renderer = axes.figure.canvas.get_renderer()
-    taken = [axes.get_legend().get_window_extent(renderer)]
+    taken = [text.get_window_extent(renderer) for text in axes.texts]
     markers = axes.transData.transform(list(zip(*_places(settings), strict=True)))
     named = [s for s in settings if (s.front or s.recommended or s.default) and s.kind != SCENARIO]
     for s in sorted(named, key=lambda s: (not s.recommended, not s.default, s.seconds)):
