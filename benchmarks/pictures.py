@@ -21,9 +21,10 @@ from pipeline.artefacts.readers import read_scores, read_tpog, read_trajectories
 from pipeline.effects import registry
 from pipeline.effects.on_traffic import SELF_ACTING
 from pipeline.report.map_frame import extent, standalone
-from pipeline.report.maps import SiteView, site_view
+from pipeline.report.maps import Backdrop, SiteView, site_view
 from pipeline.report.outlines import outlines_of
 from pipeline.report.ranking import ScoredSite
+from pipeline.report.roads import network_file, roads_within
 from pipeline.runs import workflow
 from pipeline.scenario.effects import EffectsModel
 from pipeline.scenario.models import Scenario
@@ -91,10 +92,11 @@ def before_and_after(name: str, folder: Path) -> Iterator[tuple[str, str]]:
     scored = ScoredSite.all_of(read_scores(out / "scores.parquet"))
     place = next(s for s in scored if s.site == (site or scored[0].site))
     box = extent(tpog.grid, [place])
-    outlines = outlines_of(read_ply(out / "statics.ply")[0], box)
+    roads = roads_within(network_file(out), box)
+    backdrop = Backdrop(outlines_of(read_ply(out / "statics.ply")[0], box), roads)
     peak = max(float(field.max()) for _, field, _ in found)
     for word, field, crossed in found:
-        view = SiteView(place, crossed, outlines, box)
+        view = SiteView(place, crossed, backdrop, box)
         what = f"score of site {site} by column" if site else "mean occupied voxels by column"
         alt = f"{name}, {word}: {what}, from above, 0 to {peak:.3g}"
         drawn = site_view(tpog.grid, field, peak, view, f"{name}-{word}", alt)

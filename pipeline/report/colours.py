@@ -52,7 +52,8 @@ def _classes(stops: Sequence[str]) -> str:
 
 STYLE_SHEET = f"""
 .plan {{ --large: #d5d8df; --large-line: #7d8494; --green: #9fc3b6; --green-line: #5f8f80; --small: #4d5564; \
---halo: #ffffff;
+--halo: #ffffff; --road: #e4e7ed; --road-edge: #b9c0cc; --walk: #f6efe2; --cycle: #f3dedb; --rail: #dcd6e6; \
+--street: #4a5262;
   display: block; width: 100%; height: auto; color: #1d2430; font: 12px system-ui, "DejaVu Sans", sans-serif; }}
 .plan text {{ fill: currentColor; }}
 .plan .axis {{ stroke: currentColor; stroke-opacity: .45; fill: none; }}
@@ -62,6 +63,13 @@ STYLE_SHEET = f"""
 .plan .green {{ fill: var(--green); fill-opacity: .45; stroke: var(--green-line); stroke-dasharray: 2 2; }}
 .plan .small {{ fill: var(--small); stroke: var(--small); stroke-width: .5; }}
 .plan .faint {{ opacity: .45; }}
+.plan .roads path {{ fill: none; stroke-linejoin: round; }}
+.plan .roads .edge {{ stroke: var(--road-edge); }}
+.plan .roads .junction {{ fill: var(--road); }}
+.plan .roads .drive {{ stroke: var(--road); }} .plan .roads .walk {{ stroke: var(--walk); }}
+.plan .roads .cycle {{ stroke: var(--cycle); }} .plan .roads .rail {{ stroke: var(--rail); }}
+.plan .street {{ font-size: 11px; font-style: italic; fill: var(--street); text-anchor: middle; \
+paint-order: stroke; stroke: var(--halo); stroke-width: 3px; stroke-linejoin: round; }}
 .plan .site circle {{ stroke: currentColor; stroke-width: 1.2; }}
 .plan .first circle {{ stroke-width: 2.6; }}
 .plan .site .rank {{ font-size: 9.5px; font-weight: 700; text-anchor: middle; stroke: none; }}
@@ -76,7 +84,8 @@ stroke-linejoin: round; }}
 {_classes(ON_LIGHT)}
 @media screen and (prefers-color-scheme: dark) {{
 .plan {{ --large: #343b48; --large-line: #7f889a; --green: #2f5b4f; --green-line: #6fa493; --small: #a9b2c3; \
---halo: #12161d;
+--halo: #12161d; --road: #232a36; --road-edge: #414a5a; --walk: #2e2a20; --cycle: #3a2827; --rail: #2d2838; \
+--street: #b6becc;
   color: #e6e9ef; }}
 .plan .low {{ fill: #ffffff; }} .plan .high {{ fill: #14181f; }}
 .plan .day {{ display: none; }} .plan .night {{ display: inline; }}

@@ -12,12 +12,20 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.core.grid import Grid
 from pipeline.report.colours import STEPS, STYLE_SHEET, opacity
 
 Box = tuple[float, float, float, float]
 """x0, y0, x1, y1: in the world frame, metres, or in a figure's units."""
+
+Rectangle = tuple[float, float, float, float]
+"""x, y, width, height, in a figure's units."""
+Metres = TypeVar("Metres", float, NDArray[np.float64])
 
 
 @dataclass(frozen=True)
@@ -79,27 +87,32 @@ class Plan:
         self.frame_width, self.frame_height = (box[2] - box[0]) * self.scale, (box[3] - box[1]) * self.scale
         self.left += (width - self.left - right - self.frame_width) / 2
 
-    def x(self, x_m: float) -> float:
+    def x(self, x_m: Metres) -> Metres:
         """Rightwards with east."""
         return self.left + (x_m - self.box[0]) * self.scale
 
-    def y(self, y_m: float) -> float:
+    def y(self, y_m: Metres) -> Metres:
         """Downwards with south."""
         return self.top + (self.box[3] - y_m) * self.scale
 
-    def _rectangle(self, grid: Grid) -> tuple[float, float, float, float]:
-        """x, y, width, height of the region of interest."""
+    @property
+    def whole(self) -> Rectangle:
+        """All that is shown."""
+        return self.left, self.top, self.frame_width, self.frame_height
+
+    def region(self, grid: Grid) -> Rectangle:
+        """The region of interest."""
         (x, y, _), (w, h, _) = grid.origin_m, grid.roi.size_m
         return self.x(x), self.y(y + h), w * self.scale, h * self.scale
 
     def roi(self, grid: Grid) -> str:
         """The region of interest."""
-        x, y, w, h = self._rectangle(grid)
+        x, y, w, h = self.region(grid)
         return f'<rect class="roi" x="{x:.1f}" y="{y:.1f}" width="{w:.1f}" height="{h:.1f}"/>'
 
-    def image(self, grid: Grid, png: str, look: str) -> str:
-        """A raster over the region of interest."""
-        x, y, w, h = self._rectangle(grid)
+    def image(self, rectangle: Rectangle, png: str, look: str) -> str:
+        """A raster over a rectangle."""
+        x, y, w, h = rectangle
         place = f'x="{x:.2f}" y="{y:.2f}" width="{w:.2f}" height="{h:.2f}"'
         return f'<image class="{look}" {place} preserveAspectRatio="none" href="{png}"/>'
 
@@ -137,9 +150,11 @@ class Plan:
             texts.append(f'<text x="{self.left - 8:.1f}" y="{y + 4:.1f}" text-anchor="end">{text}</text>')
         side = self.left - 16.0 - 7.0 * max(len(t) for _, t in self._ticks[1])
         centre, middle = self.left + wide / 2, self.top + tall / 2
-        texts.append(f'<text x="{centre:.1f}" y="{base + 34:.1f}" text-anchor="middle">x, east (m)</text>')
         texts.append(
-            f'<text transform="translate({side:.1f} {middle:.1f}) rotate(-90)" text-anchor="middle">y, north (m)</text>'
+            f'<text x="{centre:.1f}" y="{base + 34:.1f}" class="title" text-anchor="middle">x, east (m)</text>'
+        )
+        texts.append(
+            f'<text transform="translate({side:.1f} {middle:.1f}) rotate(-90)" class="title" text-anchor="middle">y, north (m)</text>'
         )
         return f'<path class="grid" d="{"".join(lines)}"/><path class="axis" d="{"".join(ticks)}"/>{"".join(texts)}'
 
@@ -172,7 +187,8 @@ class ColourBar:
             for at, text in self._ticks(x, width)
         )
         note = "" if self.even else " · square-root scale"
-        title = f'<text x="{x + width / 2:.1f}" y="{y + 44:.1f}" text-anchor="middle">{escape(self.label)}{note}</text>'
+        place = f'x="{x + width / 2:.1f}" y="{y + 44:.1f}"'
+        title = f'<text class="title" {place} text-anchor="middle">{escape(self.label)}{note}</text>'
         return f"<g>{fill}{bar}{ticks}{title}</g>"
 
     def _ticks(self, x: float, width: float) -> list[tuple[float, str]]:

@@ -3,13 +3,17 @@
 - :func:`occupancy`: a field over the region, summed along z, with the static outlines and the sites;
 - :func:`site_map`: the sites, coloured by score, numbered by rank;
 - :func:`site_view`: what one site sees or misses; such figures share the colour scale
-  :func:`pipeline.report.map_frame.shared_scale`.
+  :func:`pipeline.report.map_frame.shared_scale`;
+- :func:`scan_view`: where the beams of its empty scan end.
+
+Roads lie under all of them but the last.
 
 Names of sites are placed so that they hide little.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
@@ -21,7 +25,8 @@ from pipeline.core.grid import Grid
 from pipeline.report import colours, raster
 from pipeline.report.map_frame import Box, ColourBar, MapSite, Plan, extent
 from pipeline.report.outlines import Outlines
-from pipeline.report.raster import ColumnValues
+from pipeline.report.raster import ColumnValues, IndexedImage
+from pipeline.report.roads import Roads, StreetName
 
 Place = list[MapSite]
 """Sites that stand above one another, the best first."""
@@ -30,37 +35,51 @@ _LONGEST = 18
 """Letters of a name; longer ones are cut."""
 _CROWDED = 40
 """With more places than this, a map has no room for numbers and names."""
+_ALONG = (0.5, 0.3, 0.7, 0.15, 0.85)
+"""Where along its piece of street a name may stand; the first that is free."""
 _SIDES = ((1, 0), (0, -1), (0, 1), (-1, 0), (0.71, -0.71), (-0.71, -0.71), (0.71, 0.71), (-0.71, 0.71))
 """East, north, south, west, then the diagonals."""
 
 
 @dataclass(frozen=True)
+class Backdrop:
+    """What lies under every map: the static outlines, and the roads."""
+
+    outlines: Sequence[Outlines]
+    roads: Roads
+
+
+@dataclass(frozen=True)
 class SiteView:
-    """A sensor in its place, and what a figure of it shows: the voxels that its beams cross, (nx, ny, nz) bool, and the
-    static outlines within a box.
-    """
+    """A sensor in its place: the voxels that its beams cross, (nx, ny, nz) bool, and what lies under the figure."""
 
     site: MapSite
     crossed: NDArray[np.bool_]
-    outlines: Sequence[Outlines]
+    backdrop: Backdrop
     box: Box
 
 
 def occupancy(
-    grid: Grid, values: ColumnValues, label: str, outlines: Sequence[Outlines], sites: Sequence[MapSite], alt: str
+    grid: Grid, values: ColumnValues, label: str, backdrop: Backdrop, sites: Sequence[MapSite], alt: str
 ) -> str:
-    """A field over the region of interest, with the static outlines and the sites."""
+    """A field over the region of interest, with the roads, the static outlines and the sites."""
     plan = Plan(extent(grid, sites), "tpog", north=True)
     peak = float(values.max(initial=0.0))
-    parts = [_field(plan, grid, values, peak), _outline_paths(plan, outlines), plan.roi(grid)]
+    parts = [
+        _road_paths(plan, backdrop.roads),
+        _field(plan, grid, values, peak),
+        _outline_paths(plan, backdrop.outlines),
+        plan.roi(grid),
+        *_street_names(plan, backdrop.roads.names, sites)[0],
+    ]
     for s in sites:
         dot = f'<circle class="spot" cx="{plan.x(s.x_m):.1f}" cy="{plan.y(s.y_m):.1f}" r="4"/>'
         parts.append(_titled(dot, f"{s.site}: rank {s.rank}"))
     return plan.svg(parts, alt, bar=ColourBar(0.0, peak, label))
 
 
-def site_map(grid: Grid, values: ColumnValues, outlines: Sequence[Outlines], sites: Sequence[MapSite], alt: str) -> str:
-    """The sites over the static outlines: colour by score, number by rank, name beside it; occupied roads faint below.
+def site_map(grid: Grid, values: ColumnValues, backdrop: Backdrop, sites: Sequence[MapSite], alt: str) -> str:
+    """The sites over roads and static outlines: colour by score, number by rank, name beside it; traffic faint below.
 
     Of sites that share a place, the best is in the middle of its rings. Where many sites stand, only the first ten and
     the last keep a name; every site tells its own under the pointer.
@@ -68,21 +87,24 @@ def site_map(grid: Grid, values: ColumnValues, outlines: Sequence[Outlines], sit
     plan = Plan(extent(grid, sites), "sites", north=True)
     places = _places(sites)
     crowded, low, high = is_crowded(sites), min(s.egvs for s in sites), max(s.egvs for s in sites)
+    streets, street_boxes = _street_names(plan, backdrop.roads.names, sites)
     radius = 8.5 if not crowded else 6.0 if len(places) <= 120 else 4.0
     parts = [
+        _road_paths(plan, backdrop.roads),
         f'<g class="faint">{_field(plan, grid, values, float(values.max(initial=0.0)))}</g>',
-        f"<g>{_outline_paths(plan, outlines)}</g>",
+        f"<g>{_outline_paths(plan, backdrop.outlines)}</g>",
         plan.roi(grid),
+        *streets,
     ]
     parts += [_rings(plan, place, low, high, radius, crowded) for place in reversed(places)]
     named = places if not crowded else [*places[:10], places[-1]]
-    parts += _labels(plan, places, named, radius)
+    parts += _labels(plan, places, named, radius, street_boxes)
     return plan.svg(parts, alt, bar=ColourBar(low, high, "EGVS (bit)", even=True) if high > low else None)
 
 
 def site_view(grid: Grid, values: ColumnValues, peak: float, view: SiteView, prefix: str, alt: str) -> str:
     """Entropy from above that one site sees, or misses; columns of voxels that no beam crosses at any height are
-    shaded.
+    shaded. Its images carry classes (``shade``, ``field``) by which a page may exchange them.
 
     Parameters
     ----------
@@ -93,32 +115,96 @@ def site_view(grid: Grid, values: ColumnValues, peak: float, view: SiteView, pre
     prefix
         Makes ids unique on a page.
     """
-    plan, site = Plan(view.box, prefix, width=460.0, tallest=420.0), view.site
-    x, y = plan.x(site.x_m), plan.y(site.y_m)
+    plan = view_plan(view.box, prefix)
+    shade = raster.shade_image(np.logical_not(view.crossed.any(axis=2)))
     parts = [
-        plan.image(grid, raster.shade_image(np.logical_not(view.crossed.any(axis=2))), "shadow"),
+        _road_paths(plan, view.backdrop.roads),
+        plan.image(plan.region(grid), shade.uri(raster.SHADE_PALETTE), "shade"),
         _field(plan, grid, values, peak),
-        _outline_paths(plan, view.outlines),
+        _outline_paths(plan, view.backdrop.outlines),
         plan.roi(grid),
-        _titled(f'<path class="sensor" d="M{x:.1f} {y - 9:.1f}l7.8 13.5h-15.6z"/>', f"{site.site}, the sensor"),
+        _sensor(plan, view.site),
     ]
     return plan.svg(parts, alt)
 
 
+def scan_view(grid: Grid, image: IndexedImage, view: SiteView, prefix: str, alt: str) -> str:
+    """Where the beams of one site's empty scan end, from above; ``image`` covers the view's box."""
+    plan = view_plan(view.box, prefix)
+    images = (plan.image(plan.whole, image.uri(raster.DOTS[look]), f"field {look}") for look in raster.LOOKS)
+    parts = [_outline_paths(plan, view.backdrop.outlines), *images, plan.roi(grid), _sensor(plan, view.site)]
+    return plan.svg(parts, alt)
+
+
+def view_plan(box: Box, prefix: str = "") -> Plan:
+    """The frame of the figures that show one site."""
+    return Plan(box, prefix, width=460.0, tallest=420.0)
+
+
+def _sensor(plan: Plan, site: MapSite) -> str:
+    place = f'transform="translate({plan.x(site.x_m):.1f} {plan.y(site.y_m):.1f})"'
+    return f'<path class="sensor" {place} d="M0 -9l7.8 13.5h-15.6z"/>'
+
+
 def _field(plan: Plan, grid: Grid, values: ColumnValues, peak: float) -> str:
-    return "".join(plan.image(grid, png, look) for look, png in raster.field_images(values, peak))
+    if not peak > 0:
+        return ""
+    image, place = raster.field_image(values, peak), plan.region(grid)
+    return "".join(plan.image(place, image.uri(raster.FIELD[look]), f"field {look}") for look in raster.LOOKS)
+
+
+def _road_paths(plan: Plan, roads: Roads) -> str:
+    """Junctions, and lanes with a fine line between them: each is drawn twice, the second time a little narrower."""
+    outlines = "".join(_closed(plan, outline) for outline in roads.junctions)
+    by_look: dict[tuple[str, float], list[str]] = {}
+    for piece in roads.lanes:
+        by_look.setdefault((piece.look, piece.width_m), []).append(_open(plan, piece.line))
+    wide, narrow = [], []
+    for (look, width_m), paths in by_look.items():
+        width, d = width_m * plan.scale, "".join(paths)
+        wide.append(f'<path class="edge" style="stroke-width:{width:.2f}px" d="{d}"/>')
+        narrow.append(f'<path class="lane {look}" style="stroke-width:{max(width - 1.0, 0.6 * width):.2f}px" d="{d}"/>')
+    junctions = f'<path class="junction" d="{outlines}"/>' if outlines else ""
+    return f'<g class="roads">{"".join(wide)}{junctions}{"".join(narrow)}</g>' if wide else ""
+
+
+def _street_names(plan: Plan, names: Sequence[StreetName], sites: Sequence[MapSite]) -> tuple[list[str], list[Box]]:
+    """Names along their streets, where they fit into the frame, onto no site and onto no other name; those of the
+    longest pieces first. Also the boxes that they take.
+    """
+    drawn: list[str] = []
+    taken = [_square(plan.x(s.x_m), plan.y(s.y_m), 9.0) for s in sites]
+    for name in sorted(names, key=lambda name: -name.length_m):
+        (x0, y0), (x1, y1) = ((plan.x(x), plan.y(y)) for x, y in (name.start_m, name.end_m))
+        angle, half = math.atan2(y1 - y0, x1 - x0), 3.3 * len(name.text) + 4.0
+        for along in _ALONG:
+            x, y = x0 + along * (x1 - x0), y0 + along * (y1 - y0)
+            boxes = [
+                _square(x + at * math.cos(angle), y + at * math.sin(angle), 7.0) for at in np.arange(-half, half, 7)
+            ]
+            if all(_within(b, plan) and not any(_overlap(b, other) for other in taken) for b in boxes):
+                taken += boxes
+                place = f"translate({x:.1f} {y:.1f}) rotate({math.degrees(angle):.1f})"
+                drawn.append(f'<text class="street" transform="{place}" dy="4">{escape(name.text)}</text>')
+                break
+    return drawn, taken[len(sites) :]
 
 
 def _outline_paths(plan: Plan, outlines: Sequence[Outlines]) -> str:
-    def path(ring: NDArray[np.float64]) -> str:
-        xs = plan.left + (ring[:-1, 0] - plan.box[0]) * plan.scale
-        ys = plan.top + (plan.box[3] - ring[:-1, 1]) * plan.scale
-        return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in zip(xs.tolist(), ys.tolist(), strict=True)) + "z"
-
     return "".join(
-        f'<path class="{group.look}" fill-rule="evenodd" d="{"".join(path(ring) for ring in group.rings)}"/>'
+        f'<path class="{group.look}" fill-rule="evenodd" d="{"".join(_closed(plan, r[:-1]) for r in group.rings)}"/>'
         for group in outlines
     )
+
+
+def _open(plan: Plan, line: NDArray[np.float64]) -> str:
+    """The path along some points, (n, 2) metres."""
+    xs, ys = plan.x(line[:, 0]), plan.y(line[:, 1])
+    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in zip(xs.tolist(), ys.tolist(), strict=True))
+
+
+def _closed(plan: Plan, ring: NDArray[np.float64]) -> str:
+    return _open(plan, ring) + "z"
 
 
 def _titled(shape: str, title: str) -> str:
@@ -137,7 +223,8 @@ def _rings(plan: Plan, place: Place, low: float, high: float, radius: float, cro
     rank = "" if crowded else f'<text class="rank {tone}" x="{x:.1f}" y="{y + 3.4:.1f}">{place[0].rank}</text>'
     title = "; ".join(f"{s.site}: rank {s.rank}, EGVS {s.egvs:,.0f} bit, height {s.z_m:g} m" for s in place)
     first = " first" if place[0].rank == 1 else ""
-    return f'<g class="site{first}"><title>{escape(title)}</title>{"".join(circles)}{rank}</g>'
+    shown_by = f'class="site{first}" data-site="{escape(place[0].site)}"'
+    return f"<g {shown_by}><title>{escape(title)}</title>{''.join(circles)}{rank}</g>"
 
 
 def _places(sites: Sequence[MapSite]) -> list[Place]:
@@ -158,13 +245,17 @@ def has_shared_places(sites: Sequence[MapSite]) -> bool:
     return len(_places(sites)) < len(sites)
 
 
-def _labels(plan: Plan, places: Sequence[Place], named: Sequence[Place], radius: float) -> list[str]:
-    """Names of the ``named`` places, so that they hide little; ``radius`` is that of a place's innermost ring.
+def _labels(
+    plan: Plan, places: Sequence[Place], named: Sequence[Place], radius: float, others: Sequence[Box]
+) -> list[str]:
+    """Names of the ``named`` places, so that they hide little, of ``others`` too; ``radius`` is that of a place's
+    innermost ring.
 
     Steps, for each: try eight sides at four distances; take the first spot that covers nothing, or else the one that
     covers least; draw a line to one that is further out.
     """
     taken = [_square(plan.x(p[0].x_m), plan.y(p[0].y_m), _reach(p, radius) + 1) for p in places]
+    taken += others
     drawn = []
     for place in named:
         x, y = plan.x(place[0].x_m), plan.y(place[0].y_m)

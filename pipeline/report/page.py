@@ -23,7 +23,8 @@ from pipeline.core.version import __version__
 from pipeline.report import figures, maps, wording
 from pipeline.report.colours import STYLE_SHEET
 from pipeline.report.figures import Figures
-from pipeline.report.ranking import Ranking
+from pipeline.report.ranking import Ranking, ScoredSite
+from pipeline.report.roads import network_file
 from pipeline.report.study import ACCURACY, StudySummary
 from pipeline.scenario.models import Scenario
 from pipeline.stages.base import StageInputs, Summary, Workspace
@@ -37,6 +38,8 @@ STAGES = ("traffic", "statics", "tpog", "scan", "score")
 
 LISTED, FIRST, LAST = 40, 30, 5
 """More than ``LISTED`` sites are shown as the first and the last of them."""
+
+TEMPLATES = Path(__file__).parent / "templates"
 
 _LEFT_OUT = (
     ("vehicles that hide one another", "moving_occlusion"),
@@ -62,6 +65,8 @@ def inputs(work: Workspace) -> StageInputs:
         cast = scan_inputs(work)
         settings["scan"], hashes = cast.settings, dict(cast.files)
     hashes |= work.digests(*(name for name in (*read, *ACCURACY) if work.path(name).is_file()))
+    if (roads := network_file(work.folder)) is not None:
+        hashes[roads.relative_to(work.folder).as_posix()] = files.sha256_of(roads)
     # what a stage sums up is the same in every run, but for the seconds of SUMO, which are not shown
     summaries = {
         name: {key: value for key, value in stages[name].summary.items() if key != "sumo_seconds"}
@@ -71,6 +76,13 @@ def inputs(work: Workspace) -> StageInputs:
     costs = {name: [stage.cost.seconds, stage.cost.peak_mb] for name, stage in stages.items()}
     warnings = [stage.summary.get(WARNINGS, []) for stage in stages.values()]
     return StageInputs(settings, hashes, {"costs": costs, "summaries": summaries, "warnings": warnings})
+
+
+def _listed(ranking: Ranking) -> tuple[tuple[ScoredSite, ...], tuple[ScoredSite, ...]]:
+    """The first sites and the last ones that the page shows; all are first where they are few."""
+    if len(ranking.sites) <= LISTED:
+        return ranking.sites, ()
+    return ranking.sites[:FIRST], ranking.sites[-LAST:]
 
 
 def _shown(scenario: Scenario) -> dict[str, Any]:
@@ -104,7 +116,8 @@ def run(work: Workspace, inputs: StageInputs) -> Summary:
     out = work.folder
     ranking, tpog, stages = Ranking.read(out / "scores.parquet"), read_tpog(out / "tpog.parquet"), _recorded(out)
     work.progress("artefacts read", 1, 3)
-    drawn = figures.draw(work, ranking, tpog)
+    first, last = _listed(ranking)
+    drawn = figures.draw(work, ranking, (*first, *last), tpog)
     work.progress("figures drawn", 2, 3)
     html = page(work.scenario, ranking, tpog, drawn, stages, StudySummary.read(out, stages))
     files.write_text(work.path(ARTEFACTS[0]), html)
@@ -125,13 +138,19 @@ def page(
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 
-    loader = FileSystemLoader(Path(__file__).parent / "templates")
+    loader = FileSystemLoader(TEMPLATES)
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters |= {"svg": Markup, "share": wording.share, "whole": wording.whole, "plain": wording.plain}
+    environment.filters |= {
+        "svg": Markup,
+        "share": wording.share,
+        "whole": wording.whole,
+        "plain": wording.plain,
+        "degrees": wording.degrees,
+    }
     sites, effects, gamma = ranking.sites, list(scenario.effects.named), scenario.score.gamma
-    shortened, has_traffic = len(sites) > LISTED, bool(tpog.counts.any())
+    (first, last), has_traffic = _listed(ranking), bool(tpog.counts.any())
     seconds = [stage.cost.seconds for stage in stages.values()]
     return environment.get_template("report.html.j2").render(
         scenario=scenario,
@@ -143,18 +162,21 @@ def page(
         longest_s=max(seconds, default=0.0),
         artefacts=[artefact for stage in stages.values() for artefact in stage.artefacts.items()],
         study=study,
-        first=sites[:FIRST] if shortened else sites,
-        last=sites[-LAST:] if shortened else (),
+        first=first,
+        choices=(*first, *last),
         listed=LISTED,
-        hidden=len(sites) - FIRST - LAST if shortened else 0,
+        last=last,
+        hidden=len(sites) - len(first) - len(last),
         headline=wording.headline(ranking, has_traffic),
         lead=wording.lead(ranking),
+        which_to_trust=wording.which_to_trust(ranking),
         limit_share=wording.share_of_limit(sites[0]),
         separable=SEPARABLE,
         has_traffic=has_traffic,
         crowded=maps.is_crowded(sites),
         rings=maps.has_shared_places(sites),
         style=Markup(STYLE_SHEET),
+        choose=Markup((TEMPLATES / "choose.js").read_text(encoding="utf-8")),
         gamma="∞" if math.isinf(gamma) else f"{gamma:g}",
         uncapped=math.isinf(gamma),
         watched=wording.duration(tpog.frames * scenario.traffic.frame_period_s),

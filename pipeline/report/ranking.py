@@ -22,7 +22,8 @@ CLOSE = 0.01
 class ScoredSite(MapSite):
     """What is shown of a row of ``scores.parquet``; see its schema for units.
 
-    ``egvs_se`` and ``beats_next`` are None where no standard errors were computed.
+    ``egvs_se`` and ``beats_next`` are None where no standard errors were computed, longitude and latitude where nobody
+    knows where the world frame lies.
     """
 
     pole: str
@@ -36,6 +37,8 @@ class ScoredSite(MapSite):
     entropy_seen: float
     egvs_se: float | None = None
     beats_next: float | None = None
+    longitude_deg: float | None = None
+    latitude_deg: float | None = None
 
     @classmethod
     def all_of(cls, scores: pa.Table) -> tuple[ScoredSite, ...]:
@@ -127,6 +130,11 @@ class Ranking:
     def has_errors(self) -> bool:
         """Whether standard errors were computed."""
         return self.sites[0].egvs_se is not None
+
+    @property
+    def is_located(self) -> bool:
+        """Whether longitude and latitude are known."""
+        return self.sites[0].latitude_deg is not None
 
     @cached_property
     def shared_ranks(self) -> set[int]:

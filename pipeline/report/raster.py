@@ -9,7 +9,8 @@ from __future__ import annotations
 import base64
 import math
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,23 +26,56 @@ _MOST_PIXELS = 240_000
 """A raster has no more; larger grids are averaged."""
 
 
-def field_images(values: ColumnValues, peak: float) -> Iterator[tuple[str, str]]:
-    """Class (``day`` for light pages, ``night`` for dark ones) and image of a field, on a square-root scale up to
-    ``peak``; nothing where that is 0.
+LOOKS = ("day", "night")
+"""Light pages and dark ones."""
+
+
+@dataclass(frozen=True)
+class IndexedImage:
+    """Rows of palette indices, the northernmost first: the parts of a PNG file but for the palette, so that a page may
+    join them to any.
     """
-    if not peak > 0:
-        return
+
+    head: bytes
+    data: bytes
+
+    @classmethod
+    def of(cls, index: NDArray[np.uint8]) -> IndexedImage:
+        """From (height, width) uint8."""
+        height, width = index.shape
+        rows = np.zeros((height, width + 1), dtype=np.uint8)  # each row starts with its filter: none
+        rows[:, 1:] = index
+        head = width.to_bytes(4, "big") + height.to_bytes(4, "big") + bytes((8, 3, 0, 0, 0))
+        return cls(b"\x89PNG\r\n\x1a\n" + _chunk(b"IHDR", head), _chunk(b"IDAT", _deflate(rows.tobytes())))
+
+    def uri(self, palette: bytes) -> str:
+        """The whole image as a data URI."""
+        data = self.head + palette + self.data + END
+        return f"data:image/png;base64,{base64.b64encode(data).decode('ascii')}"
+
+
+def field_image(values: ColumnValues, peak: float) -> IndexedImage:
+    """A field on a square-root scale up to ``peak``, above 0, for the palettes ``FIELD``."""
     share = np.sqrt(np.minimum(shrunk(values, np.mean) / peak, 1.0))
-    index = np.where(share > 0, 1 + np.floor(share * 253.999), 0).astype(np.uint8).T[::-1]
-    alpha = bytes([0, *(round(255 * opacity(i / 254)) for i in range(255))])
-    for look, stops in (("day", ON_LIGHT), ("night", ON_DARK)):
-        yield look, _png(index, b"\0\0\0" + b"".join(mixed(n, 254, stops) for n in range(255)), alpha)
+    return IndexedImage.of(np.where(share > 0, 1 + np.floor(share * 253.999), 0).astype(np.uint8).T[::-1])
 
 
-def shade_image(shaded: NDArray[np.bool_]) -> str:
-    """The image of a shade over columns of voxels, (nx, ny) bool; where columns share a pixel, all must be shaded."""
-    index = shrunk(shaded.astype(np.float64), np.min).T[::-1] > 0
-    return _png(index, bytes((*SHADE[:3], *SHADE[:3])), bytes((0, SHADE[3])))
+def shade_image(shaded: NDArray[np.bool_]) -> IndexedImage:
+    """A shade over columns of voxels, (nx, ny) bool, for ``SHADE_PALETTE``; where columns share a pixel, all must be
+    shaded.
+    """
+    return IndexedImage.of((shrunk(shaded.astype(np.float64), np.min).T[::-1] > 0).astype(np.uint8))
+
+
+def dots_image(points_m: NDArray[np.float64], box: tuple[float, float, float, float], across: int) -> IndexedImage:
+    """How many of some points, (n, 2), lie in each cell of ``box``, for the palettes ``DOTS``; ``across`` cells from
+    west to east. A cell's index is twice the count, up to 254.
+    """
+    cell_m = (box[2] - box[0]) / across
+    shape = across, max(1, round((box[3] - box[1]) / cell_m))
+    extents = ((box[0], box[2]), (box[1], box[3]))
+    counted, _, _ = np.histogram2d(points_m[:, 0], points_m[:, 1], bins=shape, range=extents)
+    return IndexedImage.of(np.minimum(2 * counted, 254).astype(np.uint8).T[::-1])
 
 
 def shrunk(values: ColumnValues, how: Callable[..., Any]) -> ColumnValues:
@@ -57,26 +91,31 @@ def shrunk(values: ColumnValues, how: Callable[..., Any]) -> ColumnValues:
     return smaller
 
 
-def _png(index: NDArray[Any], palette: bytes, alpha: bytes) -> str:
-    """Rows of palette indices, the northernmost first, as the data URI of a PNG image."""
-    height, width = index.shape
-    rows = np.zeros((height, width + 1), dtype=np.uint8)  # each row starts with its filter: none
-    rows[:, 1:] = index
-    head = width.to_bytes(4, "big") + height.to_bytes(4, "big") + bytes((8, 3, 0, 0, 0))
-    chunks = (
-        (b"IHDR", head),
-        (b"PLTE", palette),
-        (b"tRNS", alpha),
-        (b"IDAT", _deflate(rows.tobytes())),
-        (b"IEND", b""),
-    )
-    data = b"\x89PNG\r\n\x1a\n" + b"".join(
-        len(body).to_bytes(4, "big") + name + body + zlib.crc32(name + body).to_bytes(4, "big") for name, body in chunks
-    )
-    return f"data:image/png;base64,{base64.b64encode(data).decode('ascii')}"
+def _chunk(name: bytes, body: bytes) -> bytes:
+    return len(body).to_bytes(4, "big") + name + body + zlib.crc32(name + body).to_bytes(4, "big")
+
+
+def _palette(colours: bytes, alpha: bytes) -> bytes:
+    return _chunk(b"PLTE", colours) + _chunk(b"tRNS", alpha)
+
+
+def _field_palette(stops: Sequence[str]) -> bytes:
+    alpha = bytes([0, *(round(255 * opacity(i / 254)) for i in range(255))])
+    return _palette(b"\0\0\0" + b"".join(mixed(n, 254, stops) for n in range(255)), alpha)
+
+
+def _dots_palette(ink: str) -> bytes:
+    """One colour, the denser the more points: a single one is visible."""
+    return _palette(bytes.fromhex(ink) * 256, bytes([0, *(min(255, 110 + 12 * i) for i in range(255))]))
 
 
 def _deflate(data: bytes) -> bytes:
     """A zlib stream from Arrow's compressor, which comes with the package: the system's may give other bytes."""
     gzip: bytes = pa.Codec("gzip", compression_level=6).compress(data, asbytes=True)
     return b"\x78\x9c" + gzip[10:-8] + zlib.adler32(data).to_bytes(4, "big")
+
+
+END = _chunk(b"IEND", b"")
+FIELD = {"day": _field_palette(ON_LIGHT), "night": _field_palette(ON_DARK)}
+DOTS = {"day": _dots_palette("1d2430"), "night": _dots_palette("e6e9ef")}
+SHADE_PALETTE = _palette(bytes((*SHADE[:3], *SHADE[:3])), bytes((0, SHADE[3])))

@@ -25,7 +25,7 @@ def headline(ranking: Ranking, has_traffic: bool) -> str:
         few = len(best) <= 4
         names = ", ".join(s.site for s in best[:-1]) if few else f"{top.site} and {len(best) - 2} others"
         return f"{names} and {best[-1].site} share the first place of {others + 1}: {top.site} {sees}"
-    return f"{top.site} is the best of {others + 1} sites: it {sees}"
+    return f"{top.site} is the best of {others + 1} sites"
 
 
 def lead(ranking: Ranking) -> str:
@@ -44,6 +44,30 @@ def lead(ranking: Ranking) -> str:
         more = f" and {len(ranking.close) - 4} more" if len(ranking.close) > 4 else ""
         text += f" Within {CLOSE:.0%} of the best are {len(ranking.close)} others: {names}{more}."
     return text
+
+
+def which_to_trust(ranking: Ranking) -> str:
+    """What entropy seen says beside the score, and which of the two to trust where they disagree."""
+    top, most = ranking.best[0], max(ranking.sites, key=lambda site: site.entropy_seen)
+    if ranking.is_tie or not top.egvs > 0:
+        return ""
+    if most.entropy_seen - top.entropy_seen < 0.0005:
+        return f"It also sees most of the traffic’s uncertainty, {share(top.entropy_seen)}."
+    return (
+        f"{most.site}, rank {most.rank}, sees more of the traffic’s uncertainty ({share(most.entropy_seen)} against "
+        f"{share(top.entropy_seen)}), but with fewer beams on it: trust the score, which the ranking follows. A voxel "
+        f"counts as seen from one beam on, and one beam detects no vehicle."
+    )
+
+
+def site_caption(site: ScoredSite, voxels_seen: int, voxels: int) -> str:
+    """One site in numbers."""
+    return (
+        f"{site.site}: rank {site.rank}, EGVS {whole(site.egvs)} bit, {plain(site.z_m)} m above the ground at "
+        f"x = {plain(site.x_m)} m, y = {plain(site.y_m)} m, with a {site.sensor}. It sees {whole(voxels_seen)} of {whole(voxels)} uncertain "
+        f"voxels. {whole(site.returns)} of its {whole(site.beams_in_roi)} beams towards the region end on the ground "
+        f"or on what stands there."
+    )
 
 
 def share_of_limit(site: ScoredSite) -> float | None:
@@ -65,6 +89,11 @@ def whole(value: float) -> str:
 def plain(value: float) -> str:
     """A number as a person would write it."""
     return f"{value:,.2f}".rstrip("0").rstrip(".")
+
+
+def degrees(value: float) -> str:
+    """A longitude or latitude, to about a decimetre."""
+    return f"{value:.6f}"
 
 
 def duration(seconds: float) -> str:
