@@ -154,7 +154,8 @@ class Plan:
             f'<text x="{centre:.1f}" y="{base + 34:.1f}" class="title" text-anchor="middle">x, east (m)</text>'
         )
         texts.append(
-            f'<text transform="translate({side:.1f} {middle:.1f}) rotate(-90)" class="title" text-anchor="middle">y, north (m)</text>'
+            f'<text class="title" transform="translate({side:.1f} {middle:.1f}) rotate(-90)" text-anchor="middle">'
+            "y, north (m)</text>"
         )
         return f'<path class="grid" d="{"".join(lines)}"/><path class="axis" d="{"".join(ticks)}"/>{"".join(texts)}'
 

@@ -64,8 +64,9 @@ def site_caption(site: ScoredSite, voxels_seen: int, voxels: int) -> str:
     """One site in numbers."""
     return (
         f"{site.site}: rank {site.rank}, EGVS {whole(site.egvs)} bit, {plain(site.z_m)} m above the ground at "
-        f"x = {plain(site.x_m)} m, y = {plain(site.y_m)} m, with a {site.sensor}. It sees {whole(voxels_seen)} of {whole(voxels)} uncertain "
-        f"voxels. {whole(site.returns)} of its {whole(site.beams_in_roi)} beams towards the region end on the ground "
+        f"x = {plain(site.x_m)} m, y = {plain(site.y_m)} m, with a {site.sensor}. "
+        f"It sees {whole(voxels_seen)} of {whole(voxels)} uncertain voxels. "
+        f"{whole(site.returns)} of its {whole(site.beams_in_roi)} beams towards the region end on the ground "
         f"or on what stands there."
     )
 

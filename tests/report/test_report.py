@@ -24,8 +24,10 @@ from pipeline.report import map_frame, maps, raster
 from pipeline.report import page as report
 from pipeline.report.figures import Figures
 from pipeline.report.map_frame import MapSite
+from pipeline.report.maps import Backdrop
 from pipeline.report.outlines import outlines_of
 from pipeline.report.ranking import Ranking
+from pipeline.report.roads import Roads
 from pipeline.scenario.effects import EffectsModel
 from pipeline.scenario.loading import from_values
 from pipeline.scoring.egvs import EntropyField
@@ -43,6 +45,7 @@ NASTY = '<b>&"x'
 SITES = [("north", 6, 9, 2), ("south", 6, -1, 2), (NASTY, 6, -1, 3), ("west", -2, 4, 1.5)]
 SENSOR = {"elevations_deg": [-40, 0], "channels": 6, "azimuth_step_deg": 3, "range_m": 60}
 FRAMES = 40
+PLAIN = Backdrop((), Roads())
 VOID = {"meta", "br", "link", "img", "input", "hr"}
 
 
@@ -196,14 +199,15 @@ def test_it_is_well_formed_and_its_ids_are_unique(made):
 def test_it_fetches_nothing(made):
     read = Reader(made[2])
     assert read.fetched and all(value.startswith("data:image/png;base64,") for value in read.fetched)
-    assert {tag for tag, _ in read.tags}.isdisjoint({"script", "link", "iframe", "object", "embed", "base", "form"})
+    assert {tag for tag, _ in read.tags}.isdisjoint({"link", "iframe", "object", "embed", "base", "form"})
     assert "http://" not in made[2] and "https://" not in made[2] and "@import" not in made[2]
     assert all(target.startswith("#") for target in re.findall(r"url\(([^)]*)\)", made[2]))
 
 
 def test_what_users_wrote_is_escaped_and_comes_through(made):
     text = made[2]
-    assert NASTY not in text and "<script" not in text and "<i>late" not in text
+    assert NASTY not in text and "<i>late" not in text
+    assert re.findall("<script[^>]*>", text) == ['<script type="application/json" id="site-data">', "<script>"]
     read = Reader(text)
     assert any(f"|{NASTY}|" in row for row in read.rows)
     assert "<script>alert(1)</script>" in read.text and "<i>late</i>" in read.text
@@ -211,7 +215,7 @@ def test_what_users_wrote_is_escaped_and_comes_through(made):
 
 def test_every_figure_says_what_it_shows(made):
     drawn = [values for tag, values in Reader(made[2]).tags if tag == "svg"]
-    assert len(drawn) == 7
+    assert len(drawn) == 9
     assert all(values["role"] == "img" and values["aria-label"] for values in drawn)
     rows = read_scores(made[1] / "scores.parquet").to_pylist()
     best = next(row for row in rows if row["rank"] == 1)
@@ -291,7 +295,7 @@ def test_ranking_holds_every_site_and_equal_scores_share_a_rank(tmp_path):
 def test_headline_names_the_best_and_its_lead(made):
     rows = sorted(read_scores(made[1] / "scores.parquet").to_pylist(), key=lambda row: row["rank"])
     text = Reader(made[2]).text
-    assert f"{rows[0]['site']} is the best of 4 sites: it sees {rows[0]['entropy_seen']:.1%}" in text
+    assert f"{rows[0]['site']} is the best of 4 sites" in text
     assert f"leads {rows[1]['site']}, the next, by {1 - rows[1]['egvs'] / rows[0]['egvs']:.1%}" in text
 
 
@@ -331,7 +335,7 @@ def test_effects_are_named_and_no_longer_left_out(made):
     assert "Effects none" in Reader(text).text and "fog" in text
     foggy = about.with_effects(EffectsModel.of({"fog": {"visibility_m": 100}, "moving_occlusion": {}}))
     ranking, tpog = Ranking.read(out / "scores.parquet"), read_tpog(out / "tpog.parquet")
-    shown = report.page(foggy, ranking, tpog, Figures("", "", (), "", ()), {}, None)
+    shown = report.page(foggy, ranking, tpog, Figures("", "", None, Backdrop((), Roads())), {}, None)
     assert "this run models fog, moving occlusion. Left out are rain, " in Reader(shown).text
 
 
@@ -342,7 +346,7 @@ def test_one_site(tmp_path):
     text = page(*finished(tmp_path, sites=SITES[:1]))
     read = Reader(text)
     assert "north, the only site, sees" in read.text
-    assert sum(tag == "svg" for tag, _ in read.tags) == 5
+    assert sum(tag == "svg" for tag, _ in read.tags) == 6
 
 
 def test_no_traffic(tmp_path):
@@ -397,7 +401,7 @@ def test_five_hundred_sites(tmp_path):
     assert len(shown) == 35 and "465 more sites" in read.text
     assert f"|{rows[-1]['site']}|" in shown[-1]
     assert len(text) < 2_000_000
-    titles = [t for t in read.texts if "rank" in t and "EGVS" in t]
+    titles = [t for t in read.texts if "rank" in t and "EGVS" in t and "height" in t]
     assert len({name for title in titles for name in re.findall(r"g\d{3}", title)}) == 500, (
         "each tells its name on the map"
     )
@@ -427,7 +431,7 @@ def test_north_is_up_and_east_is_right():
     grid = Grid((0.0, 0.0, 0.0), 1.0, (4, 3, 1))
     field = np.zeros((4, 3))
     field[3, 2], field[0, 0] = 4.0, 1.0
-    drawn = maps.occupancy(grid, field, "voxels", (), [MapSite("a", 0, 0, 1, 1.0, 1)], "")
+    drawn = maps.occupancy(grid, field, "voxels", PLAIN, [MapSite("a", 0, 0, 1, 1.0, 1)], "")
     for png in re.findall(r'href="([^"]+)"', drawn):
         index = decoded(png)
         assert index.shape == (3, 4) and index[0, 3] == 254 and index[2, 0] == 1 + 253.999 // 2
@@ -444,7 +448,7 @@ def test_large_grids_are_averaged():
 def test_names_do_not_hide_one_another():
     candidates = [MapSite(f"c{n:02}", 5.0 * n, 50.0, 2.0, 100.0 - n, n + 1) for n in range(8)]
     grid = Grid((0.0, 0.0, 0.0), 0.5, (200, 100, 4))
-    drawn = maps.site_map(grid, np.zeros((200, 100)), (), candidates, "")
+    drawn = maps.site_map(grid, np.zeros((200, 100)), PLAIN, candidates, "")
     labels = [(float(x), float(y)) for x, y in re.findall(r'class="label" x="([\d.]+)" y="([\d.]+)"', drawn)]
     assert len(labels) == 8
     for i, (x, y) in enumerate(labels):
@@ -458,8 +462,8 @@ def test_sites_at_one_place_are_rings_and_the_best_is_inside():
         MapSite("high", 5.0, 5.0, 4.0, 20.0, 1),
         MapSite("else", 9.0, 9.0, 4.0, 5.0, 3),
     ]
-    drawn = maps.site_map(Grid((0.0, 0.0, 0.0), 0.5, (20, 20, 4)), np.zeros((20, 20)), (), candidates, "")
-    both = re.search(r'<g class="site first">.*?</g>', drawn).group()
+    drawn = maps.site_map(Grid((0.0, 0.0, 0.0), 0.5, (20, 20, 4)), np.zeros((20, 20)), PLAIN, candidates, "")
+    both = re.search(r'<g class="site first"[^>]*>.*?</g>', drawn).group()
     radii = [(float(r), int(q)) for q, r in re.findall(r'class="q(\d+)".*?r="([\d.]+)"', both)]
     assert len(radii) == 2 and radii[0][0] > radii[1][0] and radii[1][1] == 16
     assert "high, low" in drawn and "height 4 m; low" in both
