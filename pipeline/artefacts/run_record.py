@@ -13,8 +13,8 @@ from pipeline.core.errors import InputError
 
 RECORD = "run.json"
 
-STAGES = ("statics", "scan", "traffic", "tpog", "score", "report")
-"""In the order of running; the quick branch comes first, so that a site in a wall is told before SUMO runs."""
+STAGES = ("check", "statics", "scan", "traffic", "tpog", "score", "report")
+"""In the order of running: what can be refused is refused first; the quick branch comes before SUMO runs."""
 
 
 @dataclass(frozen=True)

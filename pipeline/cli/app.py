@@ -94,6 +94,19 @@ def run(
 
 
 @app.command()
+def check(scenario: ScenarioPath, set_: Set = None) -> None:
+    """Is the scenario sound? Everything that can be told before a run, at once; writes nothing."""
+    from pipeline.checks import checking
+    from pipeline.cli import results
+    from pipeline.scenario.loading import load
+
+    checked = checking.check(load(scenario, set_ or ()))
+    results.print_check(checked)
+    if checked.errors:
+        raise typer.Exit(InputError.exit_code)
+
+
+@app.command()
 def traffic(
     scenario: ScenarioPath,
     out: Out = None,

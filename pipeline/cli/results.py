@@ -15,6 +15,7 @@ from pipeline.cli.terminal import NARROW, WIDE, console, in_words, table, value_
 from pipeline.report.ranking import ScoredSite, poles_of
 
 if TYPE_CHECKING:
+    from pipeline.checks.checking import Checked
     from pipeline.importers.openstreetmap import NewScenario
 
 _FILE_WIDTH = 150
@@ -91,6 +92,22 @@ def print_verification(folder: Path, differences: list[str]) -> None:
     well = ["every artefact is as the run made it, and a second run makes the same bytes"]
     for line in differences or well:
         console(_FILE_WIDTH).print(f"{folder}: {line}", markup=False)
+
+
+def print_check(checked: Checked) -> None:
+    """All findings, errors first, those of one rule together."""
+    out = console(_FILE_WIDTH)
+    for what, findings in (("error", checked.errors), ("warning", checked.warnings)):
+        if findings:
+            out.print(f"{len(findings)} {what}{'s' if len(findings) > 1 else ''}")
+        for rule in dict.fromkeys(finding.rule for finding in findings):
+            out.print(f"  {rule}", markup=False)
+            for finding in findings:
+                if finding.rule == rule:
+                    out.print(f"    {finding}", markup=False)
+    if not checked.findings:
+        out.print("nothing found")
+    out.print(f"{checked.sites} sites, {checked.solids} solids and {checked.lanes} lanes held against one another")
 
 
 def print_new_scenario(made: NewScenario) -> None:

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from pipeline.core.errors import EgvsError
+from pipeline.core.errors import InputError
 
 WARNINGS = "warnings"
 """The key of a stage's summary that holds its warnings."""
@@ -43,6 +43,11 @@ class Finding:
     def __str__(self) -> str:
         return f"{self.place}: {self.found}" + (f"; {self.cure}" if self.cure else "")
 
+    @classmethod
+    def of(cls, rule: str, error: InputError) -> Finding:
+        """What a refusal says, as an error among others."""
+        return cls(rule, error.place, error.found, error.right, is_error=True)
+
     def to_json(self) -> dict[str, Any]:
         """As a stage's summary holds it."""
         return asdict(self)
@@ -53,11 +58,9 @@ def warnings_of(summaries: Iterable[Mapping[str, Any]]) -> list[Finding]:
     return [Finding(**value) for summary in summaries for value in summary.get(WARNINGS, ())]
 
 
-class FindingsError(EgvsError):
-    """What was found forbids the run; all errors at once."""
-
-    exit_code = 2
+class FindingsError(InputError):
+    """What was found forbids the run; all errors at once. There is at least one."""
 
     def __init__(self, findings: Iterable[Finding]) -> None:
-        self.findings = tuple(findings)
-        super().__init__("\n".join(map(str, self.findings)))
+        self.findings = first, *others = tuple(findings)
+        super().__init__(first.place, first.found, "\n".join([first.cure, *map(str, others)]))

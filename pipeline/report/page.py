@@ -33,7 +33,7 @@ from pipeline.stages.shared.scene import scan_inputs
 NAME = "report"
 ARTEFACTS = ("report.html",)
 
-STAGES = ("traffic", "statics", "tpog", "scan", "score")
+STAGES = ("check", "traffic", "statics", "tpog", "scan", "score")
 """Those whose costs and artefacts the page shows, in its order."""
 
 LISTED, FIRST, LAST = 40, 30, 5

@@ -62,8 +62,8 @@ def program(stage: str, scenario: Scenario, loaded: tuple[str, ...] = ()) -> dic
     }
 
 
-_ASKS = {"score": ("scan", "score"), "report": ("scan", "score")}
-"""Score casts, and the report marches, what the scan does: both ask its effects as well."""
+_ASKS = {"check": ("traffic", "scan", "score"), "score": ("scan", "score"), "report": ("scan", "score")}
+"""Score casts, and the report marches, what the scan does: both ask its effects as well. The check asks all."""
 
 
 def _data(stage: str) -> list[Path]:

@@ -12,8 +12,8 @@ from pipeline.core import files
 from pipeline.core.cost import Cost, measured
 from pipeline.stages.base import StageInputs, Summary, Workspace
 
-RANKING = STAGES[:-1]
-"""What a ranking takes; the report is left out."""
+RANKING = STAGES[1:-1]
+"""What a ranking takes; the check and the report are left out."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,8 @@ def module_of(stage: str) -> ModuleType:
     """A stage's module, imported when it is needed (``--help`` stays quick)."""
     module: ModuleType
     match stage:
+        case "check":
+            from pipeline.stages import check as module
         case "statics":
             from pipeline.stages import statics as module
         case "scan":

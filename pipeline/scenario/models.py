@@ -128,6 +128,10 @@ class SitesModel(StrictModel):
     file: str | None = Field(None, description="CSV (site, x_m, y_m, z_m, ...) or GeoJSON points")
     grid: SiteGrid | None = None
     along: tuple[SiteLine, ...] = ()
+    only_free: bool = Field(
+        True,
+        description="Drop those places of grid and along that stand in a lane or in a solid",
+    )
     points: str | None = Field(
         None, description="A measured empty scan (PCD, PLY, LAS, LAZ, CSV; world frame) of the only site"
     )

@@ -35,7 +35,7 @@ def check(scene: Scene, pose: Pose, sensor: Sensor, place: str) -> None:
             f"stands {far_m:.1f} m from the region of interest",
             f"within the {sensor.range_m:g} m of {sensor.name}",
         )
-    inside = _solid_round(scene.world, pose, over)
+    inside = _solid_among(scene.world, pose, over)
     if inside is not None:
         name, kind = scene.world.solids[inside]
         raise InputError(
@@ -65,7 +65,12 @@ def _ground_m(world: World, pose: Pose, over: NDArray[np.int64]) -> float:
     return 0.0
 
 
-def _solid_round(world: World, pose: Pose, over: NDArray[np.int64]) -> int | None:
+def solid_round(world: World, pose: Pose) -> int | None:
+    """The first solid that a sensor stands in, as a position in ``world.solids``; not one whose surface it is on."""
+    return _solid_among(world, pose, _faces_round(world, pose))
+
+
+def _solid_among(world: World, pose: Pose, over: NDArray[np.int64]) -> int | None:
     """The first solid that a sensor stands in, by its winding number; not one whose surface it stands on."""
     at = np.asarray(pose.position_m)
     totals = np.zeros(len(world.solids), dtype=np.int64)

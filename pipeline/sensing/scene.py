@@ -54,6 +54,8 @@ class Scene:
         The named effects of the scan and score stages that can change a result here, in the order in which they act.
     idle
         The named effects of these stages that provably change nothing here.
+    dropped
+        Candidates of a rule that no pole can stand for, each with the reason.
     """
 
     scenario: Scenario
@@ -61,6 +63,7 @@ class Scene:
     sites: tuple[Site, ...]
     effects: tuple[LiveEffect, ...] = ()
     idle: tuple[IdleEffect, ...] = ()
+    dropped: tuple[tuple[Site, str], ...] = ()
 
     @property
     def roi(self) -> Roi:

@@ -9,8 +9,8 @@ from __future__ import annotations
 from pipeline.core import files
 from pipeline.effects import on_traffic
 from pipeline.stages.base import StageInputs, Summary, Workspace
+from pipeline.stages.shared.built import built
 from pipeline.traffic import sumo_folder
-from pipeline.world import static_world
 from pipeline.world.mesh import write_ply
 
 NAME = "statics"
@@ -40,7 +40,7 @@ def run(work: Workspace, inputs: StageInputs) -> Summary:
         needed).
     """
     ground = on_traffic.ground(work.scenario)
-    world, counts = static_world.build(work.scenario, ground, work.progress)
+    world, counts = built(work)
     write_ply(work.path(ARTEFACTS[0]), world, work.metadata(inputs, seeded=False))
     notes = {} if ground is None else {"notes": [f"{ground.NAME}: on, the ground follows the network's roads"]}
     return {"triangles": len(world.faces), "solids": len(world.solids), **counts.to_json(), **notes}

@@ -292,7 +292,7 @@ def _with_one_site(scenario: Scenario) -> Scenario:
     yaw_deg, pitch_deg, roll_deg = site.pose.angles_deg
     alone = {
         "file": None, "along": (), "points": None, "grid": here, "sensor": site.sensor, "heights_m": (), "aim": None,
-        "aim_m": None, "yaw_deg": yaw_deg, "pitch_deg": pitch_deg, "roll_deg": roll_deg,
+        "aim_m": None, "yaw_deg": yaw_deg, "pitch_deg": pitch_deg, "roll_deg": roll_deg, "only_free": False,
     }  # fmt: skip
     nothing_kept = scenario.score.model_copy(update={"keep_visibility": ()})
     return scenario.model_copy(update={"sites": scenario.sites.model_copy(update=alone), "score": nothing_kept})

@@ -13,14 +13,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.core import files
 from pipeline.core.errors import InputError
 from pipeline.formats import safe_xml
 
@@ -236,9 +237,24 @@ class Network:
 def read(path: Path, name: Path | None = None) -> Network:
     """Read a network; messages call it ``name`` where it is a copy of what the user named.
 
+    The same content under the same name is read once: the check, the ground and the traffic all ask for it.
+
     InputError when the file is no SUMO network, is damaged, or has no road.
     """
-    copy, path = path, name or path
+    return _read(_Named(name or path, path), files.sha256_of(path))
+
+
+@dataclass(frozen=True)
+class _Named:
+    """A file as messages call it, and where to read it, which does not count when two are compared."""
+
+    name: Path
+    copy: Path = field(compare=False)
+
+
+@lru_cache(maxsize=2)
+def _read(file: _Named, _content: str) -> Network:
+    copy, path = file.copy, file.name
     edges: list[Edge] = []
     connections: list[dict[str, str]] = []
     lane_links: list[tuple[str, str]] = []

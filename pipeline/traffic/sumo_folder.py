@@ -12,8 +12,10 @@ from __future__ import annotations
 
 import os
 import shutil
+import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
@@ -142,6 +144,19 @@ def network_path(scenario: Scenario) -> Path | None:
         return None
     config = scenario.find(traffic.sumocfg, "traffic.sumocfg")
     return next((config.parent / value for key, value in _options(config) if key == "net-file" and value), None)
+
+
+def roads(scenario: Scenario) -> network.Network | None:
+    """The network that a scenario simulates, a map of OpenStreetMap converted first; None of a finished file.
+
+    InputError when the scenario, its configuration or its network is wrong.
+    """
+    path = network_path(scenario)
+    if path is None or not network.is_osm(path):
+        return None if path is None else network.read(path)
+    with tempfile.TemporaryDirectory(prefix="egvs-roads-") as folder:
+        convert_osm(path, Path(folder) / NETWORK)
+        return network.read(Path(folder) / NETWORK, path)
 
 
 def may_have_heights(scenario: Scenario) -> bool:
@@ -325,12 +340,20 @@ def _copies(given: Sources, folder: Path, others: Iterable[str]) -> dict[str, st
 
 def convert_osm(path: Path, network_path: Path) -> None:
     """Turn a map of OpenStreetMap into a network; its world frame starts at the network's south-west corner."""
-    folder = network_path.parent
-    if osm.is_pbf(path):  # netconvert reads XML only
-        osm.write_xml(path, folder / MAP)
-        path = folder / MAP
-    source = os.path.relpath(path, folder)
-    sumo.run("netconvert", ["--osm-files", source, *_OSM_FLAGS, "-o", network_path.name], folder)
+    network_path.write_bytes(_converted(path, files.sha256_of(path)))
+
+
+@lru_cache(maxsize=1)
+def _converted(path: Path, _content: str) -> bytes:
+    """The network of a map, converted once for the check and the traffic."""
+    with tempfile.TemporaryDirectory(prefix="egvs-map-") as temporary:
+        folder = Path(temporary)
+        source = os.path.relpath(path, folder)
+        if osm.is_pbf(path):  # netconvert reads XML only
+            osm.write_xml(path, folder / MAP)
+            source = MAP
+        sumo.run("netconvert", ["--osm-files", source, *_OSM_FLAGS, "-o", NETWORK], folder)
+        return (folder / NETWORK).read_bytes()
 
 
 def _config_xml(options: Mapping[str, str]) -> str:

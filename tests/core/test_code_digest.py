@@ -18,7 +18,7 @@ import pipeline
 from pipeline.core import code_digest
 
 PACKAGE = Path(pipeline.__file__).parent
-STAGES = [f"pipeline.stages.{name}" for name in ("statics", "scan", "traffic", "tpog", "score")] + [
+STAGES = [f"pipeline.stages.{name}" for name in ("check", "statics", "scan", "traffic", "tpog", "score")] + [
     "pipeline.report.page"
 ]
 
@@ -92,11 +92,11 @@ def digests(folder: Path) -> list[str]:
 
 CHANGED = {
     "kernels/march.py": {"score", "page"},
-    "kernels/boxes.py": {"tpog", "scan", "score", "page"},  # whose depth of contact the other kernels share
+    "kernels/boxes.py": {"check", "tpog", "scan", "score", "page"},  # whose depth of contact the other kernels share
     "kernels/foliage.py": set(),  # an effect's
-    "kernels/rays.py": {"scan", "score", "page"},  # without kept scans, these two cast
-    "traffic/demand.py": {"statics", "traffic"},  # statics asks the network whether it has relief
-    "core/grid.py": {"statics", "scan", "traffic", "tpog", "score", "page"},
+    "kernels/rays.py": {"check", "scan", "score", "page"},  # without kept scans, these two cast
+    "traffic/demand.py": {"check", "statics", "traffic", "scan", "score", "page"},  # beside what reads the network
+    "core/grid.py": {"check", "statics", "scan", "traffic", "tpog", "score", "page"},
     "studies/accuracy.py": set(),
     "cli/app.py": set(),
     "__init__.py": set(),

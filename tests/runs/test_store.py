@@ -290,10 +290,10 @@ def test_what_was_used_longest_ago_goes_first(
     order = [entry.stage for entry in kept.entries()]
     assert order == ["traffic", *sorted(set(STAGES) - {"traffic"})]
     sizes = {entry.stage: entry.bytes for entry in kept.entries()}
-    removed = kept.prune(sizes["traffic"] + sizes["report"] + sizes["scan"])
+    removed = kept.prune(sum(sizes[stage] for stage in ("traffic", "check", "report", "scan")))
     assert [entry.stage for entry in removed] == ["tpog", "statics", "score"]
-    assert [entry.stage for entry in assert_whole(store)] == ["traffic", "report", "scan"]
-    assert len(kept.prune(-1)) == 3
+    assert [entry.stage for entry in assert_whole(store)] == ["traffic", "check", "report", "scan"]
+    assert len(kept.prune(-1)) == 4
     assert not assert_whole(store)
 
 
@@ -419,12 +419,12 @@ def test_a_run_says_what_it_fetched(done: tuple[pipeline.Scenario, Path], tmp_pa
 
 CHANGED_LINES = {
     "kernels/march.py": {"score", "report"},
-    "kernels/rays.py": {"scan", "score", "report"},
-    "kernels/solids.py": {"scan", "tpog", "score", "report"},
-    "sensing/sensors.py": {"scan", "score"},
+    "kernels/rays.py": {"check", "scan", "score", "report"},
+    "kernels/solids.py": {"check", "scan", "tpog", "score", "report"},
+    "sensing/sensors.py": {"check", "scan", "score"},
     "stages/traffic.py": {"traffic"},
-    "world/mesh.py": {"statics", "scan", "tpog", "score", "report"},
-    "effects/score/rain.py": {"score", "report"},
+    "world/mesh.py": {"check", "statics", "scan", "tpog", "score", "report"},
+    "effects/score/rain.py": {"check", "score", "report"},
     "effects/score/fog.py": set(),
     "formats/csv_points.py": {"scan"},
     "formats/pcd.py": set(),

@@ -90,11 +90,11 @@ def test_a_second_run_does_nothing_and_says_so(done: tuple[Path, Path], egvs) ->
 
 CHANGES = {
     "score.gamma=9": {"score", "report"},
-    "roi.voxel_m=0.25": {"tpog", "score", "report"},
+    "roi.voxel_m=0.25": {"check", "tpog", "score", "report"},
     "tpog.blocks=5": {"tpog", "score", "report"},
-    "sites.yaw_deg=3": {"scan", "score", "report"},
-    "traffic.frames=20": {"traffic", "tpog", "score", "report"},
-    "statics.ground=false": {"statics", "scan", "tpog", "score", "report"},
+    "sites.yaw_deg=3": {"check", "scan", "score", "report"},
+    "traffic.frames=20": {"check", "traffic", "tpog", "score", "report"},
+    "statics.ground=false": {"check", "statics", "scan", "tpog", "score", "report"},
 }
 
 
@@ -195,7 +195,7 @@ def test_a_single_stage_with_other_settings_leaves_no_mixed_record(done: tuple[P
     mini, out = done
     assert egvs("score", mini, "--out", out, "--set", "score.gamma=7", "--set", "sites.yaw_deg=5")[0] == 0
     code, _, said = egvs("verify", out)
-    assert (code, "the stage scan is not done" in said) == (2, True), said
+    assert (code, "the stage check is not done" in said) == (2, True), said
     assert egvs("run", mini, "--out", out)[0] == 0
     assert egvs("verify", out)[0] == 0
 
@@ -280,7 +280,7 @@ def test_a_record_of_an_earlier_version_is_one_of_nothing(done: tuple[Path, Path
         stage["said"] = stage.pop("summary")
         del stage["files"]
     (out / "run.json").write_text(json.dumps(record | {"effects": []}))
-    with pytest.raises(InputError, match="the stage statics is not done"):
+    with pytest.raises(InputError, match="the stage check is not done"):
         workflow.verify(out)
     assert set(states(pipeline.load(mini), out).values()) == {"fetched"}
     assert workflow.verify(out) == []

@@ -36,6 +36,8 @@ def scan_inputs(work: Workspace) -> StageInputs:
     }
     if live:
         settings["effects"] = registry.settings(live)
+    if scene.dropped:
+        settings["dropped"] = [site.name for site, _ in scene.dropped]
     hashes = work.digests(STATICS) | site_digests(scenario, scene.sites)
     readers = {point_clouds.reader_of(Path(s.points), f"site {s.name}: points") for s in scene.sites if s.points}
     return StageInputs(settings, hashes, modules=(*registry.modules(live), *sorted(readers)))

@@ -1,0 +1,1 @@
+"""Holds sites, solids, region of interest, lanes, traffic and sensors against one another before anything is run."""

@@ -1,0 +1,70 @@
+"""Holds a scenario's sites, solids, region of interest, lanes, traffic and sensors against one another.
+
+:func:`check` reads what the scenario names once, asks every rule, and gives all findings at once, errors first. Nothing
+is simulated, cast or written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from pipeline.checks import region, sensing, sites, solids, traffic
+from pipeline.checks.subject import Subject, build_world, gather
+from pipeline.core.findings import Finding
+from pipeline.scenario.models import Scenario
+from pipeline.world.mesh import World
+
+RULES: tuple[Callable[[Subject], Iterator[Finding]], ...] = (
+    region.voxels, region.lanes, traffic.times, traffic.kinds, sensing.known, sensing.complete,
+    sites.standing, sites.on_lanes, sites.dropped, sites.unmet, solids.over_lanes, solids.far_away,
+)  # fmt: skip
+"""In the order in which findings are told. A further rule is a function here."""
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What a check found, and how much was held against one another.
+
+    Attributes
+    ----------
+    findings
+        Errors first.
+    sites, solids, lanes
+        How many there are.
+    """
+
+    findings: tuple[Finding, ...]
+    sites: int
+    solids: int
+    lanes: int
+
+    @property
+    def errors(self) -> tuple[Finding, ...]:
+        """What must stop a run."""
+        return tuple(finding for finding in self.findings if finding.is_error)
+
+    @property
+    def warnings(self) -> tuple[Finding, ...]:
+        """What a planner has to know."""
+        return tuple(finding for finding in self.findings if not finding.is_error)
+
+
+def check(scenario: Scenario, world_of: Callable[[Scenario], World] = build_world) -> Checked:
+    """Ask every rule; ``world_of`` builds the static world.
+
+    Raises
+    ------
+    RunError
+        When a program that reads a file is not there or fails; what is wrong with the input is among the findings.
+    """
+    subject, refused = gather(scenario, world_of)
+    found = [*refused, *(finding for rule in RULES for finding in rule(subject))]
+    told = {(finding.place, finding.found): finding for finding in reversed(found)}  # the first of equals stays
+    once = [finding for finding in found if told[finding.place, finding.found] is finding]
+    return Checked(
+        tuple(sorted(once, key=lambda finding: not finding.is_error)),
+        len(subject.sites),
+        0 if subject.world is None else len(subject.world.solids),
+        0 if subject.carriageway is None else len(subject.carriageway.lanes),
+    )

@@ -1,0 +1,99 @@
+"""Rules for sites: where they stand, and whether their beams meet the region of interest."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.checks.subject import Subject
+from pipeline.core.errors import InputError
+from pipeline.core.findings import Finding
+from pipeline.kernels import rays
+from pipeline.sensing import placing, sensors
+from pipeline.sensing.sensors import Sensor
+from pipeline.sensing.sites import Site
+from pipeline.world import limits
+
+MOST_LISTED = 8
+"""So many sites get a line of their own; the others share one."""
+
+
+def standing(subject: Subject) -> Iterator[Finding]:
+    """An error for each site that is in a solid, below the ground, or out of its sensor's reach of the region."""
+    if subject.scene is None:
+        return
+    for site in subject.sites:
+        if (sensor := _sensor(subject, site)) is not None:
+            try:
+                placing.check(subject.scene, site.pose, sensor, f"site {site.name}")
+            except InputError as error:
+                yield Finding.of("sites", error)
+
+
+def on_lanes(subject: Subject) -> Iterator[Finding]:
+    """A warning for each named site that stands in a lane, unless it hangs over the road."""
+    if subject.carriageway is None or not subject.sites:
+        return
+    at_m = np.array([[site.pose.x_m, site.pose.y_m] for site in subject.sites])
+    found = []
+    for site, lane in zip(subject.sites, subject.carriageway.lanes_at(at_m), strict=True):
+        if lane is not None:
+            road_m = subject.carriageway.height_m(lane, np.array([site.pose.x_m, site.pose.y_m]))
+            if site.pose.z_m - road_m <= limits.CLEARANCE_M:
+                found.append((site, subject.carriageway.names[lane]))
+    cure = f"a place beside the road, or more than {limits.CLEARANCE_M:g} m above it"
+    for site, name in found[:MOST_LISTED]:
+        what = f"({site.pose.x_m:g}, {site.pose.y_m:g}, {site.pose.z_m:g}) stands in lane {name}"
+        yield Finding("sites on lanes", subject.site_place(site), what, cure)
+    if rest := found[MOST_LISTED:]:
+        names = ", ".join(site.name for site, _ in rest)
+        what = f"{len(rest)} more of {len(subject.sites)} stand in lanes: {names}"
+        yield Finding("sites on lanes", subject.site_place(rest[0][0]).partition(":")[0], what, cure)
+
+
+def dropped(subject: Subject) -> Iterator[Finding]:
+    """How many candidates of a rule are dropped, and why."""
+    if subject.scene is not None and (gone := subject.scene.dropped):
+        reasons = Counter(why for _, why in gone)
+        why = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
+        what = f"{len(gone)} of {len(gone) + len(subject.sites)} candidates are dropped, since no pole can stand there"
+        place = "sites.grid" if subject.scenario.sites.grid is not None else "sites.along"
+        yield Finding("dropped candidates", place, f"{what} ({why})", "name a sensor on a gantry in a file of sites")
+
+
+def unmet(subject: Subject) -> Iterator[Finding]:
+    """A warning where no beam of a sensor as mounted meets the region of interest."""
+    blind = []
+    for site in subject.sites:
+        sensor = None if site.points is not None else _sensor(subject, site)
+        if sensor is not None and not _meets(subject, site, sensor):
+            blind.append(site)
+    if blind:
+        names = ", ".join(site.name for site in blind[:MOST_LISTED]) + (", ..." if blind[MOST_LISTED:] else "")
+        what = f"no beam of {len(blind)} of {len(subject.sites)} sites meets the region of interest: {names}"
+        yield Finding("beams beside the region", "sites", what, "another yaw, pitch or place, or a sensor that sees it")
+
+
+def _meets(subject: Subject, site: Site, sensor: Sensor) -> bool:
+    box = subject.scenario.roi.box
+    ends = _directions(sensor, site.pose.angles_deg) * sensor.range_m
+    reaches = np.empty(len(ends), dtype=np.bool_)
+    rays.can_meet(np.subtract(site.pose.position_m, box.origin_m), ends, np.asarray(box.size_m), reaches)
+    return bool(reaches.any())
+
+
+@cache
+def _directions(sensor: Sensor, angles_deg: tuple[float, float, float]) -> NDArray[np.float64]:
+    return sensor.directions(*angles_deg)
+
+
+def _sensor(subject: Subject, site: Site) -> Sensor | None:
+    """A site's sensor; None where it is unknown, which is told elsewhere."""
+    try:
+        return sensors.resolve(site.sensor, subject.scenario.sensors, "")
+    except InputError:
+        return None

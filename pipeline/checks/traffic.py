@@ -1,0 +1,43 @@
+"""Rules for traffic: what can be known of it before it is simulated."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from pipeline.checks.subject import Refusals, Subject
+from pipeline.core.errors import InputError
+from pipeline.core.findings import Finding
+from pipeline.traffic import demand, sumo, sumo_folder
+
+
+def times(subject: Subject) -> Iterator[Finding]:
+    """An error where times do not fit SUMO's step, or its configuration is wrong."""
+    scenario, refusals = subject.scenario, Refusals()
+    place = sumo_folder.place_of(scenario)
+    if scenario.traffic.fcd is None:
+        given = refusals.unless_refused("traffic", lambda: sumo_folder.sources(scenario))
+        begin_s = 0.0 if given is None else given.begin_s
+        refusals.unless_refused("traffic", lambda: sumo_folder.timing(scenario.traffic, begin_s, place))
+    yield from refusals.found
+
+
+def kinds(subject: Subject) -> Iterator[Finding]:
+    """An error for each kind of vehicle that SUMO or the network does not admit, and for each unknown edge."""
+    traffic, place = subject.scenario.traffic, sumo_folder.place_of(subject.scenario)
+    if traffic.network is None or traffic.routes:
+        return
+    for kind in traffic.kinds:
+        try:
+            demand.check_kinds([kind], sumo.vehicle_classes(), place)
+        except InputError as error:
+            yield Finding.of("traffic", error)
+    if subject.network is None:
+        return
+    edges = {edge.id for edge in subject.network.edges}
+    for unknown in sorted(traffic.edge_weights.keys() - edges):
+        found = f"the network has no edge {unknown!r}"
+        yield Finding("traffic", f"{place}.edge_weights", found, "the id of an edge", is_error=True)
+    for kind in traffic.kinds:
+        if not any(edge.lanes_for(kind.vclass) for edge in subject.network.edges):
+            found = f"kind {kind.name!r} (vClass {kind.vclass}) may use no lane of the network"
+            yield Finding("traffic", f"{place}.kinds", found, "a kind that the network admits", is_error=True)

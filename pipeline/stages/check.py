@@ -1,0 +1,48 @@
+"""The check stage: what can be refused is refused before anything costly, and doubts are told; it writes no file.
+
+Steps: read what the scenario names; ask every rule (:mod:`pipeline.checks.checking`). All errors stop the run at once;
+warnings stay in the stage's summary.
+"""
+
+from __future__ import annotations
+
+from pipeline.checks import checking, files
+from pipeline.core.findings import WARNINGS, FindingsError
+from pipeline.stages.base import StageInputs, Summary, Workspace
+from pipeline.stages.shared.built import built
+
+NAME = "check"
+ARTEFACTS = ()
+
+
+def inputs(work: Workspace) -> StageInputs:
+    """Every file by hash, and all settings but those of what comes of a run (:data:`UNREAD`)."""
+    scenario = work.scenario
+    hashes = files.digests(scenario)
+    settings = scenario.model_dump(mode="json", exclude=UNREAD)
+    settings["keep_visibility"] = scenario.score.keep_visibility
+    return StageInputs(settings, hashes)
+
+
+UNREAD = {"description", "extends", "seed", "tpog", "scan", "score"}
+
+
+def run(work: Workspace, inputs: StageInputs) -> Summary:
+    """Ask every rule.
+
+    Returns
+    -------
+    dict
+        ``sites`` (those that are scanned), ``solids`` and ``lanes`` that were held against one another; warnings.
+
+    Raises
+    ------
+    FindingsError
+        With all errors.
+    """
+    del inputs
+    checked = checking.check(work.scenario, lambda _: built(work)[0])
+    if checked.errors:
+        raise FindingsError(checked.errors)
+    counts = {"sites": checked.sites, "solids": checked.solids, "lanes": checked.lanes}
+    return {**counts, WARNINGS: [finding.to_json() for finding in checked.warnings]}
