@@ -1,4 +1,4 @@
-"""Rules for the region of interest: its voxels fit, and lanes lead through it."""
+"""Rules for the region of interest: lanes lead through it."""
 
 from __future__ import annotations
 
@@ -7,17 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from pipeline.checks.subject import Subject
-from pipeline.core.errors import InputError
 from pipeline.core.findings import Finding
 from pipeline.world import limits
-
-
-def voxels(subject: Subject) -> Iterator[Finding]:
-    """An error where the region is no whole number of voxels."""
-    try:
-        _ = subject.scenario.roi.grid
-    except InputError as error:
-        yield Finding.of("region", error)
 
 
 def lanes(subject: Subject) -> Iterator[Finding]:

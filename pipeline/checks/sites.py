@@ -22,21 +22,36 @@ MOST_LISTED = 8
 """So many sites get a line of their own; the others share one."""
 
 
-def standing(subject: Subject) -> Iterator[Finding]:
-    """An error for each site that is in a solid, below the ground, or out of its sensor's reach of the region."""
+def poses(subject: Subject) -> Iterator[Finding]:
+    """An error for each site that is in a solid, below the ground, or out of its sensor's reach of the region.
+
+    A warning where no beam of a sensor as mounted meets the region.
+    """
+    blind = []
     if subject.scene is None:
         return
     for site in subject.sites:
-        if (sensor := _sensor(subject, site)) is not None:
-            try:
-                placing.check(subject.scene, site.pose, sensor, f"site {site.name}")
-            except InputError as error:
-                yield Finding.of("sites", error)
+        try:
+            sensor = sensors.resolve(site.sensor, subject.scenario.sensors, "")
+        except InputError:
+            continue  # told elsewhere
+        try:
+            placing.check(subject.scene, site.pose, sensor, f"site {site.name}")
+        except InputError as error:
+            yield Finding.of("sites", error)
+            continue
+        if site.points is None and not _meets(subject, site, sensor):
+            blind.append(site.name)
+    if blind:
+        names = ", ".join(blind[:MOST_LISTED]) + (", ..." if blind[MOST_LISTED:] else "")
+        what = f"no beam of {len(blind)} of {len(subject.sites)} sites meets the region of interest: {names}"
+        yield Finding("beams beside the region", "sites", what, "another yaw, pitch or place, or a sensor that sees it")
 
 
 def on_lanes(subject: Subject) -> Iterator[Finding]:
     """A warning for each named site that stands in a lane, unless it hangs over the road."""
-    if subject.carriageway is None or not subject.sites:
+    model = subject.scenario.sites
+    if subject.carriageway is None or not subject.sites or (model.file is None and model.only_free):
         return
     at_m = np.array([[site.pose.x_m, site.pose.y_m] for site in subject.sites])
     found = []
@@ -65,19 +80,6 @@ def dropped(subject: Subject) -> Iterator[Finding]:
         yield Finding("dropped candidates", place, f"{what} ({why})", "name a sensor on a gantry in a file of sites")
 
 
-def unmet(subject: Subject) -> Iterator[Finding]:
-    """A warning where no beam of a sensor as mounted meets the region of interest."""
-    blind = []
-    for site in subject.sites:
-        sensor = None if site.points is not None else _sensor(subject, site)
-        if sensor is not None and not _meets(subject, site, sensor):
-            blind.append(site)
-    if blind:
-        names = ", ".join(site.name for site in blind[:MOST_LISTED]) + (", ..." if blind[MOST_LISTED:] else "")
-        what = f"no beam of {len(blind)} of {len(subject.sites)} sites meets the region of interest: {names}"
-        yield Finding("beams beside the region", "sites", what, "another yaw, pitch or place, or a sensor that sees it")
-
-
 def _meets(subject: Subject, site: Site, sensor: Sensor) -> bool:
     box = subject.scenario.roi.box
     ends = _directions(sensor, site.pose.angles_deg) * sensor.range_m
@@ -89,11 +91,3 @@ def _meets(subject: Subject, site: Site, sensor: Sensor) -> bool:
 @cache
 def _directions(sensor: Sensor, angles_deg: tuple[float, float, float]) -> NDArray[np.float64]:
     return sensor.directions(*angles_deg)
-
-
-def _sensor(subject: Subject, site: Site) -> Sensor | None:
-    """A site's sensor; None where it is unknown, which is told elsewhere."""
-    try:
-        return sensors.resolve(site.sensor, subject.scenario.sensors, "")
-    except InputError:
-        return None

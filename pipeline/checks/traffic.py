@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from pipeline.checks.subject import Refusals, Subject
 from pipeline.core.errors import InputError
 from pipeline.core.findings import Finding
-from pipeline.traffic import demand, sumo, sumo_folder
+from pipeline.traffic import sumo, sumo_folder
+from pipeline.traffic.demand import trips
 
 
 def times(subject: Subject) -> Iterator[Finding]:
@@ -28,7 +29,7 @@ def kinds(subject: Subject) -> Iterator[Finding]:
         return
     for kind in traffic.kinds:
         try:
-            demand.check_kinds([kind], sumo.vehicle_classes(), place)
+            trips.check_kinds([kind], sumo.vehicle_classes(), place)
         except InputError as error:
             yield Finding.of("traffic", error)
     if subject.network is None:

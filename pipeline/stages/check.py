@@ -16,15 +16,15 @@ ARTEFACTS = ()
 
 
 def inputs(work: Workspace) -> StageInputs:
-    """Every file by hash, and all settings but those of what comes of a run (:data:`UNREAD`)."""
+    """Every file by hash, and all settings but voxels and those of what comes of a run (:data:`UNREAD`)."""
     scenario = work.scenario
     hashes = files.digests(scenario)
-    settings = scenario.model_dump(mode="json", exclude=UNREAD)
+    settings = scenario.model_dump(mode="json", exclude={**dict.fromkeys(UNREAD, True), "roi": {"voxel_m"}})
     settings["keep_visibility"] = scenario.score.keep_visibility
     return StageInputs(settings, hashes)
 
 
-UNREAD = {"description", "extends", "seed", "tpog", "scan", "score"}
+UNREAD = ("description", "extends", "seed", "tpog", "scan", "score")
 
 
 def run(work: Workspace, inputs: StageInputs) -> Summary:

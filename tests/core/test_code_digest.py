@@ -95,7 +95,7 @@ CHANGED = {
     "kernels/boxes.py": {"check", "tpog", "scan", "score", "page"},  # whose depth of contact the other kernels share
     "kernels/foliage.py": set(),  # an effect's
     "kernels/rays.py": {"check", "scan", "score", "page"},  # without kept scans, these two cast
-    "traffic/demand.py": {"check", "statics", "traffic", "scan", "score", "page"},  # beside what reads the network
+    "traffic/sumo_folder.py": {"check", "statics", "traffic", "scan", "score", "page"},  # beside what reads the network
     "core/grid.py": {"check", "statics", "scan", "traffic", "tpog", "score", "page"},
     "studies/accuracy.py": set(),
     "cli/app.py": set(),

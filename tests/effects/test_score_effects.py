@@ -519,7 +519,11 @@ def test_only_the_score_runs_again(mini: Path, tmp_path: Path) -> None:
 
     states()
     for settings in (["effects.rain.rate_mm_h=5"], ["effects.rain.rate_mm_h=9"], ON["dropout"], []):
-        assert {stage for stage, state in states(*settings).items() if state != "skipped"} == {"check", "score", "report"}
+        assert {stage for stage, state in states(*settings).items() if state != "skipped"} == {
+            "check",
+            "score",
+            "report",
+        }
     assert set(states().values()) == {"skipped"}
 
 

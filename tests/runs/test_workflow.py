@@ -90,7 +90,7 @@ def test_a_second_run_does_nothing_and_says_so(done: tuple[Path, Path], egvs) ->
 
 CHANGES = {
     "score.gamma=9": {"score", "report"},
-    "roi.voxel_m=0.25": {"check", "tpog", "score", "report"},
+    "roi.voxel_m=0.25": {"tpog", "score", "report"},
     "tpog.blocks=5": {"tpog", "score", "report"},
     "sites.yaw_deg=3": {"check", "scan", "score", "report"},
     "traffic.frames=20": {"check", "traffic", "tpog", "score", "report"},

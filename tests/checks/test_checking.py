@@ -1,0 +1,281 @@
+"""What a check says of sites, solids, region, lanes, traffic and sensors: each case by hand, with its message."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+import pipeline
+from pipeline.checks import checking
+from pipeline.core.errors import InputError
+from pipeline.core.findings import FindingsError
+from tests.checks.conftest import LANES, net_xml
+from tests.conftest import collection, feature
+
+
+def found(folder: Path, *settings: str) -> dict[str, list[str]]:
+    """What is found, by rule; errors as they are, warnings in brackets."""
+    told: dict[str, list[str]] = {}
+    for finding in checking.check(pipeline.load(folder, settings)).findings:
+        line = f"{finding.place}: {finding.found}".replace(f"{folder}/", "")
+        told.setdefault(finding.rule, []).append(line if finding.is_error else f"[{line}]")
+    return told
+
+
+def box(low: tuple[float, float], high: tuple[float, float], name: str = "kiosk", **more: object) -> dict:
+    (x0, y0), (x1, y1) = low, high
+    ring = [[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]]
+    return feature({"type": "Polygon", "coordinates": [ring]}, **{"name": name, "kind": "kiosk", "height_m": 3, **more})
+
+
+def sites(folder: Path, *rows: str) -> None:
+    (folder / "sites.csv").write_text("\n".join(["site,x_m,y_m,z_m", *rows]) + "\n")
+
+
+def statics(folder: Path, *features: dict) -> None:
+    (folder / "statics.geojson").write_text(collection(*features))
+
+
+def test_a_sound_scenario_has_no_finding(street: Path, mini: Path) -> None:
+    checked = checking.check(pipeline.load(street))
+    assert (checked.findings, checked.sites, checked.solids, checked.lanes) == ((), 2, 3, 2)
+
+
+def test_without_a_network_nothing_is_known_of_lanes(mini: Path) -> None:
+    checked = checking.check(pipeline.load(mini))
+    assert (checked.findings, checked.lanes) == ((), 0)
+
+
+# ---- sites
+
+
+def test_a_site_is_in_a_lane_when_it_is_deeper_in_it_than_a_quarter_metre(street: Path) -> None:
+    """Lanes of 3.2 m round y = +-1.6: from 0 to 3.2 m, so 2.94 is in one and 2.96 is not; 0 is the line between."""
+    sites(street, "in,10,2.94,3", "kerb,10,2.96,3", "middle,12,0,3", "walk,10,-4.2,3", "bicycles,10,4.2,3", "e,9,-1,3")
+    assert found(street) == {
+        "sites on lanes": [
+            "[sites.csv: site in: (10, 2.94, 3) stands in lane west_1]",
+            "[sites.csv: site e: (9, -1, 3) stands in lane east_1]",
+        ]
+    }
+
+
+def test_a_sensor_on_a_gantry_stands_in_nobodys_way(street: Path) -> None:
+    sites(street, "low,10,1.6,4.5", "high,10,1.6,4.51")
+    assert [line for lines in found(street).values() for line in lines] == [
+        "[sites.csv: site low: (10, 1.6, 4.5) stands in lane west_1]"
+    ]
+
+
+def test_the_height_over_the_road_counts(street: Path) -> None:
+    lifted = LANES.replace("80,1.60 -40,1.60", "80,1.60,4.00 -40,1.60,4.00").replace(
+        "-40,-1.60 80,-1.60", "-40,-1.60,4.00 80,-1.60,4.00"
+    )
+    (street / "net.net.xml").write_text(net_xml(lifted))
+    sites(street, "low,10,1.6,8.4", "high,10,1.6,8.6")
+    told = found(street, "roi.center_m=[20,0,6.5]")
+    assert [line.partition(" stands")[0] for line in told["sites on lanes"]] == ["[sites.csv: site low: (10, 1.6, 8.4)"]
+
+
+def test_many_sites_in_lanes_share_a_line(street: Path) -> None:
+    sites(street, *(f"s{i:02d},{i},1.6,3" for i in range(1, 13)))
+    lines = found(street)["sites on lanes"]
+    assert len(lines) == 9
+    assert lines[-1] == "[sites.csv: 4 more of 12 stand in lanes: s09, s10, s11, s12]"
+
+
+def rule(folder: Path, grid: str) -> None:
+    text = (folder / "scenario.toml").read_text()
+    (folder / "scenario.toml").write_text(text.replace('file = "sites.csv"', f"grid = {grid}"))
+
+
+def test_a_rule_drops_places_in_lanes_and_solids_and_says_how_many(street: Path) -> None:
+    """Rows at y = -6, -1, 4 and 9: the second is in a lane, whatever the height; of the last, one is in the house (from
+    x = 14 to 18, y = 5 to 8, made wider here), but not above it."""
+    statics(street, box((14, 5), (18, 10), "house", height_m=6))
+    rule(street, "{ low_m=[6,-6], high_m=[26,9], spacing_m=5, heights_m=[3.0, 7.0] }")
+    checked = checking.check(pipeline.load(street))
+    assert [str(finding) for finding in checked.findings] == [
+        "sites.grid: 11 of 40 candidates are dropped, since no pole can stand there (10 in a lane, 1 in a solid);"
+        " name a sensor on a gantry in a file of sites"
+    ]
+    scene = pipeline.build_scene(pipeline.load(street))
+    assert (len(scene.sites), checked.sites) == (29, 29)
+    assert {site.pose.y_m for site in scene.sites} == {-6.0, 4.0, 9.0}
+    assert [(site.pose.position_m, why) for site, why in scene.dropped if site.pose.y_m > 4] == [
+        ((16.0, 9.0, 3.0), "in a solid")
+    ]
+
+
+def test_a_rule_may_keep_all_and_is_then_told_as_a_file_is(street: Path) -> None:
+    rule(street, "{ low_m=[6,-6], high_m=[16,9], spacing_m=5, heights_m=[3.0] }")
+    told = found(street, "sites.only_free=false")
+    assert {key: len(lines) for key, lines in told.items()} == {"sites on lanes": 3}
+
+
+def test_a_rule_of_which_nothing_is_left_is_an_error(street: Path) -> None:
+    rule(street, "{ low_m=[6,1], high_m=[16,1], spacing_m=5, heights_m=[3.0] }")
+    assert found(street) == {"sites": ["scenario.toml: sites: no place can hold a pole (3 in a lane)"]}
+
+
+def test_a_dropped_site_cannot_be_kept(street: Path) -> None:
+    rule(street, "{ low_m=[6,-6], high_m=[6,-1], spacing_m=5, heights_m=[3.0] }")
+    told = found(street, 'score.keep_visibility=["g02"]')
+    assert told == {"sites": ["scenario.toml: score.keep_visibility: the site 'g02' is dropped: it stands in a lane"]}
+
+
+def test_beams_that_never_meet_the_region(street: Path) -> None:
+    sensor = "{elevations_deg=[5,15],channels=4,azimuth_step_deg=1.0,range_m=100}"
+    told = found(street, f"sensors.small={sensor}", "roi.center_m=[20,0,1.0]", "roi.size_m=[40,20,2]")
+    assert told == {
+        "beams beside the region": ["[sites: no beam of 2 of 2 sites meets the region of interest: pole_a, pole_b]"]
+    }
+
+
+def test_all_that_is_wrong_with_poses_is_told_at_once(street: Path) -> None:
+    sites(street, "inside,16,6,3", "deep,10,12,-1", "far,300,12,3", "fine,10,12,3")
+    assert found(street) == {
+        "sites": [
+            "site inside: (16, 6, 3) stands inside house (building)",
+            "site deep: z_m = -1 is not above the ground (z = 0)",
+            "site far: stands 260.0 m from the region of interest",
+        ]
+    }
+
+
+# ---- solids
+
+
+def test_a_shelter_in_mid_road_is_told_with_its_place(street: Path) -> None:
+    """2 x 2 m of two lanes that are 2.7 m wide without their edges and 120 m long: 4 of 2 * 2.7 * 120 m2."""
+    statics(street, box((20, 0.5), (22, 2.5), "shelter", base_m=2.4, height_m=2.6))
+    share, lanes = 4 / (2 * 2.7 * 120), "of the lanes in and round the region"
+    assert found(street) == {
+        "solids over lanes": [f"[statics: a solid covers {share:.1%} {lanes}: shelter (kiosk) 4 m2 at (21, 2)]"]
+    }
+
+
+@pytest.mark.parametrize(
+    ("solid", "is_found"),
+    [
+        (box((20, 0.5), (22, 2.5), base_m=4.5, height_m=6), False),  # a bridge
+        (box((20, 0.5), (22, 2.5), height_m=0.3), False),  # an island
+        (box((20, 0.5), (22, 2.5), height_m=0.31), True),
+        (box((20, 2.9), (30, 6)), False),  # touches: 0.05 m of the inset lane
+        (box((20, 2.7), (30, 6)), True),  # 0.25 m of it, 2.5 m2
+        (box((20, 1.5), (20.2, 1.7)), True),  # a post, small, but in the middle of a lane
+        (box((20, 2.9), (20.2, 3.1)), False),  # one at the kerb
+        (box((200, 0.5), (222, 2.5)), False),  # too far away to matter
+    ],
+)
+def test_what_is_in_the_way_on_a_lane(street: Path, solid: dict, is_found: bool) -> None:
+    statics(street, solid)
+    assert set(found(street)) == ({"solids over lanes"} if is_found else set())
+
+
+def test_an_open_surface_is_in_the_way_where_it_is_above_the_kerb(street: Path) -> None:
+    """A sheet over the whole street is the road at 0.1 m, and in everybody's way at 1 m."""
+    for height_m, is_found in ((0.1, False), (1.0, True)):
+        corners = "".join(f"v {x} {y} {height_m}\n" for x, y in ((-40, -6), (80, -6), (80, 6), (-40, 6)))
+        (street / "sheet.obj").write_text(corners + "f 1 2 3\nf 1 3 4\n")
+        told = found(street, "statics.footprints=[]", 'statics.meshes=[{file="sheet.obj"}]')
+        assert set(told) == ({"solids over lanes"} if is_found else set())
+        if is_found:
+            assert "a solid covers 100.0% of the lanes" in told["solids over lanes"][0]
+
+
+def test_buildings_of_another_place_are_told(street: Path) -> None:
+    statics(street, box((1000, 2000), (1010, 2010)), box((1100, 2000), (1110, 2010)))
+    assert found(street) == {
+        "statics far away": [
+            "[statics: the nearest solid is 2,209 m from the region of interest; all lie round (1055, 2005)]"
+        ]
+    }
+
+
+# ---- the region
+
+
+def test_a_region_without_lanes(street: Path) -> None:
+    sites(street, "a,20,210,3")
+    statics(street)
+    told = found(street, "roi.center_m=[20,200,2.5]")
+    assert told == {"region": ["scenario.toml: roi: no lane leads through it: the nearest is 187.1 m away"]}
+
+
+def test_a_region_above_the_road(street: Path) -> None:
+    told = found(street, "roi.center_m=[20,0,22.5]")
+    assert told["region"] == ["scenario.toml: roi: reaches from z = 20 to 25 m, but the road there lies at z = 0.0 m"]
+
+
+# ---- all at once
+
+
+def test_everything_that_is_wrong_is_told_at_once(street: Path, egvs) -> None:
+    sites(street, "in,10,1.6,3", "house,16,6,3")
+    (street / "broken.geojson").write_text("{")
+    settings = (
+        'sites.sensor="smal"', "traffic.frame_period_s=0.3", "traffic.edge_weights={north=2}",
+        'statics.footprints=["statics.geojson","gone.geojson","broken.geojson"]',
+    )  # fmt: skip
+    told = found(street, *settings)
+    assert {key: len(lines) for key, lines in told.items()} == {
+        "files": 1, "statics": 1, "traffic": 2, "sensors": 1, "sites on lanes": 1,
+    }  # fmt: skip
+    assert told["sensors"] == ["site in and 1 more: unknown sensor 'smal'"]
+    flags = [word for setting in settings for word in ("--set", setting)]
+    code, printed, _ = egvs("check", street, *flags)
+    assert code == 2
+    assert printed.splitlines()[0] == "5 errors"
+    assert "1 warning" in printed.splitlines()
+    code, _, said = egvs("run", street, "--out", street / "out", *flags)
+    said = said.replace(f"{street}/", "")
+    assert code == 2
+    assert all(line.partition(": ")[2] in said for lines in told.values() for line in lines if line[0] != "[")
+    assert json.loads((street / "out" / "run.json").read_text())["stages"] == {}
+
+
+def test_a_truncated_network_is_refused_before_anything_is_built(street: Path) -> None:
+    (street / "net.net.xml").write_text(net_xml()[:300])
+    told = found(street)
+    assert list(told) == ["network"]
+    with pytest.raises(FindingsError, match="is not well-formed XML"):
+        pipeline.run(pipeline.load(street), street / "out")
+
+
+@pytest.mark.parametrize("softness", [0, 0.3])
+def test_a_range_limit_without_a_rated_range_is_refused_first(street: Path, softness: float) -> None:
+    told = found(street, f"effects.range_limit={{reflectivity=0.1, softness={softness}}}")
+    assert told == {"effects": ["effects.range_limit: sensor small: no rated_range_m"]}
+
+
+# ---- the command, and the run
+
+
+def test_the_command_says_so_when_nothing_is_found_and_writes_nothing(street: Path, egvs) -> None:
+    before = sorted(street.rglob("*"))
+    code, printed, _ = egvs("check", street)
+    assert (code, printed.splitlines()) == (
+        0,
+        ["nothing found", "2 sites, 3 solids and 2 lanes held against one another"],
+    )
+    assert sorted(street.rglob("*")) == before
+
+
+def test_a_run_keeps_the_warnings_and_shows_them(mini: Path, egvs) -> None:
+    statics(mini, box((1000, 2000), (1010, 2010)))
+    for state in ("nearest solid", "unchanged"):
+        code, _, said = egvs("run", mini, "--out", mini / "out")
+        assert (code, state in said, "warning: statics: the nearest solid is 2,209 m" in said) == (0, True, True)
+    record = json.loads((mini / "out" / "run.json").read_text())
+    assert [warning["rule"] for warning in record["stages"]["check"]["summary"]["warnings"]] == ["statics far away"]
+    assert "the nearest solid is 2,209 m" in (mini / "out" / "report.html").read_text()
+    assert egvs("verify", mini / "out")[0] == 0
+
+
+def test_findings_errors_are_errors_of_input(street: Path) -> None:
+    with pytest.raises(InputError) as caught:
+        pipeline.run(pipeline.load(street, ['sites.sensor="smal"', "traffic.edge_weights={north=2}"]), street / "out")
+    assert len(str(caught.value).splitlines()) == 2
