@@ -334,13 +334,14 @@ def new(
         str | None, typer.Option(metavar="LAT,LON", help="The junction nearest to this place; the largest by default.")
     ] = None,
     lefthand: Annotated[bool, typer.Option("--lefthand", help="Traffic drives on the left.")] = False,
+    walk: Annotated[bool, typer.Option("--walk", help="Sidewalks and crossings, for people on foot.")] = False,
 ) -> None:
     """Make a scenario from an OpenStreetMap extract."""
     from pipeline.cli import results
     from pipeline.importers import openstreetmap
 
     place = arguments.latitude_and_longitude(at) if at is not None else None
-    results.print_new_scenario(openstreetmap.new(folder, osm, place, lefthand=lefthand))
+    results.print_new_scenario(openstreetmap.new(folder, osm, place, lefthand=lefthand, walk=walk))
 
 
 @app.command()

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -78,8 +78,9 @@ class Streets:
 
     @property
     def lane_length_m(self) -> float:
-        """All lanes outside junctions, one after another."""
-        return math.fsum(lane.length_m for road in self.network.edges for lane in road.lanes)
+        """All lanes outside junctions, one after another; pavements are none."""
+        lanes = (lane for road in self.network.edges for lane in road.lanes if not lane.is_pavement)
+        return math.fsum(lane.length_m for lane in lanes)
 
     def to_xy(self, lons_deg: Sequence[float], lats_deg: Sequence[float]) -> list[XY]:
         """World-frame x, y in metres of positions in degrees."""
@@ -121,7 +122,8 @@ def read(path: Path) -> Streets:
     inside = [edge for edge in network.all_edges if edge.function == "internal"]
     areas = {edge.id: _area(edge) for edge in (*network.edges, *inside)}
     nodes = [n for n in network.junctions if n.type not in ("internal", "dead_end") and n.incoming_lanes]
-    return Streets(network, areas, tuple(_junction(node, network.edges) for node in nodes))
+    driven = {f"{e.id}_{i}" for e in network.edges for i, lane in enumerate(e.lanes) if not lane.is_pavement}
+    return Streets(network, areas, tuple(_junction(node, network.edges, driven) for node in nodes))
 
 
 def _area(edge: Edge) -> BaseGeometry:
@@ -129,19 +131,20 @@ def _area(edge: Edge) -> BaseGeometry:
     return shapely.union_all([
         LineString(lane.shape_m[:, :2]).buffer((lane.width_m or LANE_WIDTH_M) / 2, cap_style="flat")
         for lane in edge.lanes
-        if lane.permission.allow != frozenset({"pedestrian"}) and len(np.unique(lane.shape_m, axis=0)) > 1
+        if not lane.is_pavement and len(np.unique(lane.shape_m, axis=0)) > 1
     ])  # fmt: skip
 
 
-def _junction(node: Node, roads: Sequence[Edge]) -> Junction:
-    """A node of the network, with what meets there."""
+def _junction(node: Node, roads: Sequence[Edge], driven: Set[str]) -> Junction:
+    """A node of the network, with what meets there; ``driven`` are the lanes of ``roads`` that are no pavements."""
     corners_m = node.shape_m[:, :2]
     area = shapely.make_valid(Polygon(corners_m)) if len(corners_m) >= 3 else Point(node.at_m).buffer(1.0)
     meeting = [road for road in roads if node.id in _ends(road)]
     arms = {end for road in meeting for end in _ends(road)} - {node.id}
     names = sorted({html.unescape(road.name) for road in meeting if road.name})  # netconvert escapes names twice
     signalised = node.type.startswith("traffic_light")
-    return Junction(node.id, node.at_m, area, len(node.incoming_lanes), len(arms), signalised, tuple(names))
+    lanes_in = sum(lane in driven for lane in node.incoming_lanes)
+    return Junction(node.id, node.at_m, area, lanes_in, len(arms), signalised, tuple(names))
 
 
 def _ends(road: Edge) -> tuple[str, str]:

@@ -55,6 +55,14 @@ Measured on a town with 19 km of lanes: 50 and 80 vehicles are held for 5000 fra
 turnarounds, or with larger junctions, there are more overlaps, and grid-locks.
 """
 
+WALK = ("--sidewalks.guess", "--sidewalks.guess.max-speed", "28", "--crossings.guess")
+"""Sidewalks, walking areas at their corners, and crossings between these.
+
+Up to 28 m/s instead of 13.89: that is what netconvert takes a main street without ``maxspeed`` for; not a motorway.
+"""
+
+PEOPLE = "people come with --set effects.pedestrians_bicycles.pedestrians_per_h=300 (bicycles_per_h for bicycles)"
+
 LANE_PER_VEHICLE_M = 250.0
 VEHICLES_LEAST, VEHICLES_MOST = 5, 50
 
@@ -98,7 +106,9 @@ class NewScenario:
         }  # fmt: skip
 
 
-def new(folder: Path, osm: Path, at: tuple[float, float] | None = None, lefthand: bool = False) -> NewScenario:
+def new(
+    folder: Path, osm: Path, at: tuple[float, float] | None = None, lefthand: bool = False, walk: bool = False
+) -> NewScenario:
     """Make a scenario folder from an OpenStreetMap extract.
 
     Parameters
@@ -111,6 +121,8 @@ def new(folder: Path, osm: Path, at: tuple[float, float] | None = None, lefthand
         Latitude, longitude in degrees: the signalised junction nearest to it is taken; without it, the largest.
     lefthand
         Whether one drives on the left there.
+    walk
+        Whether the network gets sidewalks and crossings, which people on foot need.
 
     Raises
     ------
@@ -121,14 +133,14 @@ def new(folder: Path, osm: Path, at: tuple[float, float] | None = None, lefthand
     name = _check_folder(folder)
     extract = read_extract(osm)
     _check_at(extract, at)
-    network, streets = _network(extract, osm, lefthand)
+    network, streets = _network(extract, osm, lefthand, walk)
     junction, roi = _junction(streets, osm, at)
     mapped, counts = solids.collect(extract, streets)
     places = junctions.kerb_places(streets, junction, roi, [solid.area for solid in mapped])
     if not places:
         problem = f"no place for a pole is free along the kerbs of the {junction.title}"
         raise InputError(osm, problem, "another junction: --at LAT,LON")
-    notes = _notes(junction, roi, counts)
+    notes = (*_notes(junction, roi, counts), *([PEOPLE] if walk else []))
     made = NewScenario(folder, junction, roi, streets, len(places) * len(HEIGHTS_M), counts, notes)
     files = {NETWORK: network, STATICS: _geojson(mapped, counts), SITES: _sites(places), FILE: _toml(name, made)}
     _publish(folder, files)
@@ -159,7 +171,7 @@ def _check_at(extract: Extract, at: tuple[float, float] | None) -> None:
 # --- network --------------------------------------------------------------------------------------------------------
 
 
-def _network(extract: Extract, osm: Path, lefthand: bool) -> tuple[str, Streets]:
+def _network(extract: Extract, osm: Path, lefthand: bool, walk: bool) -> tuple[str, Streets]:
     """The SUMO network as text, and what is in it."""
     right = "an extract with streets for cars (ways with highway=...)"
     missing = InputError(osm, "has no drivable streets that meet", right)
@@ -168,7 +180,7 @@ def _network(extract: Extract, osm: Path, lefthand: bool) -> tuple[str, Streets]
     with tempfile.TemporaryDirectory() as name:
         work = Path(name)
         write_streets(extract, work / "streets.osm.xml")
-        flags = [*NETCONVERT, *_boundary(extract), *(["--lefthand"] if lefthand else [])]
+        flags = [*NETCONVERT, *_boundary(extract), *(["--lefthand"] if lefthand else []), *(WALK if walk else [])]
         try:
             sumo.run("netconvert", ["--osm-files", "streets.osm.xml", *flags, "-o", NETWORK], work)
             streets = junctions.read(work / NETWORK)

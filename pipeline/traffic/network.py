@@ -90,6 +90,11 @@ class Lane(Shape):
     length_m: float
     permission: Permission
 
+    @property
+    def is_pavement(self) -> bool:
+        """Whether it is for people on foot alone."""
+        return self.permission.allow == frozenset({_PEDESTRIAN})
+
 
 @dataclass(frozen=True)
 class Edge:

@@ -546,6 +546,17 @@ def test_people_walk_on_sidewalks_facing_their_way_half_a_length_behind_their_fr
         assert first[name] == pytest.approx((x - 0.4, y), abs=1e-6)
 
 
+@given(length_m=st.floats(0.2, 500), before_m=st.floats(0, 20))
+def test_a_bicycle_stops_on_its_lane_whatever_its_length(length_m: float, before_m: float) -> None:
+    """SUMO refuses a stop that ends beyond the lane's end (175.53 of 175.526 m) or is shorter than 0.1 m."""
+    end_m = max(length_m - before_m, length_m / 2)
+    stop = pedestrians_bicycles._stop(("lane", length_m), end_m - 12.0, end_m, 1.0)
+    first, last = (float(re.search(f'{key}="([^"]*)"', stop)[1]) for key in ("startPos", "endPos"))
+    assert 0 <= first <= last - 0.1 + 1e-9
+    assert last <= length_m
+    assert last == pytest.approx(end_m, abs=0.0101)
+
+
 def test_bicycles_ride_on_their_lanes_with_their_riders_size(climbed):
     riders = kind_rows(climbed[1], "bicycle")
     on_lane = (riders["x_m"] > 170) & (riders["x_m"] < 430)

@@ -273,6 +273,18 @@ def test_driving_on_the_left(tmp_path: Path) -> None:
     assert 'lefthand="true"' in (tmp_path / "left" / "network.net.xml").read_text(encoding="utf-8")
 
 
+def test_sidewalks_and_crossings_change_neither_junction_nor_lanes(made: Made, tmp_path: Path) -> None:
+    walked = osm.new(tmp_path / "walked", SMALL, walk=True)
+    plain = made[1]
+    assert walked.notes[:-1] == plain.notes and "pedestrians_per_h" in walked.notes[-1]
+    assert (walked.junction.title, walked.junction.lanes_in) == (plain.junction.title, plain.junction.lanes_in)
+    assert walked.streets.lane_length_m == pytest.approx(plain.streets.lane_length_m, rel=0.05)  # larger corners
+    assert plain.streets.network.walkways.sidewalks == ()
+    ways = walked.streets.network.walkways
+    assert len({walk.part for walk in ways.sidewalks}) == 1 and len(ways.sidewalks) > 3
+    assert ways.crossings > 3 and ways.areas > 3
+
+
 def test_an_empty_folder_is_filled_and_a_name_with_spaces_is_mended(tmp_path: Path) -> None:
     folder = tmp_path / "my junction"
     folder.mkdir()
@@ -335,6 +347,21 @@ def test_a_real_town_at_a_place(town: Made, tmp_path: Path) -> None:
     assert summary.junction.title == "signalised junction of Benno-Schilde-Straße and Dippelstraße"
     check_sites(tmp_path / "other", 12)
     assert (tmp_path / "other" / "network.net.xml").read_bytes() == (town[0] / "network.net.xml").read_bytes()
+
+
+@pytest.mark.parametrize("walk", [False, True])
+def test_people_move_in_a_real_town(town: Made, tmp_path: Path, walk: bool) -> None:
+    from pipeline.stages import traffic
+
+    del town  # the file is there
+    osm.new(tmp_path / "town", REAL, walk=walk)
+    rates = {"bicycles_per_h": 100, "pedestrians_per_h": 200} if walk else {"bicycles_per_h": 100}
+    people = [f"effects.pedestrians_bicycles.{key}={rate}" for key, rate in rates.items()]
+    scenario = loading.load(tmp_path / "town", [*people, "traffic.frames=50", "traffic.warmup_s=60", "tpog.blocks=5",
+                                                "traffic.hold='at_most'"])  # fmt: skip
+    summary = run_stage(traffic, scenario, tmp_path / "run")
+    assert summary["beside_vehicles"]["bicycle"]["most"] > 0
+    assert ("pedestrian" in summary["beside_vehicles"]) == walk
 
 
 def test_a_real_town_holds_its_vehicles_in_every_frame(town: Made, tmp_path: Path) -> None:

@@ -31,6 +31,7 @@ not vary.
 from __future__ import annotations
 
 import heapq
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
@@ -59,11 +60,11 @@ _RIDES_M_S = 4.0
 
 _WAITS_S = 30.0
 _BEYOND_S = 3600.0
-_STOP_M = 12.0
+_STOP_M, _LEAST_STOP_M, _HAIR = 12.0, 0.1, 1e-6
 _BEFORE_M, _MOST_ALIKE = 0.25, 32
 _WAYPOINT_M_S = 15.0
 _MAKES_WALKS = (
-    "a network with sidewalks and walking areas, for example from netconvert --sidewalks.guess --crossings.guess"
+    "a network with sidewalks and walking areas, from egvs new --walk or netconvert --sidewalks.guess --crossings.guess"
 )
 _MAKES_LANES = "a network with lanes for bicycles, for example from netconvert --bikelanes.guess"
 
@@ -270,7 +271,9 @@ def _alike(string: list[_Ride], ride: _Ride) -> int:
 def _stop(lane: tuple[str, float], start_m: float, end_m: float, until_s: float) -> str:
     """Where a vehicle jumps from: anywhere between two places of a lane, so that it need not brake before."""
     name, length_m = lane
+    end_m = min(math.floor(100 * length_m + _HAIR) / 100, end_m)  # SUMO refuses an end beyond the lane's
+    start_m = max(0.0, min(start_m, end_m - _LEAST_STOP_M))
     return (
-        f'<stop lane={quoteattr(name)} startPos="{max(0.0, start_m):.2f}" endPos="{min(length_m, end_m):.2f}"'
+        f'<stop lane={quoteattr(name)} startPos="{start_m:.2f}" endPos="{end_m:.2f}"'
         f' duration="0" speed="{_WAYPOINT_M_S:g}" jump="0" jumpUntil="{until_s:.3f}"/>'
     )
