@@ -24,6 +24,9 @@ _TYPES = SolidTypes()
 
 def buildings(extract: Extract, xy: dict[int, XY], counts: ImportCounts) -> Iterator[MappedSolid]:
     """Outlines and parts; an outline stands only where none of its parts does."""
+    for tags in extract.node_tags.values():
+        if _is_building(tags):
+            counts.drop("building", "no_outline")
     shapes = list(_shapes(extract, xy, counts))
     parts = [shape for shape in shapes if not _is_outline(shape[1])]
     tree = shapely.STRtree([area for _, _, area in parts])

@@ -148,7 +148,7 @@ class _Reader:
             file.warnings.append(Finding("polygon types", place, f"polygons of type {found}", cure))
         if self._open:
             found = f"outlines of type {_listed(self._open)} are not closed: left out"
-            cure = "polyconvert --osm.merge-relations 1 joins outlines that come in several ways"
+            cure = "close them; those of polyconvert that come in several ways are joined by --osm.merge-relations 1"
             file.warnings.append(Finding("open outlines", place, found, cure))
         if self._polygons and not file.footprints:
             found = f"none of its {self._polygons} polygons is solid"
@@ -156,7 +156,7 @@ class _Reader:
             file.warnings.append(Finding("polygon types", place, found, cure))
         if inside := len(_pairs_inside(file.footprints)):
             found = f"solids inside another of their kind and height: {inside}; they may be courtyards that are filled"
-            cure = "polyconvert --osm.merge-relations 1 tells courtyards from buildings"
+            cure = "if so, polyconvert --osm.merge-relations 1 lets them be cut out"
             file.warnings.append(Finding("filled courtyards", place, found, cure))
         return file
 

@@ -100,3 +100,11 @@ def test_tags_that_say_nothing_are_counted(
     ((solid,), counts) = imported(tags)
     assert (solid.base_m, solid.height_m) == expected
     assert counts.unreadable == unreadable
+
+
+def test_a_building_that_is_only_a_point_is_counted() -> None:
+    counts = ImportCounts()
+    points = {1: {"building": "yes"}, 2: {"man_made": "tower"}, 3: {"shop": "bakery"}, 4: {"building": "no"}}
+    extract = Extract({node: (0.0, 0.0) for node in XY}, points, {}, (), Bounds(0, 0, 1, 1), False)
+    assert not list(buildings(extract, XY, counts))
+    assert counts.dropped == {"no_outline": {"building": 2}}
