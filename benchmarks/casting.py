@@ -38,7 +38,7 @@ def _work(name: str) -> tuple[dict[str, Callable[[], Any]], int, int]:
     TriangleMesh(bare, caster._triangles.astype(np.float32))
     jobs = []
     for site in sites.of(scenario):
-        sensor = sensors.resolve(site.sensor, scenario.sensors, site.name)
+        sensor = sensors.of_scenario(site.sensor, scenario, site.name)
         directions = sensor.directions(*site.pose.angles_deg)
         position = np.asarray(site.pose.position_m)
         d = directions[caster.scan(site.pose.position_m, directions, sensor.range_m).beam]

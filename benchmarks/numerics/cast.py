@@ -265,7 +265,7 @@ def _shipped(name: str, scale: float) -> Row:
 
     def jobs() -> Iterator[tuple[Caster, Floats, Floats, Floats]]:
         for site in sites.of(scenario):
-            sensor = sensors.resolve(site.sensor, scenario.sensors, site.name)
+            sensor = sensors.of_scenario(site.sensor, scenario, site.name)
             d = sensor.directions(*site.pose.angles_deg)
             kept = caster.scan(site.pose.position_m, d, sensor.range_m).beam[::step]
             yield caster, triangles, np.asarray(site.pose.position_m) - np.asarray(scenario.roi.box.origin_m), d[kept]

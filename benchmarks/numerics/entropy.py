@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks.numerics.row import Row
 from pipeline.core.grid import Grid
 from pipeline.scoring.egvs import EntropyField, binary_entropy
-from pipeline.sensing.sensors import CATALOGUE
+from pipeline.sensing.sensors import CATALOGUE, Sensor
 
 _LARGEST = 2**32 - 1
 
@@ -118,6 +118,18 @@ def _order(rng: np.random.Generator, scale: float) -> Row:
     )
 
 
+def _angles_of(sensor: Sensor, k: int) -> tuple[float, Fraction]:
+    """Elevation and azimuth of beam ``k``, degrees."""
+    if sensor.table is not None:
+        return float(sensor.table.elevation_deg[k]), Fraction(repr(float(sensor.table.azimuth_deg[k])))
+    a, r = divmod(k, sensor.channels)
+    first, step = Fraction(0), Fraction(360, sensor.azimuths)
+    if sensor.azimuth_deg is not None:
+        first, last = (Fraction(repr(angle)) for angle in sensor.azimuth_deg)
+        step = (last - first) / (sensor.azimuths - 1)
+    return sensor.elevations_deg[r], first + a * step + Fraction(repr(sensor.azimuth_offsets_deg[r]))
+
+
 def _directions(scale: float) -> Row:
     """Beams of every sensor, upright, against 30 digits."""
     cases, wrong, worst = 0, 0, 0.0
@@ -125,11 +137,10 @@ def _directions(scale: float) -> Row:
     for sensor in CATALOGUE.values():
         directions = sensor.directions()
         for k in range(0, sensor.beams, step):
-            a, r = divmod(k, sensor.channels)
-            azimuth = Fraction(360 * a, sensor.azimuths) + Fraction(repr(sensor.azimuth_offsets_deg[r]))
+            elevation, azimuth = _angles_of(sensor, k)
             with mpmath.workdps(30):
                 az = mpmath.radians(mpmath.mpf(round(azimuth * 10**6)) / 10**6)
-                el = mpmath.radians(mpmath.mpf(repr(sensor.elevations_deg[r])))
+                el = mpmath.radians(mpmath.mpf(repr(elevation)))
                 true = [
                     float(v) for v in (mpmath.cos(el) * mpmath.cos(az), mpmath.cos(el) * mpmath.sin(az), mpmath.sin(el))
                 ]

@@ -19,11 +19,17 @@ _FILE_WIDTH = 160
 
 def print_sensors(sensors: Iterable[Sensor]) -> None:
     """The sensors that need no table of the user's."""
-    names = ("sensor", "channels", "elevation deg", "azimuth step deg", "beams", "range m", "source")
-    rows = table(names, left=("sensor", "source"))
+    names = ("sensor", "rings", "elevation deg", "azimuth deg", "step deg", "beams", "range m", "rated m", "source")
+    rows = table(names, left=("sensor", "source"), whole=[name for name in names if name != "source"])
     for s in sensors:
-        span, step = f"{min(s.elevations_deg):g} to {max(s.elevations_deg):g}", f"{360 / s.azimuths:.6g}"
-        rows.add_row(s.name, str(s.channels), span, step, str(s.beams), f"{s.range_m:g}", s.source)
+        around = s.azimuth_span_deg
+        rows.add_row(
+            s.name, str(s.channels) if s.channels else "-", "{:.4g} to {:.4g}".format(*s.elevation_span_deg),
+            "all round" if around is None else "{:.4g} to {:.4g}".format(*around),
+            "-" if s.azimuth_step_deg is None else f"{s.azimuth_step_deg:.6g}", str(s.beams), f"{s.range_m:g}",
+            "-" if s.rated_range_m is None else f"{s.rated_range_m:g} at {s.rated_reflectivity:.0%}",
+            s.source + (f". Assumed: {s.assumed}" if s.assumed else ""),
+        )  # fmt: skip
     console(_FILE_WIDTH, soft_wrap=False).print(rows)
 
 

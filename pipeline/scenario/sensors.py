@@ -1,27 +1,65 @@
-"""The keys of ``[sensors.<name>]``: a sensor of the user's."""
+"""The keys of ``[sensors.<name>]``: a sensor of the user's. The catalogue's entries have the same keys."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from pipeline.core.strict_model import StrictModel
 from pipeline.scenario.types import NotNegative, Positive
 
+MOST_BEAMS = 10_000_000
+
 _OPTICS = ("wavelength_nm", "divergence_mrad", "rated_range_m", "rated_reflectivity")
-_MOST_BEAMS = 10_000_000
+_FIELD_OF_VIEW = ("azimuth_deg", "beams", "pattern")
+_OF_RINGS = ("channels", "azimuth_offsets_deg", "azimuth_step_deg", "azimuth_deg")
+
+Elevation = Annotated[float, Field(ge=-90, le=90)]
+Azimuth = Annotated[float, Field(ge=-360, le=360)]
+
+
+class PatternModel(StrictModel):
+    """Beams from a formula, for sensors whose pattern does not repeat: what one frame of it may look like, a model."""
+
+    kind: Literal["rosette", "even"] = Field(
+        description="'rosette': two prisms of equal deflection that turn at different speeds; 'even': evenly spread"
+    )
+    samples: int = Field(ge=1, le=MOST_BEAMS, description="Beams of one frame")
+    azimuth_deg: tuple[Azimuth, Azimuth] = Field(description="From where to where")
+    elevation_deg: tuple[Elevation, Elevation] = Field(description="From where to where")
+    turns: tuple[float, float] | None = Field(None, description="Of the two prisms in one frame, for a rosette")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> PatternModel:
+        for key in ("azimuth_deg", "elevation_deg"):
+            low, high = getattr(self, key)
+            if not low < high:
+                raise ValueError(f"{key} = [{low:g}, {high:g}] does not go up")
+        if (self.turns is None) != (self.kind == "even"):
+            raise ValueError("turns belong to a rosette" if self.turns else "a rosette needs turns")
+        return self
 
 
 class SensorModel(StrictModel):
-    """A sensor of the user's. Elevations are listed, or uniform between two when ``channels`` is given."""
+    """A sensor of the user's: rings at listed or uniform elevations, all round or in a field of view; a table of beams;
+    or beams from a formula."""
 
-    elevations_deg: tuple[Annotated[float, Field(ge=-90, le=90)], ...] = Field(
-        min_length=1, description="One a ring; or the first and the last of `channels` uniform ones"
+    elevations_deg: tuple[Elevation, ...] = Field(
+        (), description="One a ring; or the first and the last of `channels` uniform ones"
     )
     channels: int | None = Field(None, ge=1, description="Rings, uniform between two elevations_deg")
     azimuth_offsets_deg: tuple[float, ...] = Field((), description="One a ring, added to each azimuth; none: all 0")
-    azimuth_step_deg: Positive = Field(description="Divides 360")
+    azimuth_step_deg: Positive | None = Field(
+        None, description="Between two beams of a ring; divides 360, or the width of azimuth_deg"
+    )
+    azimuth_deg: tuple[Azimuth, Azimuth] | None = Field(
+        None, description="First and last azimuth of a ring, counter-clockwise from the x axis; none: all round"
+    )
+    beams: str | None = Field(
+        None, description="Instead of rings: a CSV with the columns elevation_deg and azimuth_deg, one row a beam"
+    )
+    pattern: PatternModel | None = None
     range_m: Positive
     wavelength_nm: Positive = Field(905.0, description="Of the laser; only effects ask")
     divergence_mrad: tuple[NotNegative, NotNegative] = Field(
@@ -37,30 +75,72 @@ class SensorModel(StrictModel):
         """What effects ask of the laser and the receiver."""
         return {name: getattr(self, name) for name in _OPTICS}
 
+    @property
+    def rings(self) -> int:
+        """How many rings; 0 for a table or a pattern."""
+        return self.channels or len(self.elevations_deg)
+
+    @property
+    def azimuths(self) -> int:
+        """Beams of a ring."""
+        if self.azimuth_step_deg is None:
+            return 0
+        if self.azimuth_deg is None:
+            return round(360.0 / self.azimuth_step_deg)
+        return round((self.azimuth_deg[1] - self.azimuth_deg[0]) / self.azimuth_step_deg) + 1
+
     @model_serializer(mode="wrap")
     def _without_defaults(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Without the optics that the user left out: what no effect asks for changes no artefact."""
-        return {name: v for name, v in plain(self).items() if name not in _OPTICS or name in self.model_fields_set}
+        """Without optics and field of view that the user left out: what nobody asks for changes no artefact."""
+        quiet = {*_OPTICS, *_FIELD_OF_VIEW} - self.model_fields_set
+        return {name: value for name, value in plain(self).items() if name not in quiet}
 
     @model_validator(mode="after")
-    def _consistent(self) -> SensorModel:
-        listed = len(self.elevations_deg)
+    def _one_source(self) -> SensorModel:
+        given = [key for key in ("elevations_deg", "beams", "pattern") if getattr(self, key)]
+        if len(given) != 1:
+            found = " and ".join(given) or "none"
+            raise ValueError(f"exactly one of elevations_deg, beams and pattern is needed, found {found}")
+        if given != ["elevations_deg"]:
+            if idle := [key for key in _OF_RINGS if getattr(self, key)]:
+                raise ValueError(f"{', '.join(idle)} would act on nothing beside {given[0]}")
+        elif self.azimuth_step_deg is None:
+            raise ValueError("azimuth_step_deg is needed beside elevations_deg")
+        return self
+
+    @model_validator(mode="after")
+    def _whole_rings(self) -> SensorModel:
+        listed, rings = len(self.elevations_deg), self.rings
         if self.channels not in (None, listed) and listed != 2:
             raise ValueError(
                 f"channels = {self.channels} needs elevations_deg with 2 values (uniform) or {self.channels},"
                 f" found {listed}"
             )
-        rings = self.channels or listed
-        if rings * 360.0 / self.azimuth_step_deg > _MOST_BEAMS:
+        if rings * self.azimuths > MOST_BEAMS:
             raise ValueError(
-                f"{rings} rings every {self.azimuth_step_deg:g} degrees are more than {_MOST_BEAMS:,} beams"
+                f"{rings} rings every {self.azimuth_step_deg:g} degrees are more than {MOST_BEAMS:,} beams"
             )
         if self.azimuth_offsets_deg and len(self.azimuth_offsets_deg) != rings:
             raise ValueError(
                 f"azimuth_offsets_deg has {len(self.azimuth_offsets_deg)} values,"
                 f" one for each of {rings} rings is needed"
             )
-        turns = 360.0 / self.azimuth_step_deg
-        if abs(turns - round(turns)) > 1e-9 * turns:
-            raise ValueError(f"azimuth_step_deg = {self.azimuth_step_deg:g} does not divide 360")
+        return self
+
+    @model_validator(mode="after")
+    def _whole_steps(self) -> SensorModel:
+        if self.azimuth_step_deg is None:
+            return self
+        width, what = 360.0, "360"
+        if self.azimuth_deg is not None:
+            width = self.azimuth_deg[1] - self.azimuth_deg[0]
+            what = f"the {width:g} degrees of azimuth_deg"
+            if not 0 < width < 360:
+                first, last = self.azimuth_deg
+                raise ValueError(
+                    f"azimuth_deg = [{first:g}, {last:g}] must go up, by less than 360 degrees; all round without it"
+                )
+        steps = width / self.azimuth_step_deg
+        if abs(steps - round(steps)) > 1e-9 * steps:
+            raise ValueError(f"azimuth_step_deg = {self.azimuth_step_deg:g} does not divide {what}")
         return self

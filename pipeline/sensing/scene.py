@@ -6,7 +6,7 @@ it from here instead of reading a file again. It can be sent to another process.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar, Protocol, TypeVar
 
 from pipeline.core.grid import Roi
@@ -64,6 +64,7 @@ class Scene:
     effects: tuple[LiveEffect, ...] = ()
     idle: tuple[IdleEffect, ...] = ()
     dropped: tuple[tuple[Site, str], ...] = ()
+    _sensors: dict[str, Sensor] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property
     def roi(self) -> Roi:
@@ -82,7 +83,9 @@ class Scene:
 
     def sensor(self, name: str, place: str = "sensor") -> Sensor:
         """The sensor called ``name``: the scenario's own, else the catalogue's; InputError naming ``place`` else."""
-        return sensors.resolve(name, self.scenario.sensors, place)
+        if name not in self._sensors:
+            self._sensors[name] = sensors.of_scenario(name, self.scenario, place)
+        return self._sensors[name]
 
     def site(self, name: str) -> Site:
         """The site called ``name``; KeyError when there is none."""

@@ -1,8 +1,8 @@
 r"""Sensors: which way each beam points, how far it reaches; the catalogue.
 
-A sensor is a table: one elevation and one azimuth offset a ring, an azimuth step, a maximum range. Beam ``k`` of ring
-``r`` at azimuth index ``a`` is :math:`k = a \cdot channels + r`. Its direction in the sensor's frame (x forward, z up)
-is
+A sensor is rings, with one elevation and one azimuth offset a ring, an azimuth step and perhaps a field of view; beam
+``k`` of ring ``r`` at azimuth index ``a`` is :math:`k = a \cdot channels + r`. Or it is a table of beams, in the order
+of its rows (:mod:`pipeline.sensing.beam_tables`). A beam's direction in the sensor's frame (x forward, z up) is
 
 .. math:: (\cos\epsilon \cos\alpha,\; \cos\epsilon \sin\alpha,\; \sin\epsilon)
 
@@ -17,30 +17,34 @@ in.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import cosdg, sindg
 
 from pipeline.core.errors import InputError
+from pipeline.scenario.models import Scenario
 from pipeline.scenario.sensors import SensorModel
+from pipeline.sensing import beam_tables, catalogue
+from pipeline.sensing.beam_tables import BeamTable
 
 _DEFAULT = SensorModel.model_fields
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """A spinning LiDAR; what is not said of its optics is as in ``[sensors.<name>]``.
+    """A LiDAR: rings, all round or in a field of view, or a table of beams; what is not said of its optics is as in
+    ``[sensors.<name>]``.
 
     Attributes
     ----------
     elevations_deg, azimuth_offsets_deg
         One value a ring, in the order of the table.
     azimuths
-        Number of azimuth steps a turn.
+        Number of azimuths of a ring.
     range_m
         Maximum range.
     source
@@ -50,6 +54,12 @@ class Sensor:
         them.
     rated_range_m, rated_reflectivity
         A target of this reflectivity (0 to 1), met squarely, is still noticed at this range. Only effects ask for them.
+    azimuth_deg
+        First and last azimuth of a ring; None: all round, from 0.
+    table
+        Each beam's angles, instead of rings (then there are none).
+    assumed
+        What is not the maker's.
     """
 
     name: str
@@ -62,30 +72,50 @@ class Sensor:
     divergence_mrad: tuple[float, float] = _DEFAULT["divergence_mrad"].default
     rated_range_m: float | None = _DEFAULT["rated_range_m"].default
     rated_reflectivity: float = _DEFAULT["rated_reflectivity"].default
+    azimuth_deg: tuple[float, float] | None = None
+    table: BeamTable | None = None
+    assumed: str = ""
 
     @property
     def channels(self) -> int:
-        """Number of rings."""
+        """Number of rings; 0 where a table takes their place."""
         return len(self.elevations_deg)
 
     @property
     def beams(self) -> int:
-        """Number of beams in one turn."""
-        return self.channels * self.azimuths
+        """Number of beams in one turn or frame."""
+        return self.channels * self.azimuths if self.table is None else len(self.table)
+
+    @property
+    def elevation_span_deg(self) -> tuple[float, float]:
+        """The lowest and the highest elevation."""
+        angles = self.elevations_deg if self.table is None else self.table.elevation_deg
+        return float(min(angles)), float(max(angles))
+
+    @property
+    def azimuth_span_deg(self) -> tuple[float, float] | None:
+        """Where its field of view begins and ends, counter-clockwise, without the rings' offsets; None: all round."""
+        return self.azimuth_deg if self.table is None else self.table.azimuth_span_deg
+
+    @property
+    def azimuth_step_deg(self) -> float | None:
+        """Between two beams of a ring; None for a table, or a single beam."""
+        if self.azimuth_deg is None:
+            return 360.0 / self.azimuths if self.azimuths else None
+        first, last = self.azimuth_deg
+        return (last - first) / (self.azimuths - 1) if self.azimuths > 1 else None
 
     @property
     def middle_deg(self) -> tuple[float, float]:
         """Elevation and azimuth of the middle ray, which an aim points at something: halfway between the lowest and
-        the highest elevation; the azimuth of a sensor that sees all round is 0."""
-        return 0.5 * (min(self.elevations_deg) + max(self.elevations_deg)), 0.0
+        the highest elevation, and between the ends of the field of view; azimuth 0 for a sensor that sees all round."""
+        (low, high), span = self.elevation_span_deg, self.azimuth_span_deg
+        return 0.5 * (low + high), 0.5 * (span[0] + span[1]) if span is not None else 0.0
 
     def directions(self, yaw_deg: float = 0.0, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> NDArray[np.float64]:
         """Unit vectors of all beams along the world's axes, (beams, 3) float64, for a sensor mounted so."""
-        steps = np.arange(self.azimuths) * (360.0 / self.azimuths)
         upright = pitch_deg == 0.0 and roll_deg == 0.0
-        offsets = np.asarray(self.azimuth_offsets_deg) + (yaw_deg if upright else 0.0)
-        azimuth = np.round(np.mod(steps[:, None] + offsets[None, :], 360.0), 6)
-        elevation = np.asarray(self.elevations_deg)[None, :]
+        elevation, azimuth = self._angles_deg(yaw_deg if upright else 0.0)
         flat = cosdg(elevation)
         x, y = flat * cosdg(azimuth), flat * sindg(azimuth)
         z = np.broadcast_to(sindg(elevation), x.shape)
@@ -95,6 +125,20 @@ class Sensor:
         matrix = rotation(yaw_deg, pitch_deg, roll_deg)
         # Written out: a BLAS may sum in another order on another machine.
         return rays[:, :1] * matrix[:, 0] + rays[:, 1:2] * matrix[:, 1] + rays[:, 2:] * matrix[:, 2]
+
+    def _angles_deg(self, yaw_deg: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Elevations and azimuths that broadcast to all beams in order, turned by ``yaw_deg``."""
+        azimuth: NDArray[np.float64]
+        if self.table is not None:
+            azimuth = np.mod(self.table.azimuth_deg + yaw_deg, 360.0).round(6)
+            return self.table.elevation_deg, azimuth
+        if self.azimuth_deg is None:
+            steps = np.arange(self.azimuths) * (360.0 / self.azimuths)
+        else:
+            steps = self.azimuth_deg[0] + np.arange(self.azimuths) * (self.azimuth_step_deg or 0.0)
+        offsets = np.asarray(self.azimuth_offsets_deg) + yaw_deg
+        azimuth = np.mod(steps[:, None] + offsets[None, :], 360.0).round(6)
+        return np.asarray(self.elevations_deg)[None, :], azimuth
 
 
 def rotation(yaw_deg: float, pitch_deg: float, roll_deg: float) -> NDArray[np.float64]:
@@ -107,100 +151,55 @@ def rotation(yaw_deg: float, pitch_deg: float, roll_deg: float) -> NDArray[np.fl
     return matrix
 
 
-# Elevation and azimuth offset of the VLP-32C in firing order.
-_VLP_32C = (
-    (-25, 1.4), (-1, -4.2), (-1.667, 1.4), (-15.639, -1.4), (-11.31, 1.4), (0, -1.4), (-0.667, 4.2), (-8.843, -1.4),
-    (-7.254, 1.4), (0.333, -4.2), (-0.333, 1.4), (-6.148, -1.4), (-5.333, 4.2), (1.333, -1.4), (0.667, 4.2), (-4, -1.4),
-    (-4.667, 1.4), (1.667, -4.2), (1, 1.4), (-3.667, -4.2), (-3.333, 4.2), (3.333, -1.4), (2.333, 1.4), (-2.667, -1.4),
-    (-3, 1.4), (7, -1.4), (4.667, 1.4), (-2.333, -4.2), (-2, 4.2), (15, -1.4), (10.333, 1.4), (-1.333, -1.4),
-)  # fmt: skip
-
-
 def _uniform(first: float, last: float, channels: int) -> tuple[float, ...]:
     return tuple(float(np.round(e, 9)) for e in np.linspace(first, last, channels))
 
 
-def _plain(
-    name: str, elevations: tuple[float, ...], azimuths: int, range_m: float, source: str, **optics: Any
-) -> Sensor:
-    return Sensor(name, elevations, (0.0,) * len(elevations), azimuths, range_m, source, **optics)
+class _Catalogue(Mapping[str, Sensor]):
+    """The sensors of ``catalogue.toml``, each made when it is first asked for."""
+
+    def __init__(self) -> None:
+        self._made: dict[str, Sensor] = {}
+
+    def __getitem__(self, name: str) -> Sensor:
+        if name not in self._made:
+            entry = catalogue.entries()[name]
+            sensor = _made(name, entry, entry.source, Path)
+            self._made[name] = replace(sensor, assumed=entry.assumed)
+        return self._made[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(catalogue.entries())
+
+    def __len__(self) -> int:
+        return len(catalogue.entries())
 
 
-# Velodyne's VLP-16 and VLP-32C: 903 nm; a range "up to" 100 m or 200 m, of no stated reflectivity. Assumed: 0.8, at
-# which the maker rates its HDL-64E (120 m; 50 m at 0.1); and the divergence that it states for its VLS-128 (user manual
-# 63-9483), 3.0 mrad across and 1.5 mrad along the elevation.
-_VELODYNE: dict[str, Any] = {"wavelength_nm": 903.0, "divergence_mrad": (3.0, 1.5), "rated_reflectivity": 0.8}
-
-# Hesai PandarXT-32: 905 nm, 80 m at 10 %, of no stated chance. The outer rings may reach less far, as they do in the
-# PandarXT-16 (user manual: 80 m within 7 degrees of level, 50 m beyond). Its divergence is assumed: the default.
-_XT_32: dict[str, Any] = {"wavelength_nm": 905.0, "rated_range_m": 80.0, "rated_reflectivity": 0.1}
-
-# Ouster OS1 datasheet, revision 6: 865 nm; at 1024 columns and 10 Hz, 10 % reflectivity and 100 klx, 55 m at a chance
-# above 50 % (45 m above 90 %). At 80 % it says 120 m (100 m); the power law says 156 m. Divergence: 0.18 deg at half
-# maximum (an earlier datasheet, of the field of view of 45 deg), which is 1.70 times as wide at 1/e^2: 5.34 mrad. Left
-# out: the beams' azimuth offsets, about 1.4 and 4.2 deg to either side.
-_OS1: dict[str, Any] = {
-    "wavelength_nm": 865.0,
-    "divergence_mrad": (5.34, 5.34),
-    "rated_range_m": 55.0,
-    "rated_reflectivity": 0.1,
-}
-
-CATALOGUE: Mapping[str, Sensor] = {
-    s.name: s
-    for s in (
-        _plain(
-            "VLP-16", tuple(float(e) for pair in zip(range(-15, 0, 2), range(1, 16, 2), strict=True) for e in pair),
-            1800, 100.0, "Velodyne VLP-16 User Manual 63-9243, laser angles in firing order; 0.2 deg at 10 Hz",
-            rated_range_m=100.0, **_VELODYNE,
-        ),
-        Sensor(
-            "VLP-32C", tuple(float(e) for e, _ in _VLP_32C), tuple(a for _, a in _VLP_32C),
-            1800, 200.0, "Velodyne VLP-32C User Manual 63-9325, firing order; 0.2 deg at 10 Hz",
-            rated_range_m=200.0, **_VELODYNE,
-        ),
-        _plain(
-            "Pandar XT-32", _uniform(15, -16, 32),
-            2000, 120.0, "Hesai PandarXT-32 User Manual, design values, 1 deg apart; 0.18 deg at 10 Hz", **_XT_32,
-        ),
-        _plain(
-            "OS1-64", _uniform(22.5, -22.5, 64),
-            1024, 120.0, "Ouster OS1 datasheet (gen 2), 45 deg uniform, 1024 columns", **_OS1,
-        ),
-        _plain(
-            "OS1-128", _uniform(22.5, -22.5, 128),
-            1024, 120.0, "Ouster OS1 datasheet (gen 2), 45 deg uniform, 1024 columns", **_OS1,
-        ),
-    )
-}  # fmt: skip
-"""The sensors that need no table of the user's; elevations are the makers' design values. A further one is an entry
-here, its number of beams in ``tests/sensing/test_sensors.py``, and a row in ``docs/effects.md`` that says where its
-rated range is from."""
+CATALOGUE: Mapping[str, Sensor] = _Catalogue()
+"""The sensors that need no table of the user's. A further one is an entry of ``catalogue.toml``, its number of beams in
+``tests/sensing/test_sensors.py``, and a row in ``docs/effects.md`` that says where its rated range is from."""
 
 
-def resolve(name: str, own: Mapping[str, SensorModel], place: str) -> Sensor:
+def of_scenario(name: str, scenario: Scenario, place: str) -> Sensor:
+    """The sensor called ``name``, see :func:`resolve`; its beam table is found as the scenario finds files."""
+    return resolve(name, scenario.sensors, place, lambda file: scenario.find(file, f"sensors.{name}.beams"))
+
+
+def resolve(name: str, own: Mapping[str, SensorModel], place: str, find: Callable[[str], Path] = Path) -> Sensor:
     """The sensor called ``name``: the user's own first, then the catalogue's.
+
+    Parameters
+    ----------
+    find
+        Where the beam table of an own sensor is.
 
     Raises
     ------
     InputError
-        Naming the place, and the nearest names that exist.
+        Naming the place, and the nearest names that exist; or what is wrong with a beam table.
     """
     if name in own:
-        model = own[name]
-        elevations = tuple(model.elevations_deg)
-        if model.channels not in (None, len(elevations)):
-            elevations = _uniform(elevations[0], elevations[1], model.channels or 0)
-        offsets = tuple(model.azimuth_offsets_deg) or (0.0,) * len(elevations)
-        return Sensor(
-            name,
-            elevations,
-            offsets,
-            round(360.0 / model.azimuth_step_deg),
-            model.range_m,
-            "the scenario",
-            **model.optics,
-        )
+        return _made(name, own[name], "the scenario", find)
     if name in CATALOGUE:
         return CATALOGUE[name]
     known = [*own, *CATALOGUE]
@@ -208,3 +207,19 @@ def resolve(name: str, own: Mapping[str, SensorModel], place: str) -> Sensor:
     raise InputError(
         place, f"unknown sensor {name!r}", f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
     )
+
+
+def _made(name: str, model: SensorModel, source: str, find: Callable[[str], Path]) -> Sensor:
+    """The sensor that some keys describe."""
+    elevations, table = tuple(model.elevations_deg), None
+    if model.beams is not None:
+        table = beam_tables.read(find(model.beams))
+    elif model.pattern is not None:
+        table = beam_tables.of_pattern(model.pattern)
+    elif model.channels not in (None, len(elevations)):
+        elevations = _uniform(elevations[0], elevations[1], model.rings)
+    offsets = tuple(model.azimuth_offsets_deg) or (0.0,) * len(elevations)
+    return Sensor(
+        name, elevations, offsets, model.azimuths, model.range_m, source, azimuth_deg=model.azimuth_deg, table=table,
+        **model.optics,
+    )  # fmt: skip

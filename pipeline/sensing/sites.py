@@ -25,6 +25,7 @@ from pipeline.scenario.models import Scenario, SiteGrid, SiteLine
 from pipeline.scenario.types import FARTHEST_M
 from pipeline.sensing import aiming, own_columns, sensors
 from pipeline.sensing.aiming import Wishes
+from pipeline.sensing.sensors import Sensor
 
 _NEEDED = ("site", "x_m", "y_m", "z_m")
 _ANGLES = ("yaw_deg", "pitch_deg", "roll_deg")
@@ -120,8 +121,9 @@ def of(scenario: Scenario) -> tuple[Site, ...]:
     found: dict[str, Site] = {}
     poles: dict[tuple[float, float], str] = {}
     used: set[str] = set()
+    known: dict[str, Sensor] = {}
     for row in rows:
-        for site in _candidates(row, scenario, poles, used):
+        for site in _candidates(row, scenario, poles, used, known):
             if site.name in found:
                 raise InputError(row.place, f"site {site.name!r} stands there twice", "a name of its own for each site")
             found[site.name] = site
@@ -160,8 +162,15 @@ class _Row:
     heights_m: tuple[float, ...] = ()
 
 
-def _candidates(row: _Row, scenario: Scenario, poles: dict[tuple[float, float], str], used: set[str]) -> Iterator[Site]:
-    """The candidates of one place; ``poles`` and ``used`` (keys of ``[sites]``) take what it adds."""
+def _candidates(
+    row: _Row,
+    scenario: Scenario,
+    poles: dict[tuple[float, float], str],
+    used: set[str],
+    known: dict[str, Sensor],
+) -> Iterator[Site]:
+    """The candidates of one place; ``poles``, ``used`` (keys of ``[sites]``) and ``known`` (sensors) take what it
+    adds."""
     place, columns = row.place, row.columns
     other = own_columns.own_columns(place, columns, _KNOWN)
     _check_columns(row, scenario)
@@ -170,9 +179,13 @@ def _candidates(row: _Row, scenario: Scenario, poles: dict[tuple[float, float], 
     points = str(columns["points"]).strip() if columns.get("points") else None
     wishes = _wishes(row, scenario)
     pole = poles.setdefault((wishes.x_m, wishes.y_m), name)
-    mounts = aiming.mounts(
-        place, wishes, scenario, lambda: sensors.resolve(sensor, scenario.sensors, f"{place}: sensor"), used
-    )
+
+    def aimed_sensor() -> Sensor:
+        if sensor not in known:
+            known[sensor] = sensors.of_scenario(sensor, scenario, f"{place}: sensor")
+        return known[sensor]
+
+    mounts = aiming.mounts(place, wishes, scenario, aimed_sensor, used)
     if points is not None and len(mounts) > 1:
         raise InputError(f"{place}: points", f"one measured scan for {len(mounts)} mounts", "one height and one pitch")
     for mount in mounts:

@@ -29,7 +29,7 @@ from pipeline.scoring.visibility import Beams, in_voxels
 from pipeline.sensing.sites import ScannedSite
 from pipeline.stages.base import StageInputs, Summary, Workspace
 from pipeline.stages.shared.scans import SiteBeams, scans
-from pipeline.stages.shared.scene import SCANS, scan_inputs, scene_of
+from pipeline.stages.shared.scene import SCANS, scan_inputs, scene_of, sensor_digests
 
 NAME = "score"
 ARTEFACTS = ("scores.parquet", "visibility.parquet")
@@ -66,6 +66,8 @@ def inputs(work: Workspace) -> StageInputs:
         settings["effects"] = registry.settings(live)
         settings["sensors"] = {name: model.model_dump(mode="json") for name, model in scenario.sensors.items()}
     hashes = work.digests("tpog.parquet", *(name for effect in live for name in effect.reads))
+    if live:
+        hashes |= sensor_digests(scenario, scene_of(work).sites)
     modules = registry.modules(live)
     if scenario.scan.keep:
         return StageInputs(settings, hashes | work.digests(SCANS), modules=modules)

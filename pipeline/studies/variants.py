@@ -29,7 +29,7 @@ from pipeline.scenario.models import Scenario
 from pipeline.scenario.traffic import FRAMES as FRAMES_OF_A_SCENARIO
 from pipeline.scenario.traffic import TrafficModel
 from pipeline.sensing import sites
-from pipeline.sensing.sensors import Sensor, resolve
+from pipeline.sensing.sensors import Sensor, of_scenario
 from pipeline.traffic.finished.survey import recorded_frames
 
 APPROXIMATES, MEASURES, REFERENCE, SCENARIO = "approximates", "measures", "reference", "scenario"
@@ -173,7 +173,9 @@ def _thinned(scenario: Scenario) -> Iterator[Setting]:
     if any(site.points is not None for site in candidates):
         return
     names = dict.fromkeys(site.sensor for site in candidates)
-    used = [resolve(name, scenario.sensors, f"{scenario.file}: sensors") for name in names]
+    used = [of_scenario(name, scenario, f"{scenario.file}: sensors") for name in names]
+    if any(sensor.table is not None for sensor in used):
+        return
     for factor in THINNED:
         if all(sensor.azimuths % factor == 0 for sensor in used):
             changes = [o for s in used for o in _sensor(scenario, s, factor, range(s.channels))]
@@ -194,8 +196,11 @@ def _weighted(scenario: Scenario, name: str, knob: str, changes: list[str], weig
 def _sensor(scenario: Scenario, sensor: Sensor, factor: int, rings: range | list[int]) -> Iterator[str]:
     """Overrides that make a sensor of the same name with fewer beams."""
     own = scenario.sensors.get(sensor.name)
-    step = own.azimuth_step_deg if own is not None else 360.0 / sensor.azimuths
+    step = (own.azimuth_step_deg if own is not None else sensor.azimuth_step_deg) or 360.0
     values: dict[str, object] = {"azimuth_step_deg": step * factor}
+    if sensor.azimuth_deg is not None:  # from the first azimuth to the last that is left
+        first = sensor.azimuth_deg[0]
+        values["azimuth_deg"] = [first, first + step * factor * (sensor.azimuths // factor - 1)]
     if len(rings) < sensor.channels or own is None:
         values["elevations_deg"] = [sensor.elevations_deg[r] for r in rings]
         values["azimuth_offsets_deg"] = [sensor.azimuth_offsets_deg[r] for r in rings]

@@ -70,7 +70,8 @@ def test_columns_and_metadata_are_those_declared(done: tuple[Path, Path]) -> Non
     sites = tables.read_metadata(out / "scans.parquet", "scans")["sites"]
     assert [s["site"] for s in sites] == ["pole_a", "pole_b"]
     assert set(sites[0]) == {
-        "site", "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg", "sensor", "beams", "beams_in_roi", "returns",
+        "site", "pole", "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg", "sensor", "beams", "beams_in_roi",
+        "returns",
     }  # fmt: skip
     about = tables.read_metadata(out / "tpog.parquet", "tpog")
     assert about["grid"] == {"origin_m": [0.0, -10.0, 0.0], "voxel_m": 0.5, "shape": [80, 40, 10]}

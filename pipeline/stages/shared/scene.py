@@ -10,6 +10,7 @@ from pipeline.effects import registry, scene_resolving
 from pipeline.effects.base import Effect
 from pipeline.formats import point_clouds
 from pipeline.scenario.models import Scenario
+from pipeline.sensing import catalogue
 from pipeline.sensing.scene import Scene
 from pipeline.sensing.sites import Site
 from pipeline.stages.base import StageInputs, Workspace
@@ -44,11 +45,24 @@ def scan_inputs(work: Workspace) -> StageInputs:
 
 
 def site_digests(scenario: Scenario, sites: Iterable[Site]) -> dict[str, str]:
-    """The files that say where sites are, and what was measured there, by sha256."""
+    """The files that say where sites are, what was measured there, and what their sensors are, by sha256."""
+    sites = tuple(sites)
     hashes = {}
     if scenario.sites.file is not None:
         hashes[scenario.sites.file] = files.sha256_of(scenario.find(scenario.sites.file, "sites.file"))
     for site in sites:
         if site.points is not None:
             hashes[site.points] = files.sha256_of(scenario.find(site.points, f"site {site.name}: points"))
+    return hashes | sensor_digests(scenario, sites)
+
+
+def sensor_digests(scenario: Scenario, sites: Iterable[Site]) -> dict[str, str]:
+    """The beam tables of the sites' own sensors, and the catalogue's entries of the others, by sha256."""
+    hashes = {}
+    for name in dict.fromkeys(site.sensor for site in sites):
+        own = scenario.sensors.get(name)
+        if own is not None and own.beams is not None:
+            hashes[own.beams] = files.sha256_of(scenario.find(own.beams, f"sensors.{name}.beams"))
+        elif own is None and name in catalogue.entries():
+            hashes[f"catalogue: {name}"] = catalogue.digest(name)
     return hashes
