@@ -15,14 +15,14 @@ from pipeline.sensing.scene import Scene
 
 
 def known(subject: Subject) -> Iterator[Finding]:
-    """An error for each sensor that nobody knows, and which sites name it."""
+    """An error for each sensor that nobody knows, or whose table is wrong, and which sites name it."""
     names: dict[str, list[str]] = {}
     for site in subject.sites:
         names.setdefault(site.sensor, []).append(site.name)
     for sensor, of in names.items():
         more = f" and {len(of) - 1} more" if len(of) > 1 else ""
         try:
-            sensors.resolve(sensor, subject.scenario.sensors, f"site {of[0]}{more}")
+            sensors.of_scenario(sensor, subject.scenario, f"site {of[0]}{more}")
         except InputError as error:
             yield Finding.of("sensors", error)
 

@@ -13,7 +13,7 @@ from pipeline.checks.subject import Subject
 from pipeline.core.errors import InputError
 from pipeline.core.findings import Finding
 from pipeline.kernels import rays
-from pipeline.sensing import placing, sensors
+from pipeline.sensing import placing
 from pipeline.sensing.sensors import Sensor
 from pipeline.sensing.sites import Site
 from pipeline.world import limits
@@ -32,7 +32,7 @@ def poses(subject: Subject) -> Iterator[Finding]:
         return
     for site in subject.sites:
         try:
-            sensor = sensors.resolve(site.sensor, subject.scenario.sensors, "")
+            sensor = subject.scene.sensor(site.sensor)
         except InputError:
             continue  # told elsewhere
         try:
