@@ -130,6 +130,8 @@ class _Reader:
                 self._file.mended["solids that are there twice"] += 1
                 continue
             self._seen.add(same)
+            if extent.source == "default" and solid.height_m is None:
+                self._file.mended[f"heights taken as {self._height_m:g} m"] += 1
             into = self._white if element.get("color") in _WHITE else self._file.footprints
             into.append(Footprint(name, shown or "polygon", area, extent.base_m, extent.top_m))
         return extent.base_m

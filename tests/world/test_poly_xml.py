@@ -279,7 +279,7 @@ def test_a_courtyard_is_cut_out_of_what_surrounds_it(tmp_path: Path) -> None:
         poly("inner", far),
     )  # fmt: skip
     assert [area for *_, area in extents(file)] == [300.0, 4.0, 4.0]  # the last is a hole in a wood: it stays
-    assert file.mended == {"courtyards cut out": 1}
+    assert file.mended == {"courtyards cut out": 1, "heights taken as 9 m": 2}
 
 
 @pytest.mark.parametrize("color", ["white", "255,255,255"])
@@ -327,7 +327,7 @@ def test_what_stands_there_twice_is_built_once(tmp_path: Path) -> None:
     """With full types, polyconvert writes a tower as a building and as a tower."""
     file = read(tmp_path, poly("building.yes"), poly("man_made.tower"), poly("historic.yes"))
     assert len(file.footprints) == 1
-    assert file.mended == {"solids that are there twice": 1}
+    assert file.mended == {"solids that are there twice": 1, "heights taken as 9 m": 1}
 
 
 @pytest.mark.parametrize(
