@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from functools import cache
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,8 @@ from pipeline.world import limits
 
 MOST_LISTED = 8
 """So many sites get a line of their own; the others share one."""
+
+_MOUNTS = 4  # whose beams are kept, 1.4 MB each of 57,600: sites that share a mount come one after another
 
 
 def poses(subject: Subject) -> Iterator[Finding]:
@@ -88,6 +90,6 @@ def _meets(subject: Subject, site: Site, sensor: Sensor) -> bool:
     return bool(reaches.any())
 
 
-@cache
+@lru_cache(maxsize=_MOUNTS)
 def _directions(sensor: Sensor, angles_deg: tuple[float, float, float]) -> NDArray[np.float64]:
     return sensor.directions(*angles_deg)

@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from pipeline.artefacts import schemas, tables
 from pipeline.artefacts.foreign_columns import foreign_columns
 from pipeline.artefacts.readers import read_tpog
+from pipeline.checks import recorded
+from pipeline.core.findings import WARNINGS
 from pipeline.core.grid import Grid
 from pipeline.core.parallel import in_order
 from pipeline.effects import registry
@@ -126,6 +128,9 @@ def run(
         summary |= uncertainty.in_words(estimate, tpog.frames)
     if audit:
         summary["audit"] = _worst([d.audit for d in done if d.audit is not None])
+    if work.scenario.traffic.fcd is not None:  # without a network, the record alone knows the road
+        found = recorded.on_the_road(scene_of(work).sites, tpog)
+        summary[WARNINGS] = [*summary.get(WARNINGS, ()), *(finding.to_json() for finding in found)]
     return summary
 
 

@@ -10,11 +10,12 @@ from pipeline.core import files
 from pipeline.effects import on_traffic
 from pipeline.stages.base import StageInputs, Summary, Workspace
 from pipeline.stages.shared.built import built
+from pipeline.stages.shared.world import STATICS, remember_world
 from pipeline.traffic import sumo_folder
 from pipeline.world.mesh import write_ply
 
 NAME = "statics"
-ARTEFACTS = ("statics.ply",)
+ARTEFACTS = (STATICS,)
 
 
 def inputs(work: Workspace) -> StageInputs:
@@ -41,6 +42,7 @@ def run(work: Workspace, inputs: StageInputs) -> Summary:
     """
     ground = on_traffic.ground(work.scenario)
     world, counts = built(work)
-    write_ply(work.path(ARTEFACTS[0]), world, work.metadata(inputs, seeded=False))
+    write_ply(work.path(STATICS), world, work.metadata(inputs, seeded=False))
+    remember_world(work, world)
     notes = {} if ground is None else {"notes": [f"{ground.NAME}: on, the ground follows the network's roads"]}
     return {"triangles": len(world.faces), "solids": len(world.solids), **counts.to_json(), **notes}

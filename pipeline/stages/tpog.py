@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 from pipeline.artefacts import tables
 from pipeline.artefacts.recorded_boxes import read_boxes
+from pipeline.checks import recorded
 from pipeline.core.errors import InputError
+from pipeline.core.findings import WARNINGS
 from pipeline.scoring.occupancy import count_blocks, static_voxels
 from pipeline.stages.base import StageInputs, Summary, Workspace
 from pipeline.stages.shared.world import world_of
@@ -42,7 +44,7 @@ def run(work: Workspace, inputs: StageInputs) -> Summary:
     -------
     dict
         ``occupied_voxels``, ``static_voxels`` (left out), ``boxes_in_roi`` (mean a frame); ``left_over`` where a
-        finished file's frames are no whole number of blocks.
+        finished file's frames are no whole number of blocks; warnings.
     """
     source, scenario = work.path("trajectories.parquet"), work.scenario
     grid, blocks = scenario.roi.grid, scenario.tpog.blocks
@@ -53,20 +55,30 @@ def run(work: Workspace, inputs: StageInputs) -> Summary:
         raise InputError(f"{scenario.file}: tpog.blocks", found, f"a divisor, or at most {frames}")
     frames -= left_over
     filled = static_voxels(world_of(work), grid)
+    solid, seen = np.flatnonzero(filled), 0
+    hidden = np.zeros(len(solid), dtype=np.int64)
     block_frames, in_roi, ever = frames // blocks, 0, np.zeros(grid.shape, dtype=np.bool_)
     with tables.writer(work.path(ARTEFACTS[0]), "tpog") as file:
         counted = count_blocks(read_boxes(source, grid), grid, block_frames, blocks)
         for block, (counts, boxes_near) in enumerate(counted):
+            hidden += counts.ravel()[solid]
             counts[filled] = 0
-            file.write(_sparse(block, counts))
+            rows = _sparse(block, counts)
+            file.write(rows)
+            seen += int(rows["count"].sum())
             ever |= counts > 0
             in_roi += boxes_near
             work.progress("blocks", block + 1, blocks)
         file.describe(work.metadata(inputs, grid=grid.to_json(), frames=frames, block_frames=block_frames))
+    doubts = [
+        *recorded.in_region(in_roi / frames),
+        *recorded.through_solids(hidden, seen, solid, grid, world_of(work)),
+    ]
     summary: Summary = {
         "occupied_voxels": int(ever.sum()),
-        "static_voxels": int(filled.sum()),
+        "static_voxels": len(solid),
         "boxes_in_roi": in_roi / frames,
+        WARNINGS: [finding.to_json() for finding in doubts],
     }
     if left_over:
         summary["left_over"] = f"the last {left_over} of {frames + left_over} frames, so that {blocks} blocks are alike"

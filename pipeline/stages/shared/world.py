@@ -11,3 +11,8 @@ STATICS = "statics.ply"
 def world_of(work: Workspace) -> World:
     """The static world."""
     return work.remember("world", (STATICS,), lambda: read_ply(work.path(STATICS))[0])
+
+
+def remember_world(work: Workspace, world: World) -> None:
+    """The static world that was just written, so that it need not be read, nor looked through, again."""
+    work.remember("world", (STATICS,), lambda: world)
