@@ -24,6 +24,30 @@ class VehicleKind(StrictModel):
     )
 
 
+class CountModel(StrictModel):
+    """Vehicles an hour that were counted on an edge, or on their way from one edge to another."""
+
+    edge: str | None = Field(None, description="Id of an edge of the network; or from_edge and to_edge")
+    from_edge: str | None = Field(None, description="Id of the edge from which vehicles were counted")
+    to_edge: str | None = Field(None, description="Id of the edge to which they drove, at the next junction or beyond")
+    per_hour: float = Field(ge=0, le=1e5, description="Vehicles an hour")
+    kind: str = Field("", description="The kind counted; not given: the whole fleet, its kinds by their shares")
+
+    @model_validator(mode="after")
+    def _one_place(self) -> CountModel:
+        given = tuple(key is not None for key in (self.edge, self.from_edge, self.to_edge))
+        if given not in ((True, False, False), (False, True, True)):
+            raise ValueError("either edge, or both from_edge and to_edge are needed")
+        if self.edge is None and self.from_edge == self.to_edge:
+            raise ValueError(f"from_edge and to_edge are both {self.from_edge!r}")
+        return self
+
+    @property
+    def title(self) -> str:
+        """The counted place in words."""
+        return self.edge or f"{self.from_edge} to {self.to_edge}"
+
+
 _FLEET = (
     VehicleKind(name="car", share=0.78, length_m=4.5, width_m=1.75, height_m=1.5),
     VehicleKind(name="van", vclass="delivery", share=0.12, length_m=4.9, width_m=1.9, height_m=2.1),
@@ -45,9 +69,13 @@ SOURCES = ("network", "sumocfg", "fcd")
 """Keys that say where vehicles come from; a scenario has one of them."""
 
 
+_RATES = frozenset({"vehicles_per_lane_km", "trips_per_s", "min_trip_m"})
+"""Keys that say how many trips are drawn where none were counted."""
+
+
 def idle_beside(source: str) -> frozenset[str]:
     """The keys that act on nothing with this source: one of :data:`SOURCES`, or "routes" for a network with routes."""
-    drawn = frozenset({"vehicles_per_lane_km", "trips_per_s", "min_trip_m", "edge_weights", "kinds"})
+    drawn = _RATES | {"counts", "edge_weights", "kinds"}
     simulated = frozenset({"vehicles", "hold", "step_s", "lateral_resolution_m", "max_depart_delay_s"})
     if source == "fcd":
         return simulated | drawn - {"kinds"} | {"routes"}
@@ -113,6 +141,9 @@ class TrafficModel(StrictModel):
         default_factory=dict,
         description="Drawn trips that start or end at an edge, relative to others; its number of lanes if not named",
     )
+    counts: tuple[CountModel, ...] = Field(
+        (), description="Counted vehicles; not given: trips are drawn between the network's fringe edges"
+    )
     kinds: tuple[VehicleKind, ...] = Field(
         _FLEET, min_length=1, description="The fleet of drawn trips; the sizes in a finished FCD file"
     )
@@ -133,10 +164,12 @@ class TrafficModel(StrictModel):
     def _not_endless(self) -> TrafficModel:
         frames = self.frames or 0
         lasts_s = self.warmup_s + frames * self.frame_period_s
+        counted_per_s = sum(count.per_hour for count in self.counts) / 3600.0
         for what, amount, most in (
             ("frames", frames, 10_000_000),
             ("seconds of traffic", lasts_s, 1e7),
             ("drawn trips (trips_per_s times these seconds)", lasts_s * self.trips_per_s, 1e7),
+            ("counted vehicles (per_hour for all this time)", lasts_s * counted_per_s, 1e7),
         ):
             if amount > most:
                 raise ValueError(f"{amount:,.0f} {what}: at most {most:,.0f} can be handled")
@@ -154,4 +187,6 @@ class TrafficModel(StrictModel):
             source = "routes"
         if idle := self.model_fields_set & idle_beside(source):
             return source, set(idle)
+        if self.counts and (idle := self.model_fields_set & _RATES):
+            return "counts", idle
         return "vehicles", self.model_fields_set & ({"vehicles_per_lane_km"} if self.vehicles is not None else set())

@@ -25,6 +25,9 @@ from pipeline.core import files
 from pipeline.core.errors import InputError
 from pipeline.formats import safe_xml
 
+DEFAULT_SPEED_M_S = 13.89
+"""The speed limit of a lane where the network names none."""
+
 LANE_WIDTH_M = 3.2
 """A lane's width where the network names none: SUMO's default."""
 
@@ -89,6 +92,7 @@ class Lane(Shape):
     width_m: float | None
     length_m: float
     permission: Permission
+    speed_m_s: float = DEFAULT_SPEED_M_S
 
     @property
     def is_pavement(self) -> bool:
@@ -106,6 +110,8 @@ class Edge:
     to_node: str
     name: str
     lanes: tuple[Lane, ...]
+    type: str = ""
+    """As the map has it ("highway.primary"); empty where the network names none."""
 
     @cached_property
     def start_m(self) -> tuple[float, float]:
@@ -116,6 +122,11 @@ class Edge:
     def end_m(self) -> tuple[float, float]:
         """Where its first lane ends."""
         return _point(self.lanes[0].text.split()[-1])
+
+    @property
+    def seconds(self) -> float:
+        """How long its fastest lane takes at the speed limit."""
+        return self.lanes[0].length_m / max(lane.speed_m_s for lane in self.lanes)
 
     def lanes_for(self, vclass: str) -> int:
         """How many of its lanes ``vclass`` may use."""
@@ -295,8 +306,9 @@ def _read(file: _Named, _content: str) -> Network:
 
 
 def _edge(element: Element, path: Path) -> Edge:
-    function, start, end, name = (element.get(key, "") for key in ("function", "from", "to", "name"))
-    edge = Edge(element.attrib["id"], function, start, end, name, tuple(_lane(e, path) for e in element.iter("lane")))
+    function, start, end, name, kind = (element.get(key, "") for key in ("function", "from", "to", "name", "type"))
+    lanes = tuple(_lane(lane, path) for lane in element.iter("lane"))
+    edge = Edge(element.attrib["id"], function, start, end, name, lanes, kind)
     if not function:
         if not start or not end:
             raise KeyError("to" if start else "from")
@@ -307,7 +319,8 @@ def _edge(element: Element, path: Path) -> Edge:
 def _lane(lane: Element, path: Path) -> Lane:
     width_m = float(lane.attrib["width"]) if "width" in lane.attrib else None
     length_m, place = float(lane.get("length", 0)), f"{path}: lane {lane.get('id', '')}"
-    return Lane(lane.attrib["shape"], place, width_m, length_m, Permission.of(lane.attrib))
+    speed_m_s = float(lane.get("speed", DEFAULT_SPEED_M_S))
+    return Lane(lane.attrib["shape"], place, width_m, length_m, Permission.of(lane.attrib), speed_m_s)
 
 
 def _junction(junction: dict[str, str], path: Path) -> Junction:

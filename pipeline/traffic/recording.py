@@ -15,17 +15,20 @@ from time import perf_counter
 import pyarrow as pa
 
 from pipeline.core.errors import InputError
+from pipeline.core.findings import Finding
 from pipeline.core.progress import Progress
 from pipeline.formats import safe_xml
 from pipeline.scenario.models import Scenario
 from pipeline.traffic import fcd, live, network, sumo, sumo_folder
 from pipeline.traffic.boxes import Size
+from pipeline.traffic.demand import counts
+from pipeline.traffic.demand.counts import MetCount
 from pipeline.traffic.extensions import TrafficExtension
 from pipeline.traffic.finished import sizes as finished_sizes
 from pipeline.traffic.finished import survey
 from pipeline.traffic.finished.sizes import kind_sizes
 from pipeline.traffic.frames import Window
-from pipeline.traffic.sumo_folder import COLLISIONS, CONFIG, FCD, LOG, PERSONS, STOPS, Prepared, as_flags
+from pipeline.traffic.sumo_folder import COLLISIONS, CONFIG, DRIVEN, FCD, LOG, PERSONS, STOPS, Prepared, as_flags
 
 _LEAST_PATIENCE_S = 180.0
 
@@ -39,6 +42,9 @@ class RecordingSummary:
     flags: list[str] | None
     collisions: int
     notes: list[str] = field(default_factory=list)
+    counts: list[MetCount] = field(default_factory=list)
+    """Counted against simulated, in the order of the scenario."""
+    warnings: list[Finding] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -116,7 +122,9 @@ def _simulated(
     path, persons = folder / FCD, folder / PERSONS
     try:
         seconds, flags = round(simulate(prepared, progress), 3), as_flags(prepared.options | prepared.outputs)
-        summary = RecordingSummary(sumo.version(), seconds, flags, _collisions(prepared), prepared.notes)
+        summary = RecordingSummary(
+            sumo.version(), seconds, flags, _collisions(prepared), prepared.notes, *_met(scenario, prepared)
+        )
         yield Recording(
             fcd.read(path) if _has_rows(path) else (),
             prepared.timing.window(),
@@ -129,8 +137,8 @@ def _simulated(
             lambda: summary,
         )
     finally:
-        path.unlink(missing_ok=True)
-        persons.unlink(missing_ok=True)
+        for written in (path, persons, folder / DRIVEN):
+            written.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -203,6 +211,16 @@ def _collisions(prepared: Prepared) -> int:
         if float(c.get("time", "0")) * 1000.0 >= prepared.timing.first_ms
     }
     return len(pairs)
+
+
+def _met(scenario: Scenario, prepared: Prepared) -> tuple[list[MetCount], list[Finding]]:
+    """Counted against simulated, and what to know of it."""
+    if not prepared.counted:
+        return [], []
+    when = prepared.timing
+    first_s, end_s = when.first_ms / 1000.0, (when.first_ms + when.frames * when.period_ms) / 1000.0
+    met = counts.met(scenario.traffic, prepared.folder / DRIVEN, first_s, end_s)
+    return met, counts.findings(met, (end_s - first_s) / 3600.0, sumo_folder.place_of(scenario))
 
 
 def _stopped_on_purpose(prepared: Prepared) -> set[str]:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 import re
 import subprocess
+import sys
 import tempfile
 import time
 import warnings
@@ -125,6 +126,21 @@ def run(
         text = complaint if capture == subprocess.PIPE else log.read_bytes()
         raise failure(name, process.returncode, (text or b"").decode("utf-8", "replace"))
     return printed.decode("utf-8", "replace")
+
+
+def run_tool(name: str, arguments: Sequence[str], folder: Path) -> str:
+    """Run one of SUMO's Python tools, e.g. ``"routeSampler.py"``, to its end and return what it printed.
+
+    RunError when it ends with an error; MissingBackendError when it is not installed.
+    """
+    tool = sumo_home() / "tools" / name
+    if not tool.is_file():
+        raise MissingBackendError(f"SUMO's tool {name} is not in {tool.parent}: pip install eclipse-sumo")
+    command = [sys.executable, str(tool), *arguments]
+    done = subprocess.run(command, cwd=folder, env=environment(), stdin=subprocess.DEVNULL, capture_output=True)
+    if done.returncode:
+        raise failure(name, done.returncode, done.stderr.decode("utf-8", "replace"))
+    return done.stdout.decode("utf-8", "replace")
 
 
 def _start(name: str, arguments: Sequence[str], folder: Path, printed: Any, complaints: Any) -> subprocess.Popen[bytes]:

@@ -27,12 +27,15 @@ from pipeline.formats import osm, safe_xml
 from pipeline.scenario.models import Scenario
 from pipeline.scenario.traffic import TrafficModel
 from pipeline.traffic import network, sumo
+from pipeline.traffic.demand import counts
 from pipeline.traffic.demand import trips as demand
 from pipeline.traffic.extensions import TrafficExtension
 from pipeline.traffic.frames import Window
 
 CONFIG, NETWORK, TRIPS, VTYPES = "run.sumocfg", "network.net.xml", "trips.rou.xml", "vtypes.add.xml"
 FCD, COLLISIONS, STOPS, LOG = "fcd.csv", "collisions.xml", "stops.xml", "sumo.log"
+DRIVEN = "driven.rou.xml"
+"""Who left which edge when; only where vehicles were counted."""
 OTHERS, PERSONS, MAP = "others.rou.xml", "persons.csv", "map.osm.xml"
 """Route file of an extension (those of further ones count up), and what SUMO records of persons."""
 
@@ -218,7 +221,9 @@ class Prepared:
     vehicles: int | None
     """How many are to be held in the network; None where the demand is taken as it is."""
     drawn: bool
-    """Whether the trips are drawn here, not a user's."""
+    """Whether the traffic is made here, of drawn trips or counts, and is not a user's."""
+    counted: bool
+    """Whether it follows counts."""
     adds_traffic: bool
     """Whether extensions added traffic to it."""
     notes: list[str]
@@ -237,6 +242,9 @@ class Prepared:
         }
         if self.adds_traffic or not self.drawn:  # else SUMO writes a user's persons among the vehicles
             wanted |= {"person-fcd-output": PERSONS}
+        if self.counted:
+            wanted |= {"vehroute-output": DRIVEN, "vehroute-output.exit-times": "true",
+                       "vehroute-output.write-unfinished": "true"}  # fmt: skip
         return wanted if self.drawn else wanted | {"stop-output": STOPS, "stop-output.write-unfinished": "true"}
 
 
@@ -252,11 +260,17 @@ def prepare(scenario: Scenario, folder: Path, extensions: Iterable[TrafficExtens
     roads = network.read(folder / named["net-file"], given.files["net-file"][0])
     demand_seed, sumo_seed, *other_seeds = np.random.SeedSequence(scenario.seed).spawn(2 + len(adding))
     drawn, notes = traffic.sumocfg is None and not traffic.routes, []
+    vehicles, times = traffic.vehicles, (when.begin_ms / 1000.0, when.end_ms / 1000.0)
     if drawn:
-        notes = _draw(scenario, roads, when, np.random.default_rng(demand_seed), folder)
+        demand.check_kinds(traffic.kinds, sumo.vehicle_classes(), place)
+        files.write_text(folder / VTYPES, demand.vtypes_xml(traffic.kinds))
         named |= {"additional-files": VTYPES, "route-files": TRIPS}
-    vehicles = demand.vehicles_to_hold(traffic, roads) if drawn else traffic.vehicles
-    others_at_most, times = 0, (when.begin_ms / 1000.0, when.end_ms / 1000.0)
+        if traffic.counts:
+            counts.write_routes(traffic, roads, times, demand_seed, folder, TRIPS, place)
+        else:
+            notes = _draw(scenario, roads, when, np.random.default_rng(demand_seed), folder)
+            vehicles = demand.vehicles_to_hold(traffic, roads)
+    others_at_most = 0
     for extension, name, seed in zip(adding, others, other_seeds, strict=True):
         plan = extension.plan(scenario, roads, *times, np.random.default_rng(seed))
         files.write_text(folder / name, plan.xml)
@@ -266,10 +280,10 @@ def prepare(scenario: Scenario, folder: Path, extensions: Iterable[TrafficExtens
     options = given.options | named | _settings(traffic, when, number)
     if vehicles is not None:
         options["max-num-vehicles"] = str(vehicles + others_at_most)
-    if delay_s := traffic.max_depart_delay_s or (_DRAWN_DEPART_DELAY_S if drawn else None):
+    if delay_s := traffic.max_depart_delay_s or (_DRAWN_DEPART_DELAY_S if drawn and not traffic.counts else None):
         options["max-depart-delay"] = f"{delay_s:g}"
     files.write_text(folder / CONFIG, _config_xml(options))
-    return Prepared(folder, options, when, roads, vehicles, drawn, bool(adding), notes)
+    return Prepared(folder, options, when, roads, vehicles, drawn, bool(traffic.counts), bool(adding), notes)
 
 
 def _settings(traffic: TrafficModel, when: Timing, seed: int) -> dict[str, str]:
@@ -301,15 +315,13 @@ def as_flags(options: Mapping[str, str]) -> list[str]:
 def _draw(
     scenario: Scenario, roads: network.Network, when: Timing, rng: np.random.Generator, folder: Path
 ) -> list[str]:
-    """Write drawn trips and their vTypes; what the user should know of them."""
+    """Write drawn trips; what the user should know of them."""
     traffic, place = scenario.traffic, place_of(scenario)
-    demand.check_kinds(traffic.kinds, sumo.vehicle_classes(), place)
     pairs = [demand.pairs(roads, kind, traffic, rng, place) for kind in traffic.kinds]
     count = int(np.ceil((when.end_ms - when.begin_ms) / 1000.0 * traffic.trips_per_s))
     departs_s = np.arange(count) / traffic.trips_per_s
     trips = demand.draw(roads, traffic.kinds, pairs, departs_s, rng)
     files.write_text(folder / TRIPS, demand.trips_xml(trips, departs_s))
-    files.write_text(folder / VTYPES, demand.vtypes_xml(traffic.kinds))
     return [
         f"{kind.name}: no trip between fringe edges; trips join any two edges that are far apart"
         for kind, kind_pairs in zip(traffic.kinds, pairs, strict=True)
@@ -319,7 +331,7 @@ def _draw(
 
 def _copies(given: Sources, folder: Path, others: Iterable[str]) -> dict[str, str]:
     """Copy every file into the folder, so that it can be moved and opened elsewhere; ``others`` are taken names."""
-    taken, values = {CONFIG, TRIPS, VTYPES, FCD, COLLISIONS, STOPS, LOG, OTHERS, PERSONS, MAP, *others}, {}
+    taken, values = {CONFIG, TRIPS, VTYPES, FCD, COLLISIONS, STOPS, LOG, OTHERS, PERSONS, MAP, DRIVEN, *others}, {}
     for option, paths in given.files.items():
         names = []
         for path in paths:

@@ -53,32 +53,33 @@ def pairs(network: Network, kind: VehicleKind, traffic: TrafficModel, rng: np.ra
     lanes = np.array([edge.lanes_for(kind.vclass) for edge in network.edges], dtype=np.float64)
     if not lanes.any():
         raise InputError(f"{place}.kinds", f"{who} may use no lane of the network", "a kind that the network admits")
-    min_trip_m, weights = traffic.min_trip_m, _weights(network, lanes, traffic, place)
+    min_trip_m, likely = traffic.min_trip_m, weights(network, lanes, traffic, place)
     links = network.links(kind.vclass)
-    sources, sinks = _fringe(lanes, links)
-    if not (trips := _reachable(network, weights, links, sources, sinks, min_trip_m)).origin.size:
+    sources, sinks = fringe(lanes, links)
+    if not (trips := _reachable(network, likely, links, sources, sinks, min_trip_m)).origin.size:
         far = max(min_trip_m, _FAR_SHARE * network.diagonal_m)
         anywhere = np.flatnonzero(lanes)
         some = np.sort(rng.choice(anywhere, min(_MAX_ORIGINS, anywhere.size), replace=False))
-        trips = _reachable(network, weights, links, some, anywhere, far, fringe=False)
+        trips = _reachable(network, likely, links, some, anywhere, far, fringe=False)
     if not trips.weight.any():
         what = f"{who} can go from no edge to another that is {min_trip_m:g} m away"
         raise InputError(f"{place}.kinds", what, "a connected network, or a smaller min_trip_m")
     return trips
 
 
-def _weights(network: Network, lanes: Floats, traffic: TrafficModel, place: str) -> Floats:
+def weights(network: Network, lanes: Floats, traffic: TrafficModel, place: str) -> Floats:
     """How likely a trip starts or ends at each edge: as the scenario says, else by its lanes for this kind."""
     index = {edge.id: i for i, edge in enumerate(network.edges)}
-    weights = lanes.copy()
+    likely = lanes.copy()
     for edge, weight in traffic.edge_weights.items():
         if edge not in index:
             raise InputError(f"{place}.edge_weights", f"the network has no edge {edge!r}", "the id of an edge")
-        weights[index[edge]] = weight if lanes[index[edge]] else 0.0
-    return weights
+        likely[index[edge]] = weight if lanes[index[edge]] else 0.0
+    return likely
 
 
-def _fringe(lanes: Floats, links: Ints) -> tuple[Ints, Ints]:
+def fringe(lanes: Floats, links: Ints) -> tuple[Ints, Ints]:
+    """Edges where nobody can come from elsewhere, and those where nobody can go on, by a class' lanes and links."""
     onward = links[links[:, 2] == 0]
     usable = lanes > 0
     entered, left = (np.isin(np.arange(lanes.size), onward[:, column]) for column in (1, 0))

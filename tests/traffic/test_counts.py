@@ -1,0 +1,142 @@
+"""Traffic that meets counts: by edge, by turning movement, by kind."""
+
+import re
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from pipeline.core.errors import InputError
+from pipeline.scenario.traffic import CountModel
+from pipeline.stages import traffic
+from pipeline.traffic import network
+from pipeline.traffic.demand import counts
+from pipeline.traffic.demand.ways import Ways
+from tests.stages import run_stage
+from tests.traffic.helpers import drawn, netgenerate, scenario
+
+LASTING = {"frames": 900, "warmup_s": 100.0, "frame_period_s": 1.0, "step_s": 0.5}
+KINDS = [
+    {"name": "car", "share": 3, "length_m": 4.5, "width_m": 1.75, "height_m": 1.5},
+    {"name": "truck", "vclass": "truck", "share": 1, "length_m": 7.6, "width_m": 2.3, "height_m": 3.0},
+]
+
+
+@pytest.fixture(scope="module")
+def cross(tmp_path_factory):
+    """A crossing A0 of four two-way streets; left0A0 leads from the west into it, A0right0 out of it to the east."""
+    folder = tmp_path_factory.mktemp("cross")
+    netgenerate(folder, "--grid", "--grid.number", "1", "--grid.attach-length", "150", "-L", "2",
+                "--no-turnarounds")  # fmt: skip
+    return folder
+
+
+def counted(folder, rows, **keys):
+    return scenario(folder, network="net.xml", kinds=KINDS, counts=rows, **(LASTING | keys))
+
+
+def turn(start, end, per_hour, kind=""):
+    return {"from_edge": f"{start}0A0", "to_edge": f"A0{end}0", "per_hour": per_hour, "kind": kind}
+
+
+def test_turning_movements_an_edge_and_a_kind_are_met(cross, tmp_path):
+    rows = [
+        turn("left", "right", 300), turn("left", "top", 80), turn("bottom", "left", 120),
+        {"edge": "top0A0", "per_hour": 200}, turn("left", "right", 60, "truck"),
+    ]  # fmt: skip
+    result = run_stage(traffic, counted(cross, rows), tmp_path)
+    met = result["counts"]
+    assert [c["place"] for c in met] == [
+        "left0A0 to A0right0", "left0A0 to A0top0", "bottom0A0 to A0left0", "top0A0", "left0A0 to A0right0"
+    ]  # fmt: skip
+    assert [c["counted_per_h"] for c in met] == [300, 80, 120, 200, 60] and met[-1]["kind"] == "truck"
+    assert all(c["geh"] < 5 for c in met), met
+    assert all(c["geh"] == round(counts.geh(c["counted_per_h"], c["simulated_per_h"]), 2) for c in met)
+    assert result["warnings"] == [] and "--max-num-vehicles" not in result["flags"]
+    routes = (tmp_path / "sumo" / "trips.rou.xml").read_text()
+    kinds = Counter(re.findall(r'id="fleet\.\d+" type="(\w+)"', routes))
+    assert kinds.total() == pytest.approx(700 * 1000.25 / 3600, abs=5)
+    assert 0.1 < kinds["truck"] / kinds.total() < 0.4  # a quarter by share
+    assert set(re.findall(r'id="truck\.\d+" type="(\w+)"', routes)) == {"truck"}
+    assert not {"driven.rou.xml", "candidates.rou.xml", "counts.xml"} & {f.name for f in (tmp_path / "sumo").iterdir()}
+
+
+def test_the_same_seed_gives_the_same_traffic(cross, tmp_path):
+    rows = [turn("left", "right", 300), {"edge": "top0A0", "per_hour": 200}]
+
+    def routes(seed, name):
+        run_stage(traffic, counted(cross, rows, seed=seed, frames=20, warmup_s=10.0), tmp_path / name)
+        return (tmp_path / name / "sumo" / "trips.rou.xml").read_bytes()
+
+    assert routes(1, "a") == routes(1, "b") != routes(2, "c")
+
+
+def test_counts_that_the_lanes_cannot_carry_are_told(cross, tmp_path):
+    result = run_stage(traffic, counted(cross, [turn("left", "top", 9000)], frames=300), tmp_path)
+    (warning,) = result["warnings"]
+    assert warning["rule"] == "counts" and not warning["is_error"]
+    assert re.search(r"1 of 1 counts are missed .*left0A0 to A0top0: \d+(\.\d)? for 9000", warning["found"])
+
+
+def test_what_drove_past_is_counted_by_edge_and_by_turn(tmp_path):
+    def vehicle(name, edges, times):
+        return f'<vehicle id="{name}" depart="0"><route edges="{edges}" exitTimes="{times}"/></vehicle>'
+
+    (tmp_path / "driven.xml").write_text(
+        "<routes>"
+        + vehicle("fleet.0", "a b c", "90 110 120")  # leaves a before the first frame
+        + vehicle("fleet.1", "a b c", "100 120 130")
+        + vehicle("fleet.2", "a c", "150 -1")  # still on its way; c comes after a, with nothing between
+        + vehicle("fleet.3", "c a", "150 199.5")
+        + vehicle("truck.0", "a b", "150 160")
+        + vehicle("fleet.4", "a b", "200 210")  # too late
+        + "</routes>"
+    )
+    wanted = [
+        {"edge": "a", "per_hour": 144}, {"edge": "b", "per_hour": 36}, {"edge": "b", "per_hour": 36, "kind": "truck"},
+        {"from_edge": "a", "to_edge": "c", "per_hour": 0}, {"from_edge": "c", "to_edge": "a", "per_hour": 36},
+    ]  # fmt: skip
+    model = drawn(counts=tuple(CountModel(**row) for row in wanted))
+    met = counts.met(model, tmp_path / "driven.xml", 100.0, 200.0)
+    assert [c.simulated_per_h for c in met] == [36 * n for n in (3, 2, 1, 2, 1)]
+
+
+def test_geh_by_hand():
+    assert counts.geh(100, 100) == counts.geh(0, 0) == 0
+    assert counts.geh(400, 500) == pytest.approx((2 * 100**2 / 900) ** 0.5)
+    assert counts.geh(500, 400) == counts.geh(400, 500)
+
+
+def test_ways_over_a_place_are_no_detours(town):
+    roads = network.read(town / "net.xml")
+    ways = Ways(roads, "passenger")
+    inner = next(edge for edge in roads.edges if (edge.from_node, edge.to_node) == ("A0", "A1"))
+    place = ways.place(inner.id, None, "place")
+    ends = {edge.id: (edge.from_node, edge.to_node) for edge in roads.edges}
+    found = ways.candidates([place], drawn(), np.random.default_rng(1), "place")
+    assert len(found) > 3
+    for way in found:
+        assert inner.id in way and len(set(way)) == len(way) and ways.may_drive(way)
+        assert ends[way[0]][0] != ends[way[-1]][1]
+        assert len(way) <= 4  # in, along, and out at once or one street on; never round the block
+    assert not ways.may_drive([place.edges[0], place.edges[0]])
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ([{"edge": "nowhere", "per_hour": 1}], r"traffic\.counts \(nowhere\): the network has no edge 'nowhere'"),
+        ([turn("left", "right", 10, "tram")], r"counts\.0\.kind: the fleet has no kind 'tram'; .*car, truck"),
+        (
+            [{"from_edge": "A0top0", "to_edge": "left0A0", "per_hour": 5}],
+            r"\(A0top0 to left0A0\): no way leads from 'A0top0' to 'left0A0'",
+        ),
+        ([{"edge": "a", "to_edge": "b", "per_hour": 1}], r"either edge, or both from_edge and to_edge are needed"),
+        ([{"to_edge": "b", "per_hour": 1}], r"either edge, or both from_edge and to_edge are needed"),
+        ([{"from_edge": "b", "to_edge": "b", "per_hour": 1}], r"from_edge and to_edge are both 'b'"),
+        ([{"edge": "a", "per_hour": -1}], r"per_hour"),
+    ],
+)
+def test_a_wrong_count_is_named(cross, tmp_path, rows, message):
+    with pytest.raises(InputError, match=message):
+        run_stage(traffic, counted(cross, rows), tmp_path)
