@@ -186,6 +186,26 @@ def made(tmp_path_factory):
     return about, out, page(about, out)
 
 
+# ---- counts
+
+
+def test_counts_stand_beside_what_was_simulated(tmp_path):
+    about, out = finished(tmp_path)
+    record = a_record()
+    record["stages"]["traffic"]["summary"]["counts"] = [
+        {"place": "<a> to b", "kind": "", "counted_per_h": 320.0, "simulated_per_h": 311.5, "geh": 0.48},
+        {"place": "c", "kind": "truck", "counted_per_h": 60.0, "simulated_per_h": 20.0, "geh": 6.32},
+    ]
+    (out / "run.json").write_text(json.dumps(record), encoding="utf-8")
+    read = Reader(page(about, out))
+    assert "<a> to b|all|320|311.5|0.5|" in read.rows
+    assert "c|truck|60|20|6.3|!|" in [row.replace("||", "|") for row in read.rows]
+
+
+def test_without_counts_there_is_no_table_of_them(made):
+    assert "Counted and simulated" not in made[2]
+
+
 # ---- one sound file
 
 
