@@ -335,13 +335,19 @@ def new(
     ] = None,
     lefthand: Annotated[bool, typer.Option("--lefthand", help="Traffic drives on the left.")] = False,
     walk: Annotated[bool, typer.Option("--walk", help="Sidewalks and crossings, for people on foot.")] = False,
+    surroundings: Annotated[
+        str | None,
+        typer.Option(metavar="METRES", help="How far from the junction streets are simulated: 300, or all there are."),
+    ] = None,
 ) -> None:
     """Make a scenario from an OpenStreetMap extract."""
     from pipeline.cli import results
     from pipeline.importers import openstreetmap
 
     place = arguments.latitude_and_longitude(at) if at is not None else None
-    results.print_new_scenario(openstreetmap.new(folder, osm, place, lefthand=lefthand, walk=walk))
+    reach = openstreetmap.SURROUNDINGS_M if surroundings is None else arguments.radius_m(surroundings)
+    made = openstreetmap.new(folder, osm, place, lefthand=lefthand, walk=walk, surroundings_m=reach)
+    results.print_new_scenario(made)
 
 
 @app.command()

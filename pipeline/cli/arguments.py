@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shlex
 from pathlib import Path
@@ -61,6 +62,19 @@ def latitude_and_longitude(text: str) -> tuple[float, float]:
     except ValueError:
         raise InputError("--at", repr(text), "LAT,LON in degrees, for example 50.8704,9.7080") from None
     return lat, lon
+
+
+def radius_m(text: str) -> float | None:
+    """``--surroundings``: metres, or None for all."""
+    if text == "all":
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise InputError("--surroundings", repr(text), "metres, for example 300, or all")
+    return value
 
 
 def command(verb: str, scenario: Path, set_: list[str] | None, out: Path | None = None) -> str:

@@ -92,6 +92,16 @@ class Streets:
         east_m, north_m = location.offset_m
         return [(x + east_m, y + north_m) for x, y in zip(xs, ys, strict=True)]
 
+    def to_degrees(self, points_m: Sequence[XY]) -> list[tuple[float, float]]:
+        """Longitude and latitude in degrees of positions in the world frame."""
+        from pyproj import Proj
+
+        location = self.network.location
+        assert location is not None, "netconvert writes it"
+        east_m, north_m = location.offset_m
+        xs, ys = ([p[axis] - offset for p in points_m] for axis, offset in ((0, east_m), (1, north_m)))
+        return list(zip(*Proj(location.projection)(xs, ys, inverse=True), strict=True))
+
 
 @dataclass(frozen=True)
 class Region:

@@ -16,12 +16,14 @@ The same extract gives the same bytes: no dates, no paths, objects sorted.
 from __future__ import annotations
 
 import json
+import math
 import re
 import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -31,12 +33,13 @@ from pydantic import TypeAdapter, ValidationError
 from pipeline.core.errors import InputError, RunError
 from pipeline.formats.osm import Extract, write_streets
 from pipeline.formats.osm import read as read_extract
-from pipeline.importers import junctions, solids
+from pipeline.importers import assumed_traffic, junctions, solids, surroundings
 from pipeline.importers.junctions import HEIGHTS_M, ROI_HEIGHT_M, Junction, KerbPlace, Region, Streets
 from pipeline.importers.mapped_solids import BUILDING_M, ImportCounts, MappedSolid
+from pipeline.importers.shapes import XY
 from pipeline.scenario.loading import load
 from pipeline.scenario.models import FILE, RoiModel, ScoreModel
-from pipeline.scenario.traffic import FRAMES, WARMUP_S, TrafficModel
+from pipeline.scenario.traffic import FRAMES, WARMUP_S, CountModel, TrafficModel
 from pipeline.scenario.types import Name
 from pipeline.traffic import sumo
 
@@ -63,8 +66,9 @@ Up to 28 m/s instead of 13.89: that is what netconvert takes a main street witho
 
 PEOPLE = "people come with --set effects.pedestrians_bicycles.pedestrians_per_h=300 (bicycles_per_h for bicycles)"
 
-LANE_PER_VEHICLE_M = 250.0
-VEHICLES_LEAST, VEHICLES_MOST = 5, 50
+SURROUNDINGS_LEAST_M = 100.0
+SURROUNDINGS_M = 300.0
+"""How far from the junction streets are simulated: far enough for the queues and platoons that reach it."""
 
 
 @dataclass(frozen=True)
@@ -79,10 +83,10 @@ class NewScenario:
     statics: ImportCounts
     notes: tuple[str, ...]
 
-    @property
-    def vehicles(self) -> int:
-        """How many the network takes without grid-lock."""
-        return min(max(round(self.streets.lane_length_m / LANE_PER_VEHICLE_M), VEHICLES_LEAST), VEHICLES_MOST)
+    @cached_property
+    def flows(self) -> tuple[CountModel, ...]:
+        """The assumed traffic through the region of interest; empty where no street leads through it."""
+        return tuple(assumed_traffic.flows(self.streets, self.roi))
 
     def to_json(self) -> dict[str, Any]:
         """All of it as plain JSON, in the order of interest."""
@@ -99,7 +103,9 @@ class NewScenario:
                 "edges": len(streets.network.edges), "lane_length_m": round(streets.lane_length_m),
                 "signalised_junctions": sum(j.signalised for j in streets.junctions),
             },
-            "vehicles": self.vehicles,
+            "assumed_traffic": {
+                "flows": len(self.flows), "vehicles_per_hour": round(math.fsum(f.per_hour for f in self.flows)),
+            },
             "sites": self.sites,
             "statics": self.statics.to_json(),
             "notes": list(self.notes),
@@ -107,8 +113,9 @@ class NewScenario:
 
 
 def new(
-    folder: Path, osm: Path, at: tuple[float, float] | None = None, lefthand: bool = False, walk: bool = False
-) -> NewScenario:
+    folder: Path, osm: Path, at: tuple[float, float] | None = None, lefthand: bool = False, walk: bool = False,
+    surroundings_m: float | None = SURROUNDINGS_M,
+) -> NewScenario:  # fmt: skip
     """Make a scenario folder from an OpenStreetMap extract.
 
     Parameters
@@ -123,6 +130,8 @@ def new(
         Whether one drives on the left there.
     walk
         Whether the network gets sidewalks and crossings, which people on foot need.
+    surroundings_m
+        Streets end so far from the junction; None for all that the extract has.
 
     Raises
     ------
@@ -131,11 +140,18 @@ def new(
         site is possible. Nothing is written then.
     """
     name = _check_folder(folder)
+    if surroundings_m is not None and surroundings_m < SURROUNDINGS_LEAST_M:
+        right = f"at least {SURROUNDINGS_LEAST_M:g}, so that they hold the junction with its approaches"
+        raise InputError("--surroundings", f"{surroundings_m:g} m", right)
     extract = read_extract(osm)
     _check_at(extract, at)
-    network, streets = _network(extract, osm, lefthand, walk)
+    flags = [*NETCONVERT, *_boundary(extract), *(["--lefthand"] if lefthand else []), *(WALK if walk else [])]
+    network, streets = _network(extract, osm, flags)
     junction, roi = _junction(streets, osm, at)
     mapped, counts = solids.collect(extract, streets)
+    if surroundings_m is not None:
+        network, streets = _cropped(extract, osm, flags, streets, junction, surroundings_m)
+        junction, roi = _junction_at(streets, osm, junction.at_m)
     places = junctions.kerb_places(streets, junction, roi, [solid.area for solid in mapped])
     if not places:
         problem = f"no place for a pole is free along the kerbs of the {junction.title}"
@@ -171,8 +187,8 @@ def _check_at(extract: Extract, at: tuple[float, float] | None) -> None:
 # --- network --------------------------------------------------------------------------------------------------------
 
 
-def _network(extract: Extract, osm: Path, lefthand: bool, walk: bool) -> tuple[str, Streets]:
-    """The SUMO network as text, and what is in it."""
+def _network(extract: Extract, osm: Path, flags: Sequence[str]) -> tuple[str, Streets]:
+    """The SUMO network that netconvert makes with these flags, as text, and what is in it."""
     right = "an extract with streets for cars (ways with highway=...)"
     missing = InputError(osm, "has no drivable streets that meet", right)
     if not any("highway" in way.tags for way in extract.ways.values()):
@@ -180,7 +196,6 @@ def _network(extract: Extract, osm: Path, lefthand: bool, walk: bool) -> tuple[s
     with tempfile.TemporaryDirectory() as name:
         work = Path(name)
         write_streets(extract, work / "streets.osm.xml")
-        flags = [*NETCONVERT, *_boundary(extract), *(["--lefthand"] if lefthand else []), *(WALK if walk else [])]
         try:
             sumo.run("netconvert", ["--osm-files", "streets.osm.xml", *flags, "-o", NETWORK], work)
             streets = junctions.read(work / NETWORK)
@@ -189,6 +204,19 @@ def _network(extract: Extract, osm: Path, lefthand: bool, walk: bool) -> tuple[s
                 raise missing from None
             raise
         return _without_header((work / NETWORK).read_text(encoding="utf-8")), streets
+
+
+def _cropped(
+    extract: Extract, osm: Path, flags: Sequence[str], streets: Streets, junction: Junction, radius_m: float
+) -> tuple[str, Streets]:
+    """The network of a junction's surroundings, in the frame of the whole network ``streets``."""
+    location = streets.network.location
+    assert location is not None, "netconvert writes it"
+    ((lon_deg, lat_deg),) = streets.to_degrees([junction.at_m])
+    east_m, north_m = location.offset_m
+    frame = ["--proj", location.projection, "--offset.disable-normalization", "--offset.x", f"{east_m:.2f}",
+             "--offset.y", f"{north_m:.2f}"]  # fmt: skip
+    return _network(surroundings.cut_out(extract, (lat_deg, lon_deg), radius_m), osm, [*flags, *frame])
 
 
 def _boundary(extract: Extract) -> list[str]:
@@ -205,7 +233,10 @@ def _without_header(network: str) -> str:
 
 
 def _junction(streets: Streets, osm: Path, at: tuple[float, float] | None) -> tuple[Junction, Region]:
-    near = streets.to_xy([at[1]], [at[0]])[0] if at else None
+    return _junction_at(streets, osm, streets.to_xy([at[1]], [at[0]])[0] if at else None)
+
+
+def _junction_at(streets: Streets, osm: Path, near: XY | None) -> tuple[Junction, Region]:
     junction = junctions.choose_junction(streets, near)
     if junction is None:
         raise InputError(osm, "its streets meet nowhere", "an extract with a junction")
@@ -263,9 +294,7 @@ def _toml(name: str, made: NewScenario) -> str:
             "center_m": [*made.roi.center_m, ROI_HEIGHT_M / 2], "size_m": [*made.roi.size_m, ROI_HEIGHT_M],
             "voxel_m": RoiModel.model_fields["voxel_m"].default,
         }),
-        "traffic": ("SUMO; trips are drawn between the ends of the network's streets", {
-            "network": NETWORK, "vehicles": made.vehicles, **traffic,
-        }),
+        "traffic": ("SUMO", {"network": NETWORK, **traffic}),
         "statics": ("buildings, trees, barriers, poles; what was assumed about them is counted in the file's summary", {
             "footprints": [STATICS],
         }),
@@ -279,9 +308,23 @@ def _toml(name: str, made: NewScenario) -> str:
         if comment:
             table.comment(comment)
         document.add(tomlkit.nl()).add(key, table)
-    lanes_km = made.streets.lane_length_m / 1000
-    document["traffic"]["vehicles"].comment(f"in the whole network, in every frame ({lanes_km:.1f} km of lanes)")
+    if made.flows:
+        document["traffic"].update({"counts": _counts(made.flows)})
+        document["traffic"]["counts"].comment(
+            "assumed by the class of the streets: put what was counted in their place"
+        )
     return tomlkit.dumps(document)
+
+
+def _counts(flows: Sequence[CountModel]) -> Any:
+    """One flow a line."""
+    rows = tomlkit.array()
+    for flow in flows:
+        row = tomlkit.inline_table()
+        row.update(flow.model_dump(exclude_defaults=True))
+        rows.add_line(row)
+    rows.add_line(indent="")
+    return rows
 
 
 def _publish(folder: Path, files: dict[str, str]) -> None:
