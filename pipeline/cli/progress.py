@@ -62,6 +62,8 @@ class Screen:
             self._bar.update(self._task, visible=False)
         took = {"skipped": "unchanged", "fetched": "from store"}.get(state) or f"{record.cost.seconds:.2f} s"
         summary = {key: value for key, value in record.summary.items() if key not in ("flags", WARNINGS)}
+        if counts := summary.pop("counts", None):
+            summary["worst GEH of counts"] = max(count["geh"] for count in counts)
         self._print(f"{stage:<8} {took:>10}   {in_words(summary)}")
         for warning in warnings_of([record.summary]):
             self._print(f"warning: {warning}")

@@ -71,7 +71,7 @@ def flows(streets: Streets, roi: Region) -> list[CountModel]:
 def balanced(may: NDArray[np.float64], in_h: Sequence[float], out_h: Sequence[float]) -> NDArray[np.float64]:
     """Flows (in, out) where ``may`` is above 0; rows add up to ``in_h``, columns to shares of ``out_h`` if they can."""
     rates = may.copy()
-    rows, columns = np.array(in_h), np.array(out_h)
+    rows, columns = np.array(in_h, dtype=np.float64), np.array(out_h, dtype=np.float64)
     for _ in range(_ROUNDS):
         for axis, wanted in ((0, columns), (1, rows)):
             sums = rates.sum(axis=axis)

@@ -214,8 +214,8 @@ def _cropped(
     assert location is not None, "netconvert writes it"
     ((lon_deg, lat_deg),) = streets.to_degrees([junction.at_m])
     east_m, north_m = location.offset_m
-    frame = ["--proj", location.projection, "--offset.disable-normalization", "--offset.x", f"{east_m:.2f}",
-             "--offset.y", f"{north_m:.2f}"]  # fmt: skip
+    frame = ["--proj", location.projection, "--offset.disable-normalization", "--offset.x", f"{east_m!r}",
+             "--offset.y", f"{north_m!r}"]  # fmt: skip
     return _network(surroundings.cut_out(extract, (lat_deg, lon_deg), radius_m), osm, [*flags, *frame])
 
 

@@ -223,7 +223,8 @@ def test_the_scenario_loads(made: Made) -> None:
     assert loaded.name == "cross"
     assert loaded.roi.size_m == (60.0, 60.0, 5.0)
     assert [value % 0.25 for value in loaded.roi.box.origin_m] == [0.0, 0.0, 0.0]
-    assert loaded.traffic.vehicles == summary.vehicles == 6
+    assert loaded.traffic.vehicles is None
+    assert loaded.traffic.counts == summary.flows and len(summary.flows) == 12
     assert summary.junction.at_m == pytest.approx(loaded.roi.center_m[:2], abs=1.0)
     for name in ("network.net.xml", "statics.geojson", "sites.csv"):
         assert loaded.find(name, "test").is_file()
@@ -242,7 +243,9 @@ def test_a_name_of_odd_characters_is_kept_and_comments_say_what_is_what(tmp_path
     assert title == 'signalised junction of East A\\B = #1 "Straße" & more and North Street'
     assert loading.load(tmp_path / "named").description == f"S{title[1:]}"
     text = (tmp_path / "named" / "scenario.toml").read_text(encoding="utf-8")
-    assert re.search(r"^vehicles = 6 +# in the whole network, in every frame \(1\.5 km of lanes\)$", text, re.MULTILINE)
+    assert re.search(
+        r"^\] # assumed by the class of the streets: put what was counted in their place$", text, re.MULTILINE
+    )
     assert len(re.findall(r"^\[(?:roi|traffic|statics|sites)\] +# \w", text, re.MULTILINE)) == 4
 
 
@@ -323,7 +326,7 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Made:
 def test_a_real_town(town: Made) -> None:
     folder, summary = town
     assert "Meisebacher Straße" in summary.junction.title and summary.junction.signalised
-    assert summary.vehicles == 50
+    assert summary.to_json()["assumed_traffic"]["vehicles_per_hour"] > 1000
     assert summary.statics.heights["building"] == {"height": 1, "levels": 5, "default": 636}
     assert summary.statics.objects["tree_trunk"] == 15
     assert loading.load(folder).roi.grid.shape == (360, 320, 20)
