@@ -30,6 +30,7 @@ LIBRARIES = {
     "numpy": ("numpy",),
     "osmium": ("osmium",),
     "pyarrow": ("pyarrow",),
+    "pyproj": ("pyproj",),
     "scipy": ("scipy",),
     "shapely": ("shapely",),
     "trimesh": ("trimesh", "mapbox-earcut"),

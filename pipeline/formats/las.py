@@ -1,6 +1,6 @@
 """LAS and LAZ files are read through laspy (``pip install egvs[las]``): the scaled coordinates, as the file gives them.
 
-Frame: a file in a map projection is in the world frame only when the scenario is in the same projection.
+Frame: that of the file, which may say its coordinate reference system (:func:`crs_of`).
 """
 
 from __future__ import annotations
@@ -53,6 +53,22 @@ def read(path: Path, place: str) -> NDArray[np.float64]:
     if len(points) != declared:
         raise InputError(place, f"holds {len(points)} points", f"{declared}, as its header says; a whole file")
     return points
+
+
+def crs_of(path: Path, place: str) -> str | None:
+    """The coordinate reference system that the file's header declares, as WKT; None where it declares none.
+
+    InputError at ``place`` where it declares one that is damaged. For a file that :func:`read` has read.
+    """
+    import laspy
+    from pyproj.exceptions import CRSError
+
+    try:
+        with path.open("rb") as file, laspy.open(file, closefd=False, read_evlrs=False) as las:
+            found = las.header.parse_crs()
+    except (CRSError, laspy.LaspyException, ValueError, struct.error) as error:
+        raise InputError(place, f"its coordinate reference system cannot be read ({error})", "a whole header") from None
+    return None if found is None else str(found.to_wkt())
 
 
 def _is_packed(place: str, head: bytes, size: int) -> bool:

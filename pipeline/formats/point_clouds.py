@@ -8,14 +8,14 @@ A format is an entry point of the group ``egvs.point_clouds``: its name is the s
 ``read`` and perhaps ``write`` (:class:`PointFormat`). Here, each is a module, declared in ``pyproject.toml``; other
 packages may add theirs (``docs/extending.md``).
 
-Frame: the world's (right-handed, x east, y north, z up), metres, float64.
+Frame: the world's (right-handed, x east, y north, z up), metres, float64; that of :func:`crs_of` where a file says so.
 """
 
 from __future__ import annotations
 
 from contextlib import suppress
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,14 @@ class WritableFormat(PointFormat, Protocol):
 
     def write(self, path: Path, points_m: NDArray[np.float64], /) -> None:
         """Write (n, 3) float64 to a new file; its name may have another suffix. The same points, the same bytes."""
+
+
+@runtime_checkable
+class LocatedFormat(PointFormat, Protocol):
+    """What also knows where on the Earth a file's points are; then ``read`` gives them in that system's units."""
+
+    def crs_of(self, path: Path, place: str, /) -> str | None:
+        """The coordinate reference system that a file declares, in a form that PROJ knows; None for none."""
 
 
 def read_points(path: Path, place: str) -> tuple[NDArray[np.float64], int]:
@@ -94,6 +102,16 @@ def read_points(path: Path, place: str) -> tuple[NDArray[np.float64], int]:
         right = "at least one return with finite x, y and z"
         raise InputError(place, f"holds no finite point (of {len(points)})", right)
     return (points[finite] if dropped else points), dropped
+
+
+def crs_of(path: Path, place: str) -> str | None:
+    """The coordinate reference system that a point cloud declares, as WKT; None where it, or its kind, declares none.
+
+    For a file that :func:`read_points` has read; InputError at ``place`` when what it declares is damaged.
+    """
+    place = _with_path(place, path)
+    point_format = plugins.load(GROUP, _kind(place, path, plugins.names(GROUP)))
+    return point_format.crs_of(path, place) if isinstance(point_format, LocatedFormat) else None
 
 
 def reader_of(path: Path, place: str) -> str:

@@ -26,6 +26,7 @@ from pipeline.importers.shapes import XY
 from pipeline.traffic.network import LANE_WIDTH_M, Edge, Network
 from pipeline.traffic.network import Junction as Node
 from pipeline.traffic.network import read as read_network
+from pipeline.world.world_frame import located
 
 ROI_LEAST_M, ROI_MOST_M, ROI_STEP_M, ROI_HEIGHT_M = 60.0, 120.0, 10.0, 5.0
 APPROACH_M = 20.0
@@ -84,13 +85,10 @@ class Streets:
 
     def to_xy(self, lons_deg: Sequence[float], lats_deg: Sequence[float]) -> list[XY]:
         """World-frame x, y in metres of positions in degrees."""
-        from pyproj import Proj
-
-        location = self.network.location
-        assert location is not None, "netconvert writes it"
-        xs, ys = Proj(location.projection)(list(lons_deg), list(lats_deg))
-        east_m, north_m = location.offset_m
-        return [(x + east_m, y + north_m) for x, y in zip(xs, ys, strict=True)]
+        frame = located(self.network.location)
+        assert frame is not None, "netconvert writes it"
+        xy_m = frame.from_degrees(np.column_stack([lons_deg, lats_deg]))
+        return [(x, y) for x, y in xy_m.tolist()]
 
     def to_degrees(self, points_m: Sequence[XY]) -> list[tuple[float, float]]:
         """Longitude and latitude in degrees of positions in the world frame."""

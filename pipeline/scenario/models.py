@@ -19,10 +19,11 @@ from pipeline.core.errors import InputError
 from pipeline.core.grid import Grid, Roi
 from pipeline.core.strict_model import StrictModel
 from pipeline.core.sumo_home import sumo_home
+from pipeline.scenario.crs import CrsModel
 from pipeline.scenario.effects import EffectsModel
 from pipeline.scenario.sensors import SensorModel
 from pipeline.scenario.traffic import TrafficModel
-from pipeline.scenario.types import Name, Point2, Point3, Positive
+from pipeline.scenario.types import Latitude, Longitude, Name, Point2, Point3, Positive
 
 FILE = "scenario.toml"
 _SUMO = "$SUMO_HOME/"
@@ -50,8 +51,33 @@ class MeshModel(StrictModel):
     """A triangle mesh that trimesh loads (PLY, OBJ, STL, GLB), in metres, z up."""
 
     file: str
-    offset_m: Point3 = Field((0.0, 0.0, 0.0), description="Added to every vertex to reach the world frame")
+    offset_m: Point3 = Field(
+        (0.0, 0.0, 0.0),
+        description="Added to every vertex to reach the world frame (or the system of epsg, or origin_deg)",
+    )
+    epsg: int | None = Field(
+        None,
+        ge=1,
+        description="Code of the map projection of its x, y (with offset_m added), where not the world frame's",
+    )
+    origin_deg: tuple[Longitude, Latitude] | None = Field(
+        None, description="Longitude and latitude of its zero, where its x, y are metres to the east and north of there"
+    )
     kind: Name = Field("mesh", description="Shown in messages and in the report")
+
+    @model_validator(mode="after")
+    def _one_system(self) -> MeshModel:
+        if self.epsg is not None and self.origin_deg is not None:
+            raise ValueError("epsg and origin_deg: a mesh is in one system")
+        return self
+
+    @property
+    def system(self) -> str | None:
+        """The coordinate reference system of its x, y, as PROJ knows it; None for the world frame."""
+        if self.origin_deg is not None:
+            lon_deg, lat_deg = self.origin_deg
+            return f"+proj=aeqd +lon_0={lon_deg!r} +lat_0={lat_deg!r} +datum=WGS84 +units=m +no_defs +type=crs"
+        return None if self.epsg is None else f"EPSG:{self.epsg}"
 
 
 class StaticsModel(StrictModel):
@@ -206,6 +232,7 @@ class Scenario(StrictModel):
         "", description="A scenario folder whose keys hold where this one says nothing; tables merge, lists replace"
     )
     seed: int = Field(0, ge=0, le=2**63 - 1, description="The one seed; all randomness derives from it")
+    crs: CrsModel = CrsModel()
     roi: RoiModel
     traffic: TrafficModel
     statics: StaticsModel = StaticsModel()

@@ -12,6 +12,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,7 @@ from pipeline.sensing.beam_effects import BeamCutter, BeamExpander
 from pipeline.sensing.scene import Scene
 from pipeline.sensing.sensors import Sensor
 from pipeline.sensing.sites import Pose, ScannedSite, Site
+from pipeline.world import world_frame
 from pipeline.world.casting import Caster, EmptyScan
 
 _BEAMS = 4096  # beams expanded at once: bounds the memory
@@ -174,9 +176,7 @@ class Scanner:
         """The returns of a measured scan, seen from the sensor; those that cannot meet the ROI are left out."""
         assert site.points is not None
         place, roi = f"site {site.name}: points", self.scene.roi
-        points, _ = point_clouds.read_points(self.scene.scenario.find(site.points, place), place)
-        if (farthest_m := np.abs(points).max()) > FARTHEST_M:
-            raise InputError(place, f"a point lies {farthest_m:g} m from the world's zero", f"within {FARTHEST_M:g} m")
+        points = self._points(self.scene.scenario.find(site.points, place), place)
         ends = points - np.asarray(site.pose.position_m)
         far = np.sqrt((ends**2).sum(axis=1))
         away = np.maximum(far, np.finfo(np.float64).tiny)[:, None]
@@ -190,6 +190,19 @@ class Scanner:
         weight = np.ones(len(beam)) if self.columns else None
         rows = EmptyScan(beam.astype(np.uint32), ends[beam], np.ones(len(beam), dtype=np.bool_), weight=weight)
         return Scan(site.pose, sensor, len(points), rows)
+
+    def _points(self, path: Path, place: str) -> NDArray[np.float64]:
+        """The points of a measured scan (n, 3) in the world frame, from the system that the file declares, if any."""
+        points, _ = point_clouds.read_points(path, place)
+        if (farthest_m := np.abs(points).max()) > FARTHEST_M:
+            raise InputError(place, f"a point lies {farthest_m:g} m from the world's zero", f"within {FARTHEST_M:g} m")
+        world, declared = world_frame.of(self.scene.scenario), point_clouds.crs_of(path, place)
+        if declared is None:
+            world.metres(points[:, :2], place, "metres of the world frame, or a LAS file that names its system")
+            return points
+        reading = world.reading(points[:, :2], place, declared, "points in the system that the file's header names")
+        height_m = points[:, 2] - self.scene.scenario.crs.zero_height_m
+        return np.column_stack([reading.to_world(points[:, :2]), height_m])
 
 
 def _standing(scene: Scene) -> Iterator[tuple[tuple[float, float, float], Sensor]]:

@@ -1,9 +1,10 @@
 """Places where a sensor could stand: poses, and candidate sites with names and sensors.
 
 Candidate sites come from a CSV, a GeoJSON file, or a rule (a lattice, or along lines). Each has a position in the world
-frame in metres, a pose in degrees, and a sensor; what a site does not name is taken from the scenario's ``[sites]``. A
-place with several heights or pitches is as many candidates (:mod:`pipeline.sensing.aiming`). Those of one x, y stand at
-one *pole*, which has the name of the first place there.
+frame in metres (:mod:`pipeline.formats.located_rows` brings longitude and latitude there), a pose in degrees, and a
+sensor; what a site does not name is taken from the scenario's ``[sites]``. A place with several heights or pitches is
+as many candidates (:mod:`pipeline.sensing.aiming`). Those of one x, y stand at one *pole*, which has the name of the
+first place there.
 """
 
 from __future__ import annotations
@@ -21,11 +22,14 @@ from typing import Any
 import numpy as np
 
 from pipeline.core.errors import InputError
+from pipeline.formats import located_rows
+from pipeline.formats.georeference import Georeference, Reading
 from pipeline.scenario.models import Scenario, SiteGrid, SiteLine
 from pipeline.scenario.types import FARTHEST_M
 from pipeline.sensing import aiming, own_columns, sensors
 from pipeline.sensing.aiming import Wishes
 from pipeline.sensing.sensors import Sensor
+from pipeline.world import world_frame
 
 _NEEDED = ("site", "x_m", "y_m", "z_m")
 _ANGLES = ("yaw_deg", "pitch_deg", "roll_deg")
@@ -114,7 +118,9 @@ def of(scenario: Scenario) -> tuple[Site, ...]:
     model = scenario.sites
     if model.file is not None:
         path = scenario.find(model.file, "sites.file")
-        rows = _geojson(path) if path.suffix.lower() in (".geojson", ".json") else _csv(path)
+        world = world_frame.of(scenario)
+        is_geojson = path.suffix.lower() in (".geojson", ".json")
+        rows = _geojson(path, world) if is_geojson else _csv(path, world)
     else:
         path = scenario.file
         rows = _lattice(model.grid) if model.grid is not None else _lines(model.along)
@@ -252,7 +258,7 @@ def _number(place: str, key: str, value: Any) -> float:
     return number
 
 
-def _csv(path: Path) -> Iterator[_Row]:
+def _csv(path: Path, world: Georeference) -> Iterator[_Row]:
     places, rows = [], []
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
@@ -270,41 +276,31 @@ def _csv(path: Path) -> Iterator[_Row]:
                 rows.append(dict(row))
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(path, f"cannot be read as CSV ({error})", "UTF-8 text with a header row") from None
+    rows = located_rows.placed(zip(places, rows, strict=True), path, world)
     yield from map(_Row, places, own_columns.with_numbers(rows, _KNOWN))
 
 
-def _geojson(path: Path) -> Iterator[_Row]:
-    right = "a FeatureCollection of Points in world-frame metres"
+def _geojson(path: Path, world: Georeference) -> Iterator[_Row]:
+    right = "a FeatureCollection of Points"
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise InputError(path, f"cannot be read as GeoJSON ({error})", right) from None
     if not isinstance(document, dict) or not isinstance(document.get("features"), list):
         raise InputError(path, f"has no list of features: {reprlib.repr(document)[:120]}", right)
-    if (crs := document.get("crs")) is not None and not _in_metres(crs):
-        raise InputError(f"{path}: crs", repr(crs)[:120], "no crs (RFC 7946), and metres in the world frame")
+    reading = located_rows.reading_of(document, path, world)
     for number, feature in enumerate(document["features"]):
         place = f"{path}: feature {number}"
-        yield _Row(place, _feature(place, feature))
+        yield _Row(place, _feature(place, feature, reading))
 
 
-def _in_metres(crs: Any) -> bool:
-    """Whether all axes of a GeoJSON ``crs`` member (of 2008; RFC 7946 has none) are in metres."""
-    import pyproj
-
-    try:
-        return all(axis.unit_name == "metre" for axis in pyproj.CRS(crs["properties"]["name"]).axis_info)
-    except (pyproj.exceptions.CRSError, LookupError, TypeError):
-        return False
-
-
-def _feature(place: str, feature: Any) -> dict[str, Any]:
-    """The columns that a feature's coordinates and properties give."""
+def _feature(place: str, feature: Any, reading: Reading) -> dict[str, Any]:
+    """The columns that a feature's coordinates, in the world frame, and properties give."""
     match feature:
         case {"geometry": {"type": "Point", "coordinates": [_, _, *more] as spot}, "properties": dict(properties)} if (
             len(more) < 2
         ):
-            own = dict(zip(_NEEDED, (properties.get("name"), *spot), strict=False))
+            own = dict(zip(_NEEDED, (properties.get("name"), *located_rows.in_world(spot, reading)), strict=False))
         case _:
             right = "a Feature with properties, its geometry a Point of two or three coordinates"
             raise InputError(place, f"is {reprlib.repr(feature)[:120]}", right)
@@ -312,7 +308,9 @@ def _feature(place: str, feature: Any) -> dict[str, Any]:
     for key, value in own.items():
         if isinstance(value, str) and key != "site":
             raise InputError(f"{place}: {key}", f"the coordinate {value!r}", "a number, not text")
-        if value is not None and row.get(key, value) not in (None, value):
+        if reading.convert is not None and located_rows.agree(row.get(key), value):
+            own[key] = row[key]  # what a GIS carried along, not rounded to degrees
+        elif value is not None and row.get(key, value) not in (None, value):
             raise InputError(f"{place}: {key}", f"{row[key]!r} there, but {value!r} as well", "one of them")
     return row | {key: value for key, value in own.items() if value is not None}
 

@@ -24,6 +24,7 @@ from pipeline.core.grid import Grid
 from pipeline.core.parallel import in_order
 from pipeline.effects import registry
 from pipeline.effects.base import Effect
+from pipeline.formats.georeference import Georeference
 from pipeline.kernels import march
 from pipeline.scoring import uncertainty
 from pipeline.scoring.scorer import Scorer, SiteScore
@@ -32,6 +33,7 @@ from pipeline.sensing.sites import ScannedSite
 from pipeline.stages.base import StageInputs, Summary, Workspace
 from pipeline.stages.shared.scans import SiteBeams, scans
 from pipeline.stages.shared.scene import SCANS, scan_inputs, scene_of, sensor_digests
+from pipeline.world import world_frame
 
 NAME = "score"
 ARTEFACTS = ("scores.parquet", "visibility.parquet")
@@ -64,6 +66,7 @@ def inputs(work: Workspace) -> StageInputs:
     settings: dict[str, Any] = {"name": scenario.name, "score": scenario.score.model_dump(mode="json")}
     if own := _own_columns(work):
         settings["own_columns"] = {name: column.to_pylist() for name, column in own.items()}
+    settings |= world_frame.key(scenario)
     if live:
         settings["effects"] = registry.settings(live)
         settings["sensors"] = {name: model.model_dump(mode="json") for name, model in scenario.sensors.items()}
@@ -116,8 +119,9 @@ def run(
     about = work.metadata(inputs, gamma=wanted.gamma, grid=tpog.grid.to_json(), frames=tpog.frames, sites=sites)
     _write_visibility(work, done, about)
     estimate = _estimate(done, leave_out)
-    columns, own = _columns(done, scorer.limit) | _error_columns(estimate), _own_columns(work)
-    with tables.writer(work.path(ARTEFACTS[0]), "scores", tuple(_error_columns(estimate)), foreign=own) as file:
+    more, own = _degrees(done, world_frame.of(work.scenario)) | _error_columns(estimate), _own_columns(work)
+    columns = _columns(done, scorer.limit) | more
+    with tables.writer(work.path(ARTEFACTS[0]), "scores", tuple(more), foreign=own) as file:
         file.write(columns | own)
         file.describe(about)
     best = [d.site.name for d, rank in zip(done, columns["rank"], strict=True) if rank == 1]
@@ -161,6 +165,13 @@ def _columns(done: list[ScoredSite], limit: float) -> dict[str, Any]:
 def _own_columns(work: Workspace) -> dict[str, pa.Array]:
     """The columns of the user's own that the sites have, in the order of the sites."""
     return foreign_columns([site.own for site in scene_of(work).sites], schemas.names("scores"))
+
+
+def _degrees(done: list[ScoredSite], world: Georeference) -> dict[str, Any]:
+    """Where the sites are on the Earth; nothing where that is not known."""
+    places = [[d.site.pose.x_m, d.site.pose.y_m] for d in done]
+    lon_lat_deg = world.lon_lat_deg(np.array(places).reshape(-1, 2))
+    return {} if lon_lat_deg is None else {"longitude_deg": lon_lat_deg[:, 0], "latitude_deg": lon_lat_deg[:, 1]}
 
 
 def _estimate(done: list[ScoredSite], leave_out: uncertainty.LeaveOut | None) -> uncertainty.Estimate | None:

@@ -12,6 +12,7 @@ from pipeline.stages.base import StageInputs, Summary, Workspace
 from pipeline.stages.shared.built import built
 from pipeline.stages.shared.world import STATICS, remember_world
 from pipeline.traffic import sumo_folder
+from pipeline.world import world_frame
 from pipeline.world.mesh import write_ply
 
 NAME = "statics"
@@ -28,6 +29,7 @@ def inputs(work: Workspace) -> StageInputs:
     if ground is not None and (path := sumo_folder.network_path(scenario)) is not None:
         hashes["surface"] = files.sha256_of(path)
     settings = {"name": scenario.name, "statics": model.model_dump(mode="json"), "roi": [box.origin_m, box.size_m]}
+    settings |= world_frame.key(scenario)
     return StageInputs(settings, hashes, modules=() if ground is None else (type(ground).__module__,))
 
 

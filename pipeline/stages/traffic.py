@@ -25,6 +25,7 @@ from pipeline.scenario.models import Scenario
 from pipeline.stages.base import StageInputs, Summary, Workspace
 from pipeline.traffic import recording, sumo, sumo_folder, trajectories
 from pipeline.traffic.finished import sizes
+from pipeline.world import world_frame
 
 NAME = "traffic"
 ARTEFACTS = ("trajectories.parquet",)
@@ -42,6 +43,8 @@ def inputs(work: Workspace) -> StageInputs:
             sources.insert(0, scenario.find(traffic.sumocfg, "traffic.sumocfg"))
     effects, _ = on_traffic.live(scenario)
     settings = {"seed": scenario.seed, "name": scenario.name, "traffic": traffic.model_dump(mode="json")}
+    if traffic.fcd is not None:
+        settings |= world_frame.key(scenario)
     # one that acts by itself depends on the network alone
     if named := registry.settings(effect for effect in effects if not effect.SELF_ACTING):
         settings["effects"] = named
@@ -79,7 +82,8 @@ def run(work: Workspace, inputs: StageInputs, traci: tuple[str, int] | None = No
     """
     scenario = work.scenario
     effects, notes = on_traffic.live(scenario)
-    source = recording.record(scenario, work.path(COMPANIONS[0]), effects, work.progress, traci)
+    world = world_frame.of(scenario)
+    source = recording.record(scenario, work.path(COMPANIONS[0]), effects, work.progress, traci, world)
     with source as recorded, tables.writer(work.path(ARTEFACTS[0]), "trajectories") as file:
         tally, reports = trajectories.write(scenario, recorded, effects, file, work.progress)
         period_s, frames = recorded.window.period_ms / 1000.0, recorded.window.count

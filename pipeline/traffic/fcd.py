@@ -3,9 +3,10 @@
 Reads what SUMO writes with ``--fcd-output``: CSV, XML or Parquet, each maybe gzipped, told apart by their first bytes.
 Hands out Arrow tables with the columns of :data:`SCHEMA`, piece by piece, so that memory does not grow with the file.
 
-Positions are SUMO's own: the middle of the front bumper in metres, the angle in degrees clockwise from north, the slope
-in degrees. Times are whole milliseconds, SUMO's own unit. Rows without a vehicle (SUMO writes one for an empty step)
-are left out; so are persons (unless asked for) and containers.
+Positions are SUMO's own: the middle of the front bumper in metres (or longitude and latitude, which :func:`located`
+brings into the world frame), the angle in degrees clockwise from north, the slope in degrees. Times are whole
+milliseconds, SUMO's own unit. Rows without a vehicle (SUMO writes one for an empty step) are left out; so are persons
+(unless asked for) and containers.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 
 from pipeline.core.errors import InputError
 from pipeline.formats import safe_xml
+from pipeline.formats.georeference import Georeference, Reading
 from pipeline.scenario.types import FARTHEST_M
 
 _NUMBERS = ("x", "y", "z", "angle", "slope", "speed")
@@ -41,6 +43,24 @@ _BLOCK_BYTES = 1 << 20
 _BATCH_ROWS = 1 << 16
 RIGHT = "FCD with the attributes id, x, y, angle and type (--fcd-output.attributes id,x,y,z,angle,slope,type,speed)"
 """What a message asks for where a file is not right."""
+
+_RIGHT_PLACE = "x and y in metres of the world frame, or longitude and latitude (--fcd-output.geo)"
+
+
+def located(tables: Iterable[pa.Table], world: Georeference, path: Path) -> Iterator[pa.Table]:
+    """The rows of a user's file with x, y in the world frame, whether they are metres or degrees.
+
+    The first table tells. InputError where it is neither, or no vehicle of it is near the region of interest.
+    """
+    reading: Reading | None = None
+    for table in tables:
+        xy = np.column_stack([table["x"].to_numpy(), table["y"].to_numpy()])
+        reading = reading or world.reading(xy, str(path), None, _RIGHT_PLACE)
+        if reading.convert is not None:
+            x_m, y_m = reading.to_world(xy).T
+            for name, values in (("x", x_m), ("y", y_m)):
+                table = table.set_column(SCHEMA.get_field_index(name), SCHEMA.field(name), pa.array(values))
+        yield table
 
 
 def read(path: Path, who: str = "vehicle") -> Iterator[pa.Table]:

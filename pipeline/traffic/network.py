@@ -294,7 +294,7 @@ def _read(file: _Named, _content: str) -> Network:
                     phases = element.iter("phase")
                     cycle_s = max(cycle_s, sum(float(p.get("maxDur", p.attrib["duration"])) for p in phases))
                 case "location":
-                    location = Location(element.get("projParameter", ""), _point(element.attrib["netOffset"]))
+                    location = _location(element)
         except (KeyError, ValueError, IndexError) as error:
             what = f"<{element.tag} id={element.get('id', element.get('from', ''))!r}>"
             raise InputError(path, f"{what} is not as in a SUMO network ({error!r})", _RIGHT) from None
@@ -303,6 +303,26 @@ def _read(file: _Named, _content: str) -> Network:
         raise InputError(path, "the network has no road", "a network with at least one edge")
     ways = tuple(_road_connections(connections, roads, path))
     return Network(tuple(edges), ways, tuple(junctions), cycle_s, location, tuple(lane_links))
+
+
+def location_of(path: Path, root: str = "net") -> Location | None:
+    """Where a network (or, by its ``root``, a file that polyconvert wrote) says that it lies on the Earth.
+
+    None where it does not. Only the head of the file is read.
+    """
+    for element in safe_xml.children(path, root):
+        if element.tag == "location":
+            try:
+                return _location(element)
+            except (KeyError, ValueError) as error:
+                raise InputError(path, f"<location> is not as SUMO writes it ({error!r})", _RIGHT) from None
+        if element.tag in ("edge", "poly"):
+            return None
+    return None
+
+
+def _location(element: Element) -> Location:
+    return Location(element.get("projParameter", ""), _point(element.attrib["netOffset"]))
 
 
 def _edge(element: Element, path: Path) -> Edge:

@@ -18,6 +18,7 @@ from pipeline.core.errors import InputError
 from pipeline.core.findings import Finding
 from pipeline.core.progress import Progress
 from pipeline.formats import safe_xml
+from pipeline.formats.georeference import Georeference
 from pipeline.scenario.models import Scenario
 from pipeline.traffic import fcd, live, network, sumo, sumo_folder
 from pipeline.traffic.boxes import Size
@@ -84,8 +85,10 @@ def record(
     extensions: Sequence[TrafficExtension],
     progress: Progress,
     traci: tuple[str, int] | None,
+    world: Georeference,
 ) -> AbstractContextManager[Recording]:
-    """The recording of a scenario's traffic; SUMO runs in ``folder``, or listens at ``traci`` already.
+    """The recording of a scenario's traffic; SUMO runs in ``folder``, or listens at ``traci`` already. A finished file
+    may be in degrees, which ``world`` brings into the world frame.
 
     InputError when the scenario has a finished file that was to be recorded live, or an extension refuses it.
     """
@@ -94,20 +97,20 @@ def record(
     for refusal in filter(None, (extension.refuses(scenario) for extension in extensions)):
         raise refusal
     if scenario.traffic.fcd is not None:
-        return _finished(scenario)
+        return _finished(scenario, world)
     if traci is not None:
         return _running(scenario, *traci, extensions)
     return _simulated(scenario, folder, progress, extensions)
 
 
 @contextmanager
-def _finished(scenario: Scenario) -> Iterator[Recording]:
+def _finished(scenario: Scenario, world: Georeference) -> Iterator[Recording]:
     """From a file; nothing is simulated, so nothing is promised about it."""
     name, place = scenario.traffic.fcd, sumo_folder.place_of(scenario)
     assert name is not None
     when, held = survey.window(scenario)
     path, sizes = scenario.find(name, "traffic.fcd"), finished_sizes.of_types(scenario, held.types)
-    yield Recording(fcd.read(path), when, sizes, place)
+    yield Recording(fcd.located(fcd.read(path), world, path), when, sizes, place)
 
 
 @contextmanager

@@ -1,7 +1,8 @@
 """Reads footprints, and mends or refuses what is not sound.
 
-Steps: read GeoJSON polygons, lines and points (:mod:`pipeline.world.poly_xml` reads SUMO's); widen lines and points;
-mend what has one meaning only, and count it; refuse the rest. World frame, metres.
+Steps: read GeoJSON polygons, lines and points (:mod:`pipeline.world.poly_xml` reads SUMO's); bring what is in degrees
+or in a map projection into the world frame (:mod:`pipeline.formats.georeference`); widen lines and points; mend what
+has one meaning only, and count it; refuse the rest. World frame, metres.
 
 ``height_m`` is the z of the top, ``base_m`` (default 0) the z of the underside. Points are discs of ``radius_m``, lines
 are strips of that half width.
@@ -19,6 +20,7 @@ import numpy as np
 
 from pipeline.core.errors import InputError
 from pipeline.core.findings import Finding
+from pipeline.formats.georeference import IN_WORLD, Georeference, Reading, coordinates_of, declared_by
 from pipeline.scenario.types import FARTHEST_M
 
 if TYPE_CHECKING:
@@ -49,8 +51,8 @@ class FootprintFile:
     warnings: list[Finding] = field(default_factory=list)
 
 
-def read_geojson(path: Path) -> FootprintFile:
-    """Footprints of a GeoJSON FeatureCollection in world-frame metres.
+def read_geojson(path: Path, world: Georeference) -> FootprintFile:
+    """Footprints of a GeoJSON FeatureCollection in world-frame metres, degrees, or the system that it declares.
 
     InputError names the feature that cannot be understood, has no height, or is no sound polygon.
     """
@@ -61,6 +63,10 @@ def read_geojson(path: Path) -> FootprintFile:
         raise InputError(path, f"is not valid JSON: {error}", "a GeoJSON FeatureCollection") from None
     if not isinstance(document, dict) or not isinstance(document.get("features"), list):
         raise InputError(path, "has no list of features", "a GeoJSON FeatureCollection in world-frame metres")
+    declared = declared_by(document, str(path))
+    reading = world.reading(coordinates_of(document["features"]), str(path), declared)
+    if reading.convert is not None:
+        file.mended[f"features in {reading.words}, brought into the world frame"] += len(document["features"])
     for number, feature in enumerate(document["features"]):
         place = f"{path}: feature {number}"
         if not isinstance(feature, dict) or not isinstance(feature.get("properties") or {}, dict):
@@ -72,7 +78,7 @@ def read_geojson(path: Path) -> FootprintFile:
         if not height > base:
             raise InputError(place, f"height_m = {height:g} with base_m = {base:g}", "a top above the underside")
         kind = str(properties.get("kind", "footprint"))
-        for part in polygons_of(feature.get("geometry"), properties, place, file.mended):
+        for part in polygons_of(feature.get("geometry"), properties, place, file.mended, reading):
             file.footprints.append(Footprint(name, kind, part, base, height))
     return file
 
@@ -86,8 +92,11 @@ def _metres(properties: dict[str, Any], key: str, place: str, default: float | N
     return float(value)
 
 
-def polygons_of(geometry: Any, properties: dict[str, Any], place: str, mended: Counter[str]) -> list[Polygon]:
-    """The polygons of one feature: lines and points buffered, dirt mended, multi-part geometries taken apart."""
+def polygons_of(
+    geometry: Any, properties: dict[str, Any], place: str, mended: Counter[str], reading: Reading = IN_WORLD
+) -> list[Polygon]:
+    """The polygons of one feature, in the world frame: lines and points buffered, dirt mended, multi-part geometries
+    taken apart."""
     import shapely
 
     shape_place = f"{place}: geometry"
@@ -104,6 +113,8 @@ def polygons_of(geometry: Any, properties: dict[str, Any], place: str, mended: C
         raise InputError(shape_place, f"lies {far_m:g} m from the world's zero", f"within {FARTHEST_M:g} m")
     if shapely.has_z(shape) and np.any(shapely.get_coordinates(shape, include_z=True)[:, 2] != 0):
         raise InputError(shape_place, "has z coordinates", "two coordinates a point; heights go into base_m, height_m")
+    if reading.convert is not None:
+        shape = shapely.transform(shape, reading.to_world)
     if shape.geom_type.endswith(("Point", "LineString")):
         radius = _metres(properties, "radius_m", place)
         if radius <= 0:

@@ -3,13 +3,15 @@
 Steps: look each shape's type up in the table of solids (:mod:`pipeline.world.solid_types`); widen lines of walls and
 barriers; cut out the courtyards that polyconvert hands over as polygons of type ``inner``. Heights are the shape's own
 (attribute or parameter ``height``, or what ``polyconvert --all-attributes`` kept of the map), else those of its type.
-World frame, metres.
+World frame, metres: a shape is in those of the file's own ``<location>``, in the world frame's where it has none, or in
+degrees where it says ``geo``, as a point with ``lon`` and ``lat`` is.
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -21,23 +23,28 @@ from shapely import Polygon
 from pipeline.core.errors import InputError
 from pipeline.core.findings import Finding
 from pipeline.formats import safe_xml
+from pipeline.formats.crs import WGS84
+from pipeline.formats.georeference import Georeference, Reading
+from pipeline.traffic.network import location_of
 from pipeline.world.footprints import Footprint, FootprintFile, polygons_of
 from pipeline.world.mapped_heights import extent_of, is_underground
 from pipeline.world.solid_types import POLES, TRUNK_RADIUS_M, SolidType, SolidTypes
+from pipeline.world.world_frame import located
 
 _INNER = "inner"
 _WHITE = ("white", "255,255,255")  # polyconvert's colour of courtyards, which --osm.keep-full-type gives another type
 _NO_TYPE = "(none)"
 _SHOWN = 12  # types that a warning names
+_RIGHT = "a file that polyconvert made with the scenario's network (-n)"
 
 
-def read_poly_xml(path: Path, types: SolidTypes, height_m: float) -> FootprintFile:
+def read_poly_xml(path: Path, types: SolidTypes, height_m: float, world: Georeference) -> FootprintFile:
     """Footprints of what is solid; ``height_m`` is the top of what has no height of its own, nor one by its type.
 
     What is left out is counted by type; types that no table knows, and outlines of solids that are not closed, are
-    warned of. InputError names the solid that is not in metres, or not sound.
+    warned of. InputError names the solid that is not sound, or the file where it lies elsewhere.
     """
-    reader = _Reader(path, types, height_m)
+    reader = _Reader(path, types, height_m, world)
     for number, element in enumerate(safe_xml.children(path, "additional")):
         reader.take(number, element)
     return reader.done()
@@ -46,8 +53,9 @@ def read_poly_xml(path: Path, types: SolidTypes, height_m: float) -> FootprintFi
 class _Reader:
     """Takes the shapes of one file, one by one."""
 
-    def __init__(self, path: Path, types: SolidTypes, height_m: float) -> None:
-        self._path, self._types, self._height_m = path, types, height_m
+    def __init__(self, path: Path, types: SolidTypes, height_m: float, world: Georeference) -> None:
+        self._path, self._types, self._height_m, self._world = path, types, height_m, world
+        self._readings = _readings(path, world)
         self._file = FootprintFile()
         self._unknown, self._open, self._polygons = Counter[str](), Counter[str](), 0
         self._inner: list[Polygon] = []
@@ -68,7 +76,7 @@ class _Reader:
             return
         self._polygons += 1
         if kind == _INNER:
-            self._inner += self._areas(place, _points(element, place))
+            self._inner += self._areas(place, self._points(element, place))
             return
         if is_underground(tags):
             self._leave_out("underground polygons", kind)
@@ -79,7 +87,7 @@ class _Reader:
             if not self._types.knows(kind):
                 self._unknown[kind or _NO_TYPE] += 1
             return
-        points = _points(element, place)
+        points = self._points(element, place)
         closed = points[0] == points[-1] or _is_filled(element)
         if len(set(points)) > 2 and closed and (solid.half_width_m is None or _is_filled(element)):
             areas = self._areas(place, points)
@@ -95,16 +103,30 @@ class _Reader:
         """A pole, or a tree with its trunk; all other points of interest are none."""
         solid = POLES.get(kind) or self._types.named(kind)
         radius_m = solid.half_width_m if solid is not None and (kind in POLES or solid.is_tree) else None
-        if solid is None or radius_m is None or element.get("x") is None or element.get("y") is None:
+        is_geo = "x" not in element.attrib
+        x, y = (element.get(key) for key in (("lon", "lat") if is_geo else ("x", "y")))
+        if solid is None or radius_m is None or x is None or y is None:
             self._leave_out("points", kind.partition(".")[0])
             return
-        at = _numbers(f"{element.get('x')},{element.get('y')}", place)[0]
+        at = self._in_world(place, _numbers(f"{x},{y}", place), is_geo)[0]
         disc = polygons_of({"type": "Point", "coordinates": at}, {"radius_m": radius_m}, place, self._file.mended)
         base_m = self._add(place, name, kind, solid, disc, element, tags)
         if solid.is_tree and base_m > 0:
             properties = {"radius_m": TRUNK_RADIUS_M}
             trunk = polygons_of({"type": "Point", "coordinates": at}, properties, place, self._file.mended)
             self._file.footprints.append(Footprint(f"{name}/trunk", "tree_trunk", trunk[0], 0.0, base_m))
+
+    def _points(self, element: Element, place: str) -> list[tuple[float, float]]:
+        points = _numbers(element.get("shape", ""), place)
+        if len(points) < 2:
+            right = "three points for an area, two for a line"
+            raise InputError(f"{place}: shape", f"{element.get('shape')!r}", right)
+        return self._in_world(place, points, _is_geo(element))
+
+    def _in_world(self, place: str, points: list[tuple[float, float]], is_geo: bool) -> list[tuple[float, float]]:
+        if (reading := self._readings[is_geo]) is None:
+            raise self._world.unknown(place, "is in longitude and latitude", np.array(points))
+        return points if reading.convert is None else [(x, y) for x, y in reading.to_world(np.array(points)).tolist()]
 
     def _areas(self, place: str, points: list[tuple[float, float]]) -> list[Polygon]:
         ring = {"type": "Polygon", "coordinates": [points if points[0] == points[-1] else [*points, points[0]]]}
@@ -193,13 +215,30 @@ def _is_filled(element: Element) -> bool:
     return element.get("fill", "false").lower() in ("true", "1")
 
 
-def _points(element: Element, place: str) -> list[tuple[float, float]]:
-    if element.get("geo", "false").lower() in ("true", "1"):
-        raise InputError(place, "has longitude and latitude (geo)", "a shape in the network's metres")
-    points = _numbers(element.get("shape", ""), place)
-    if len(points) < 2:
-        raise InputError(f"{place}: shape", f"{element.get('shape')!r}", "three points for an area, two for a line")
-    return points
+def _is_geo(element: Element) -> bool:
+    return element.get("geo", "false").lower() in ("true", "1")
+
+
+def _readings(path: Path, world: Georeference) -> dict[bool, Reading | None]:
+    """How the file's shapes become the world frame's: those in degrees (True), and those in metres (False).
+
+    None where nothing says where the world frame lies, which matters only if a solid is in degrees.
+    """
+    points: dict[bool, list[tuple[float, float]]] = {True: [], False: []}
+    for element in safe_xml.children(path, "additional"):
+        if element.tag == "poly":
+            with suppress(InputError):  # told with the shape's name where it is read
+                points[_is_geo(element)] += _numbers(element.get("shape", ""), "")
+        elif element.tag == "poi" and "lon" in element.attrib:
+            with suppress(InputError):
+                points[True] += _numbers(f"{element.get('lon')},{element.get('lat')}", "")
+    finite = {is_geo: [p for p in some if np.isfinite(p).all()] for is_geo, some in points.items()}
+    degrees, metres = (np.array(finite[is_geo]).reshape(-1, 2) for is_geo in (True, False))
+    own = located(location_of(path, "additional"))
+    return {
+        True: None if world.frame is None else world.reading(degrees, str(path), WGS84, _RIGHT),
+        False: world.of_frame(own, metres, str(path), _RIGHT),
+    }
 
 
 def _numbers(text: str, place: str) -> list[tuple[float, float]]:

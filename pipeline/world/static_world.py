@@ -21,8 +21,10 @@ from numpy.typing import NDArray
 from pipeline.core.errors import InputError
 from pipeline.core.findings import WARNINGS, Finding
 from pipeline.core.progress import Progress, silent
+from pipeline.formats.georeference import Georeference
 from pipeline.scenario.models import MeshModel, Scenario
 from pipeline.scenario.types import FARTHEST_M
+from pipeline.world import world_frame
 from pipeline.world.footprints import Footprint, read_geojson
 from pipeline.world.ground import GroundSource
 from pipeline.world.mesh import World
@@ -59,11 +61,11 @@ def build(
 
     InputError when a file that the scenario names is not sound.
     """
-    model, builder = scenario.statics, _Builder()
-    read = [read_geojson(scenario.find(name, "statics.footprints")) for name in model.footprints]
+    model, builder, world = scenario.statics, _Builder(), world_frame.of(scenario)
+    read = [read_geojson(scenario.find(name, "statics.footprints"), world) for name in model.footprints]
     types = SolidTypes(model.polygon_types)
     polygons = [scenario.find(name, "statics.polygons") for name in model.polygons]
-    read += [read_poly_xml(path, types, model.polygon_height_m) for path in polygons]
+    read += [read_poly_xml(path, types, model.polygon_height_m, world) for path in polygons]
     for file in read:
         builder.counts.mended.update(file.mended)
         builder.counts.left_out.update(file.left_out)
@@ -75,7 +77,7 @@ def build(
         builder.add(*_extrude(standing), footprint.name, footprint.kind)
         progress("footprints", done + 1, len(footprints))
     for mesh in model.meshes:
-        _add_mesh(builder, scenario.find(mesh.file, "statics.meshes"), mesh)
+        _add_mesh(builder, scenario.find(mesh.file, "statics.meshes"), mesh, world)
     if model.ground:
         laid = _plane(builder, scenario) if surface is None else (surface.vertices_m, surface.faces)
         builder.add(*laid, "ground", "ground")
@@ -118,7 +120,7 @@ def _extrude(footprint: Footprint) -> tuple[Floats, NDArray[np.int64]]:
     return np.asarray(mesh.vertices) + np.array([0.0, 0.0, footprint.base_m]), np.asarray(mesh.faces)
 
 
-def _add_mesh(builder: _Builder, path: Path, model: MeshModel) -> None:
+def _add_mesh(builder: _Builder, path: Path, model: MeshModel, world: Georeference) -> None:
     """Each closed piece of a mesh becomes a solid, so that sites inside can be told; the rest stays one surface."""
     import trimesh
 
@@ -142,17 +144,28 @@ def _add_mesh(builder: _Builder, path: Path, model: MeshModel) -> None:
     if dropped := faces - len(mesh.faces):
         builder.counts.mended["degenerate or doubled triangles dropped"] += dropped
     pieces = trimesh.graph.connected_components(mesh.face_adjacency, nodes=np.arange(len(mesh.faces)), min_len=1)
-    offset, surface = np.asarray(model.offset_m), [np.empty(0, dtype=np.int64)]
+    vertices_m, surface = _in_world(mesh.vertices, model, path, world), [np.empty(0, dtype=np.int64)]
     for number, piece in enumerate(sorted((np.sort(p) for p in pieces), key=lambda p: int(p[0]))):
-        part = trimesh.Trimesh(mesh.vertices, mesh.faces[piece], process=False)
+        part = trimesh.Trimesh(vertices_m, mesh.faces[piece], process=False)
         if part.is_watertight and part.is_winding_consistent:
             part.remove_unreferenced_vertices()
-            builder.add(part.vertices + offset, part.faces, f"{path.stem}_{number}", model.kind)
+            builder.add(part.vertices, part.faces, f"{path.stem}_{number}", model.kind)
         else:
             surface.append(piece)
     if len(rest := np.concatenate(surface)):
         name, form = f"{path.stem}_surface", " (open surface)"
-        builder.add(mesh.vertices + offset, mesh.faces[rest], name, model.kind, form)
+        builder.add(vertices_m, mesh.faces[rest], name, model.kind, form)
+
+
+def _in_world(vertices_m: Floats, model: MeshModel, path: Path, world: Georeference) -> Floats:
+    """A mesh's vertices (n, 3) in the world frame: moved by its offset, then brought from its own system, if any."""
+    placed: Floats = np.add(vertices_m, model.offset_m, dtype=np.float64)
+    if model.system is None:
+        world.metres(placed[:, :2], str(path), "offset_m, epsg or origin_deg beside the mesh's file")
+        return placed
+    right = "the epsg or the origin_deg that the mesh was made with"
+    reading = world.reading(placed[:, :2], str(path), model.system, right)
+    return np.column_stack([reading.to_world(placed[:, :2]), placed[:, 2]])
 
 
 def _plane(builder: _Builder, scenario: Scenario) -> tuple[Floats, NDArray[np.int64]]:

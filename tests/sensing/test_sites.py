@@ -90,7 +90,7 @@ def test_a_run_from_geojson_scores_what_a_run_from_csv_does(mini: Path, tmp_path
     ("text", "message"),
     [
         ("", "cannot be read as GeoJSON"),
-        *((text, r"sites\.geojson: has no list of features: .*; a FeatureCollection of Points in world-frame metres$")
+        *((text, r"sites\.geojson: has no list of features: .*; a FeatureCollection of Points$")
           for text in ("[1, 2]", '{"type": "Point"}', "[]", "null", "5", '{"features": null}', '{"features": {}}')),
         pytest.param("[" * 100_000, "cannot be read as GeoJSON", id="deep"),
         (collection(), "holds no site"),
@@ -110,9 +110,13 @@ def test_a_run_from_geojson_scores_what_a_run_from_csv_does(mini: Path, tmp_path
           for value in ([], ["b"], {}, True)),
         (collection(point(0, 0, 3, name="\ud800")), r"feature 0: site: '\\ud800'; a name of up to 80"),
         *((json.dumps({"crs": crs, "features": [point(0, 0, 3, name="a")]}),
-           r"sites\.geojson: crs: .*; no crs \(RFC 7946\), and metres in the world frame")
-          for crs in (5, "EPSG:25832", {}, named("local"), named("EPSG:4326"), named("urn:ogc:def:crs:OGC:1.3:CRS84"),
-                      named("EPSG:2263"))),
+           r"sites\.geojson: crs: .*; .*or null$") for crs in (5, "EPSG:25832", {}, {"properties": {"name": 5}})),
+        (json.dumps({"crs": named("local"), "features": [point(0, 0, 3, name="a")]}),
+           r"sites\.geojson: crs: 'local' is none that is known; a coordinate reference system, for example"),
+        *((json.dumps({"crs": named(crs), "features": [point(9, 51, 3, name="a")]}),
+           rf"sites\.geojson: is in {name}.*, and nothing says where the scenario's world frame lies on the Earth; "
+           r"\[crs\] with epsg .*scenario\.toml, or a network with a <location>")
+          for crs, name in (("EPSG:4326", "WGS 84"), ("urn:ogc:def:crs:OGC:1.3:CRS84", "WGS"), ("EPSG:2263", "NAD83"))),
         (
             collection(feature({"type": "LineString", "coordinates": [[0, 0, 3], [1, 1, 3]]}, name="a")),
             "feature 0: is .*'LineString'.*a Point",

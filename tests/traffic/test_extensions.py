@@ -13,6 +13,7 @@ from pipeline.stages import traffic
 from pipeline.traffic import recording, trajectories
 from pipeline.traffic.boxes import Size
 from pipeline.traffic.extensions import TrafficPlan
+from pipeline.world import world_frame
 from tests.stages import run_stage
 from tests.traffic.helpers import SMALL, scenario
 
@@ -58,7 +59,7 @@ class Guests(Traffic):
 
 def recorded(scene, out, *acting):
     with (
-        recording.record(scene, out / "sumo", acting, silent, None) as rows,
+        recording.record(scene, out / "sumo", acting, silent, None, world_frame.of(scene)) as rows,
         tables.writer(out / "trajectories.parquet", "trajectories") as file,
     ):
         tally, reports = trajectories.write(scene, rows, acting, file, silent)

@@ -14,17 +14,26 @@ import pytest
 import shapely
 
 from pipeline.core.errors import InputError
+from pipeline.core.grid import Roi
 from pipeline.core.sumo_home import sumo_home
 from pipeline.formats import osm
+from pipeline.formats.crs import WorldFrame
+from pipeline.formats.georeference import Georeference
 from pipeline.scenario.loading import from_values
+from pipeline.traffic.network import location_of
 from pipeline.world import static_world
 from pipeline.world.footprints import FootprintFile
 from pipeline.world.mesh import World
 from pipeline.world.poly_xml import read_poly_xml
 from pipeline.world.solid_types import SolidTypes
+from pipeline.world.world_frame import located
 
 SMALL = Path(__file__).parents[1] / "importers" / "data" / "small.osm"
 SQUARE = "0,0 4,0 4,4 0,4"
+HERE = Roi((0.0, 0.0, 0.0), (20.0, 20.0, 5.0))
+NOWHERE = Georeference(None, HERE, "scenario.toml")
+FRAME = WorldFrame("EPSG:32632", (-550_700.0, -5_635_200.0))
+UTM = "+proj=utm +zone=32 +ellps=WGS84 +datum=WGS84 +units=m +no_defs"
 
 
 def poly(
@@ -36,10 +45,13 @@ def poly(
     return f'<poly id="x" {attributes}>{params}</poly>'
 
 
-def read(folder: Path, *shapes: str, types: dict[str, Any] | None = None, height_m: float = 9.0) -> FootprintFile:
+def read(
+    folder: Path, *shapes: str, types: dict[str, Any] | None = None, height_m: float = 9.0,
+    world: Georeference = NOWHERE,
+) -> FootprintFile:  # fmt: skip
     path = folder / "s.poly.xml"
     path.write_text(f"<additional>{''.join(shapes)}</additional>", encoding="utf-8")
-    return read_poly_xml(path, SolidTypes(types), height_m)
+    return read_poly_xml(path, SolidTypes(types), height_m, world)
 
 
 def extents(file: FootprintFile) -> list[tuple[str, float, float, float]]:
@@ -312,7 +324,7 @@ def test_trees_and_poles_among_the_points(tmp_path: Path) -> None:
         '<poi id="l" type="highway.street_lamp" x="1" y="2"/>',
         '<poi id="s" type="shop.bakery" x="1" y="2"/>',
         '<poi id="b" type="building.yes" x="1" y="2"/>',
-        '<poi id="g" type="natural.tree" lon="10" lat="50"/>',
+        '<poi id="g" type="natural.tree" lon="10"/>',
     )
     assert [(f.name, f.kind, f.base_m, f.height_m) for f in file.footprints] == [
         ("t", "tree_crown", 3.0, 10.0),
@@ -350,6 +362,44 @@ def test_a_tunnelled_garage_is_left_out(tmp_path: Path) -> None:
     assert file.left_out == {"underground polygons of type building.garage": 1}
 
 
+# ---- where shapes are
+
+
+def as_geo(shape: str) -> str:
+    metres = np.array([[float(v) for v in pair.split(",")] for pair in shape.split()])
+    return " ".join(f"{lon:.13f},{lat:.13f}" for lon, lat in FRAME.to_degrees(metres).tolist())
+
+
+def test_a_shape_in_degrees_is_brought_into_the_world(tmp_path: Path) -> None:
+    here = Georeference(FRAME, HERE, "scenario.toml")
+    lon, lat = as_geo("10,10").split(",")
+    tree = f'<poi id="t" type="natural.tree" lon="{lon}" lat="{lat}"/>'
+    tree_m = '<poi id="t" type="natural.tree" x="10" y="10"/>'
+    geo = read(tmp_path, poly("building", as_geo(SQUARE), geo="1"), poly("building", "6,0 9,0 9,3"), tree, world=here)
+    metres = read(tmp_path, poly("building"), poly("building", "6,0 9,0 9,3"), tree_m, world=here)
+    assert [f.polygon.wkb for f in geo.footprints] == [f.polygon.wkb for f in metres.footprints]
+    assert len(geo.footprints) == 4
+    with pytest.raises(
+        InputError, match=r"s.poly.xml: poly x: is in longitude and latitude, and nothing says where the scen"
+    ):
+        read(tmp_path, poly("building", as_geo(SQUARE), geo="1"))
+
+
+def test_a_files_own_location_counts(tmp_path: Path) -> None:
+    """polyconvert without the scenario's network lays another zero."""
+    here = Georeference(FRAME, HERE, "scenario.toml")
+    own = f'<location netOffset="-550690.00,-5635195.00" projParameter="{UTM}"/>'
+    moved = read(tmp_path, own, poly("building", "10,5 14,5 14,9 10,9"), world=here)
+    assert moved.footprints[0].polygon.equals(read(tmp_path, poly("building")).footprints[0].polygon)
+    same = f'<location netOffset="-550700.00,-5635200.00" projParameter="{UTM}"/>'
+    assert read(tmp_path, same, poly("building"), world=here).footprints[0].polygon.bounds == (0, 0, 4, 4)
+    far = f'<location netOffset="-500000.00,-5635200.00" projParameter="{UTM}"/>'
+    with pytest.raises(InputError, match=r"s.poly.xml: .* \(51 km\) as metres of its own <location>; .*polyconvert"):
+        read(tmp_path, far, poly("building"), world=here)
+    with pytest.raises(InputError, match=r"lie far from the region of interest \(141 km\)"):
+        read(tmp_path, poly("building", "100000,100000 100004,100000 100004,100004"))
+
+
 # ---- a file that polyconvert made
 
 
@@ -370,7 +420,9 @@ def test_what_polyconvert_makes_of_a_map(tmp_path: Path) -> None:
     ):  # fmt: skip
         command = [home / "bin" / name, "--osm-files", "m.osm", *flags]
         subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, env=environment)
-    file = read_poly_xml(tmp_path / "p.poly.xml", SolidTypes(), 9.0)
+    world = Georeference(located(location_of(tmp_path / "n.net.xml")), HERE, "scenario.toml")
+    assert world.frame is not None
+    file = read_poly_xml(tmp_path / "p.poly.xml", SolidTypes(), 9.0, world)
     found = {f.name: (f.base_m, f.height_m) for f in file.footprints}
     expected = {
         "2001": (0, 12), "2002": (0, 12.19), "2003": (0, 9), "2004": (0, 9), "2005": (0, 6), "2006": (3, 9),

@@ -15,6 +15,7 @@ from pipeline.sensing.scene import Scene
 from pipeline.sensing.sites import Site
 from pipeline.stages.base import StageInputs, Workspace
 from pipeline.stages.shared.world import STATICS, world_of
+from pipeline.world import world_frame
 
 SCANS = "scans.parquet"
 
@@ -35,6 +36,9 @@ def scan_inputs(work: Workspace) -> StageInputs:
         "sites": scenario.sites.model_dump(mode="json"),
         "sensors": {name: model.model_dump(mode="json") for name, model in scenario.sensors.items()},
     }
+    settings |= world_frame.key(scenario)
+    if scenario.crs.zero_height_m:
+        settings["zero_height_m"] = scenario.crs.zero_height_m
     if live:
         settings["effects"] = registry.settings(live)
     if scene.dropped:

@@ -1,0 +1,129 @@
+"""Tells where a scenario's world frame lies on the Earth.
+
+Steps: take the projection and offset of ``[crs]``, or those of the SUMO network's ``<location>`` (netconvert wrote
+there what it did to longitude and latitude); where both are given, hold them against one another.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.core import files
+from pipeline.core.errors import InputError
+from pipeline.formats.crs import STRETCH_MOST, WorldFrame, utm_epsg
+from pipeline.formats.georeference import Georeference
+from pipeline.scenario.models import Scenario
+from pipeline.traffic import network, sumo, sumo_folder
+from pipeline.traffic.network import Location
+
+_AGREE_M = 10.0
+"""Datums of one place differ by less, once transformed; a forgotten offset or another zone by far more."""
+
+_NONE = ("", "!")
+"""What SUMO writes where a network was not made from a map."""
+
+
+def of(scenario: Scenario) -> Georeference:
+    """Where the world frame lies, if the scenario or its network says it; a network of OpenStreetMap is converted.
+
+    InputError where ``[crs]`` names nothing that fits: no projection in metres, one that stretches lengths, or another
+    place than the network says.
+    """
+    stated, own = _stated(scenario), _of_network(scenario)
+    box, place = scenario.roi.box, str(scenario.file)
+    if stated is not None:
+        _check_stretch(stated, scenario)
+        if own is not None:
+            _check_agreement(stated, own, scenario)
+    return Georeference(stated or own, box, place)
+
+
+def key(scenario: Scenario) -> dict[str, Any]:
+    """What :func:`of` depends on, as a stage's settings hold it: ``world_frame``, or nothing where it is not known.
+
+    No map is converted for it.
+    """
+    found: dict[str, Any] = {}
+    if scenario.crs.epsg is not None:
+        found["crs"] = [scenario.crs.epsg, *scenario.crs.offset_m]
+    path = sumo_folder.network_path(scenario)
+    if path is not None and path.is_file():
+        if network.is_osm(path):
+            found |= {"map": files.sha256_of(path), "sumo": sumo.version()}
+        elif (location := network.location_of(path)) is not None and location.projection not in _NONE:
+            found["location"] = [location.projection, *location.offset_m]
+    return {"world_frame": found} if found else {}
+
+
+def located(location: Location | None) -> WorldFrame | None:
+    """The frame of a network, or of a ``.poly.xml``, that says where it lies; None where it does not, or in SUMO's own
+    words that PROJ does not know."""
+    if location is None or location.projection in _NONE:
+        return None
+    try:
+        return WorldFrame.of(location.projection, location.offset_m, "<location>")
+    except InputError:  # "-", ".": SUMO's own rough projections
+        return None
+
+
+def _stated(scenario: Scenario) -> WorldFrame | None:
+    crs = scenario.crs
+    if crs.epsg is None:
+        return None
+    return WorldFrame.of(f"EPSG:{crs.epsg}", crs.offset_m, f"{scenario.file}: crs.epsg")
+
+
+def _of_network(scenario: Scenario) -> WorldFrame | None:
+    path = sumo_folder.network_path(scenario)
+    if path is None or not path.is_file():
+        return None
+    if network.is_osm(path):
+        status = path.stat()
+        return located(_converted(path, status.st_mtime_ns, status.st_size))
+    return located(network.location_of(path))
+
+
+@lru_cache(maxsize=4)
+def _converted(path: Path, changed_ns: int, size: int) -> Location | None:
+    """Where netconvert puts a map; the file's time and size tell one map from another under the same name."""
+    del changed_ns, size
+    with tempfile.TemporaryDirectory() as folder:
+        made = Path(folder) / sumo_folder.NETWORK
+        sumo_folder.convert_osm(path.resolve(), made)
+        return network.location_of(made)
+
+
+def _check_stretch(frame: WorldFrame, scenario: Scenario) -> None:
+    x, y, _ = scenario.roi.center_m
+    place, stretch = f"{scenario.file}: crs", frame.stretch((x, y))
+    if abs(stretch - 1.0) <= STRETCH_MOST:
+        return
+    lon_deg, lat_deg = frame.to_degrees(np.array([[x, y]]))[0]
+    if not np.isfinite(lon_deg + lat_deg):
+        found = f"epsg = {scenario.crs.epsg} has no place ({x:g}, {y:g}) less offset_m, the centre of roi"
+        raise InputError(place, found, "the network's netOffset as offset_m, or roi.center_m in this system")
+    found = (
+        f"epsg = {scenario.crs.epsg} draws lengths {stretch:.3g} times as long at the region of interest"
+        f" (longitude {lon_deg:.5f}, latitude {lat_deg:.5f})"
+    )
+    right = f"a system that keeps lengths there, for example epsg = {utm_epsg(lon_deg, lat_deg)}, with its offset_m"
+    raise InputError(place, found, right)
+
+
+def _check_agreement(stated: WorldFrame, own: WorldFrame, scenario: Scenario) -> None:
+    centre = np.array([scenario.roi.center_m[:2]])
+    lon_deg, lat_deg = own.to_degrees(centre)[0]
+    apart_m = float(np.hypot(*(stated.from_degrees(own.to_degrees(centre)) - centre)[0]))
+    if not apart_m <= _AGREE_M:
+        found = (
+            f"epsg = {stated.projection.removeprefix('EPSG:')} with offset_m = {list(stated.offset_m)} puts the"
+            f" region of interest {apart_m:,.0f} m from where the network's <location> puts it"
+            f" (longitude {lon_deg:.5f}, latitude {lat_deg:.5f})"
+        )
+        right = f"no [crs], or one that agrees: netOffset {list(own.offset_m)}, projParameter {own.projection!r}"
+        raise InputError(f"{scenario.file}: crs", found, right)

@@ -1,0 +1,141 @@
+"""Where a scenario's world lies on the Earth: from its network, from ``[crs]``, and what is refused.
+
+The oracle is the map itself: a node of OpenStreetMap has its longitude and latitude, and the junction that netconvert
+made of it its x, y."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.core.errors import InputError
+from pipeline.core.sumo_home import sumo_home
+from pipeline.formats import osm
+from pipeline.scenario.loading import from_values
+from pipeline.scenario.models import Scenario
+from pipeline.traffic import network, sumo_folder
+from pipeline.traffic.network import Location
+from pipeline.world import world_frame
+
+SMALL = Path(__file__).parents[1] / "importers" / "data" / "small.osm"
+REAL = Path(__file__).parents[3] / "shared" / "real" / "bad_hersfeld.osm"
+INGOLSTADT = "tools/game/fkk_in/ingolstadt.net.xml.gz"
+
+
+def load(folder: Path, traffic: dict[str, Any], center: tuple[float, float] = (0, 0), **values: Any) -> Scenario:
+    roi = {"center_m": [*center, 2.5], "size_m": [60, 60, 5]}
+    return from_values({"roi": roi, "traffic": traffic, "sites": {"file": "s.csv"}, **values}, folder, "scenario.toml")
+
+
+def with_location(folder: Path, projection: str, offset: str = "-550000.00,-5634000.00") -> dict[str, Any]:
+    lane = '<lane id="a_0" index="0" speed="10" length="9" shape="0,0 9,0"/>'
+    (folder / "n.net.xml").write_text(
+        f'<net><location netOffset="{offset}" projParameter="{projection}"/>'
+        f'<edge id="a" from="n" to="m">{lane}</edge></net>'
+    )
+    return {"network": "n.net.xml"}
+
+
+UTM = "+proj=utm +zone=32 +ellps=WGS84 +datum=WGS84 +units=m +no_defs"
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("map_file", [SMALL, pytest.param(REAL, marks=pytest.mark.skipif(
+    not REAL.is_file(), reason="bad_hersfeld.osm is not beside the checkout (shared/real)"))])  # fmt: skip
+def test_a_junction_is_where_its_node_is_on_the_map(tmp_path: Path, map_file: Path) -> None:
+    sumo_folder.convert_osm(map_file, tmp_path / "n.net.xml")
+    world = world_frame.of(load(tmp_path, {"network": "n.net.xml"}))
+    assert world.frame is not None
+    nodes = osm.read(map_file).nodes
+    known = [j for j in network.read(tmp_path / "n.net.xml").junctions if j.id.isdigit() and int(j.id) in nodes]
+    assert len(known) > 5
+    junctions = np.array([j.at_m for j in known])
+    lon_lat_deg = np.array([nodes[int(j.id)] for j in known])[:, ::-1]
+    away_m = np.hypot(*(world.frame.from_degrees(lon_lat_deg) - junctions).T)
+    assert np.median(away_m) < 0.01  # netconvert writes centimetres
+    assert np.ptp(junctions, axis=0).min() > 100
+    back = world.lon_lat_deg(junctions)
+    assert back is not None
+    assert np.median(np.abs(back - lon_lat_deg)) < 2e-7
+
+
+@pytest.mark.system
+def test_a_map_as_network_lies_where_netconvert_will_put_it(tmp_path: Path) -> None:
+    sumo_folder.convert_osm(SMALL, tmp_path / "n.net.xml")
+    (tmp_path / "m.osm.xml").write_bytes(SMALL.read_bytes())
+    by_net, by_map = (load(tmp_path, {"network": name}) for name in ("n.net.xml", "m.osm.xml"))
+    assert world_frame.of(by_map).frame == world_frame.of(by_net).frame is not None
+    assert world_frame.key(by_map)["world_frame"].keys() == {"map", "sumo"}
+
+
+def test_a_real_network_knows_its_town(tmp_path: Path) -> None:
+    """Against sumolib, which inverts the same location with its own code."""
+    import sumolib
+
+    world = world_frame.of(load(tmp_path, {"network": f"$SUMO_HOME/{INGOLSTADT}"}, (5770, 5665)))
+    found = world.lon_lat_deg(np.array([[5770.0, 5665.0], [5525.68, 5517.09]]))
+    assert found is not None
+    net = sumolib.net.readNet(str(sumo_home() / INGOLSTADT))
+    assert found[0] == pytest.approx(net.convertXY2LonLat(5770, 5665), abs=1e-8)
+    assert found[1] == pytest.approx((11.42, 48.77), abs=0.02)
+
+
+def test_a_network_that_was_drawn_lies_nowhere(tmp_path: Path) -> None:
+    for projection in ("!", "", "-", "."):
+        scene = load(tmp_path, with_location(tmp_path, projection))
+        assert world_frame.of(scene).frame is None
+        assert ("world_frame" in world_frame.key(scene)) == (projection in ("-", "."))
+
+
+def test_a_scenario_may_say_it_itself(tmp_path: Path) -> None:
+    crs = {"epsg": 32632, "offset_m": [-550000, -5634000]}
+    scene = load(tmp_path, {"fcd": "f.csv"}, (700, 1200), crs=crs)
+    by_net = load(tmp_path, with_location(tmp_path, UTM), (700, 1200))
+    stated, own = (world_frame.of(s).lon_lat_deg(np.array([[700.0, 1200.0]])) for s in (scene, by_net))
+    assert np.array_equal(stated, own)
+    assert world_frame.key(scene) == {"world_frame": {"crs": [32632, -550000, -5634000]}}
+    assert world_frame.key(by_net) == {"world_frame": {"location": [UTM, -550000, -5634000]}}
+    assert world_frame.key(load(tmp_path, {"fcd": "f.csv"})) == {}
+    world_frame.of(load(tmp_path, with_location(tmp_path, UTM), (700, 1200), crs=crs))
+
+
+@pytest.mark.parametrize(
+    ("crs", "message"),
+    [
+        ({"epsg": 4326}, r"crs.epsg: EPSG:4326 \(WGS 84\) is no map projection; a projected system in metres"),
+        ({"epsg": 2263}, r"crs.epsg: EPSG:2263 .* counts in US survey foot"),
+        ({"epsg": 1}, "crs.epsg: 'EPSG:1' is none that is known"),
+        ({"epsg": 3857, "offset_m": [-1081000, -6594000]},
+         r"crs: epsg = 3857 draws lengths 1.58 times as long at the region of interest \(longitude 9.71\d*, latitude "
+         r"50.8\d*\); a system that keeps lengths there, for example epsg = 32632, with its offset_m"),
+        ({"epsg": 25832}, r"crs: epsg = 25832 .*(has no place|draws lengths|puts the region)"),  # a forgotten offset
+        ({"epsg": 32633, "offset_m": [-550000, -5634000]}, r"puts the region of interest [\d,]+ m from where"),
+        ({"epsg": 25832, "offset_m": [-550000, -5634020]},
+         r"puts the region of interest 20 m from where the network's <location> puts it .*; "
+         r"no \[crs\], or one that agrees: netOffset \[-550000.0, -5634000.0\], projParameter '\+proj=utm \+zone=32"),
+    ],
+)  # fmt: skip
+def test_what_contradicts_itself_is_refused(tmp_path: Path, crs: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        world_frame.of(load(tmp_path, with_location(tmp_path, UTM), (700, 1200), crs=crs))
+
+
+def test_an_offset_needs_its_projection(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="crs: offset_m without epsg"):
+        load(tmp_path, {"fcd": "f.csv"}, crs={"offset_m": [1, 2]})
+    assert load(tmp_path, {"fcd": "f.csv"}, crs={"zero_height_m": 210.0}).crs.zero_height_m == 210.0
+
+
+def test_a_damaged_location_is_told(tmp_path: Path) -> None:
+    scene = load(tmp_path, with_location(tmp_path, UTM, "here"))
+    with pytest.raises(InputError, match=r"n.net.xml: <location> is not as SUMO writes it"):
+        world_frame.of(scene)
+
+
+def test_what_sumo_says_in_words_of_its_own_is_no_frame() -> None:
+    assert world_frame.located(None) is None
+    assert world_frame.located(Location("-", (0.0, 0.0))) is None
+    assert world_frame.located(Location(UTM, (1.0, 2.0))) is not None
