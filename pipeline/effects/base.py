@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.artefacts.readers import Tpog
+    from pipeline.core.grid import Grid
     from pipeline.scenario.models import Scenario
     from pipeline.sensing.crossings import Crossings
     from pipeline.sensing.scene import Scene
@@ -114,6 +115,12 @@ class TransmitScore(Effect[P]):
         it (:attr:`reads`)."""
         raise NotImplementedError
 
+    def seen_from(self, sensor_m: NDArray[np.float64], grid: Grid) -> TransmitScore[P]:
+        """The effect for one sensor (3,), in the grid's frame, whose crossings it is asked about next; here is the
+        place for what does not depend on the beams. Called from several threads."""
+        del sensor_m, grid
+        return self
+
     def share(self, crossings: Crossings) -> NDArray[np.float64]:
         """Share (k,), 0 to 1, of its beam that gets as far as each crossing of ``crossings``; called from several
         threads."""
@@ -136,7 +143,9 @@ class Detect(Effect[P]):
         return None
 
     def detect(self, range_m: NDArray[np.float64], sensor: Sensor) -> NDArray[np.float64]:
-        """Chance (n,), 0 to 1, for targets at ``range_m`` (n,) metres from the sensor."""
+        """Chance (n,), 0 to 1, for targets at ``range_m`` (n,) metres from the sensor.
+
+        It is not asked once for each beam and voxel, see :mod:`pipeline.scoring.thinning`."""
         raise NotImplementedError
 
 

@@ -1,4 +1,4 @@
-"""Lists which voxels beam pieces cross, with their ranges.
+"""Lists which voxels beam pieces cross, with their ranges, and adds up what each crossing is worth.
 
 Frame: the grid's own, in voxel units, as in :mod:`pipeline.kernels.march`, whose decisions these are.
 """
@@ -15,7 +15,7 @@ _kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 @_kernel
 def crossings(o, d, shape, voxel_m, first, cells, enter_m, leave_m):  # type: ignore[no-untyped-def]
-    """List crossings, or count them when ``cells`` is empty.
+    """List crossings.
 
     Parameters
     ----------
@@ -23,23 +23,21 @@ def crossings(o, d, shape, voxel_m, first, cells, enter_m, leave_m):  # type: ig
         Sensor (3,), beam ends seen from it (n, 3), both in voxel units; the grid, as in
         :func:`pipeline.kernels.march.count_hits`.
     first
-        (n + 1,) int64. Counting: ``first[i + 1]`` is set to the crossings of piece i. Listing: where each piece's
-        begin.
+        (n + 1,) int64, filled: crossings first[i] to first[i + 1] belong to piece i.
     cells, enter_m, leave_m
-        Filled: flat index, range of entry and of exit of each crossing.
+        Filled: flat index, range of entry and of exit of each crossing. At least n * sum(shape) long each.
     """
-    longest = shape[0] + shape[1] + shape[2] + 3
-    scratch, t_cells, times = np.empty(longest, np.int64), np.empty((longest, 2), np.float64), _scratch(shape)
-    unused = np.empty(0, np.uint32)
+    times, t_cells = _scratch(shape), np.empty((shape[0] + shape[1] + shape[2], 2), np.float64)
+    unused, total = np.empty(0, np.uint32), 0
+    first[0] = 0
     for n in range(d.shape[0]):
-        count, _, _ = _walk(o, d[n], shape, voxel_m, unused, scratch, t_cells, times)
-        if cells.shape[0] == 0:
-            first[n + 1] = count
-            continue
+        count, _, _ = _walk(o, d[n], shape, voxel_m, unused, np.uint32(0), cells[total:], t_cells, times)
         size = np.sqrt(d[n, 0] ** 2 + d[n, 1] ** 2 + d[n, 2] ** 2) * voxel_m
         for i in range(count):
-            at = first[n] + i
-            cells[at], enter_m[at], leave_m[at] = scratch[i], t_cells[i, 0] * size, t_cells[i, 1] * size
+            enter_m[total + i] = t_cells[i, 0] * size
+            leave_m[total + i] = t_cells[i, 1] * size
+        total += count
+        first[n + 1] = total
 
 
 @_kernel
@@ -47,3 +45,20 @@ def accumulate(cells, weights, hits):  # type: ignore[no-untyped-def]
     """Add whole-number weights (k,) int64 to ``hits`` at ``cells``."""
     for i in range(cells.shape[0]):
         hits[cells[i]] += weights[i]
+
+
+@_kernel
+def add_shares(first, cells, weights, share, unit, hits):  # type: ignore[no-untyped-def]
+    """Add to ``hits`` (int64) what gets as far as each crossing, in whole multiples of 1 / ``unit``.
+
+    Parameters
+    ----------
+    first, cells
+        As :func:`crossings` fills them.
+    weights, share
+        The share of its beam that each piece is (n,), and of the piece that gets as far as each crossing (k,), float64.
+    """
+    for n in range(first.shape[0] - 1):
+        weight = weights[n]
+        for i in range(first[n], first[n + 1]):
+            hits[cells[i]] += np.int64(np.rint(weight * share[i] * unit))

@@ -96,22 +96,6 @@ def _shortest(dx, dy, dz, voxel_m):  # type: ignore[no-untyped-def]
 
 
 @_kernel
-def _note(hits, cells, t_cells, count, cell, t, t_next, shortest):  # type: ignore[no-untyped-def]
-    """Count a voxel if crossed, or list it where a list is wanted (settled when compiled: ``cells`` is None or an
-    array).
-
-    Returns how many are listed now.
-    """
-    crossed = t_next - t > shortest
-    if cells is None:
-        hits[cell] += np.uint32(crossed)  # no branch: faster, and nearly always 1
-        return 0
-    if crossed:
-        cells[count], t_cells[count, 0], t_cells[count, 1] = cell, t, t_next
-    return count + crossed
-
-
-@_kernel
 def _scratch(shape):  # type: ignore[no-untyped-def]
     """Room for the crossings of each axis in rows 0 to 2; row 3 holds 0, 1, 2, ..."""
     times = np.empty((4, max(shape[0], shape[1], shape[2]) + 2), np.float64)
@@ -121,8 +105,11 @@ def _scratch(shape):  # type: ignore[no-untyped-def]
 
 
 @_kernel
-def _walk(o, d, shape, voxel_m, hits, cells, t_cells, times):  # type: ignore[no-untyped-def]
-    """:func:`walk` with room for the crossings, from :func:`_scratch`."""
+def _walk(o, d, shape, voxel_m, hits, amount, cells, t_cells, times):  # type: ignore[no-untyped-def]
+    """:func:`walk` with what a crossed voxel gets, and room for the crossings, from :func:`_scratch`.
+
+    Whether voxels are counted or listed is settled when it is compiled: ``cells`` is None or an array.
+    """
     ox, oy, oz = o[0], o[1], o[2]
     dx, dy, dz = d[0], d[1], d[2]
     nx, ny, nz = float(shape[0]), float(shape[1]), float(shape[2])
@@ -151,28 +138,29 @@ def _walk(o, d, shape, voxel_m, hits, cells, t_cells, times):  # type: ignore[no
     ix, iy, iz = np.uint64(0), np.uint64(0), np.uint64(0)
     tx, ty, tz = times_x[ix], times_y[iy], times_z[iz]
     t_first, count = t, 0
-    while True:
+    following, on = cell, True
+    while on:
         if tx < ty and tx < tz:
-            count = _note(hits, cells, t_cells, count, cell, t, tx, shortest)
-            t = tx
-            cell += step_x
+            t_next, following = tx, cell + step_x
             ix += one
             tx = times_x[ix]
         elif ty < tz:
-            count = _note(hits, cells, t_cells, count, cell, t, ty, shortest)
-            t = ty
-            cell += step_y
+            t_next, following = ty, cell + step_y
             iy += one
             ty = times_y[iy]
         elif tz < np.inf:
-            count = _note(hits, cells, t_cells, count, cell, t, tz, shortest)
-            t = tz
-            cell += step_z
+            t_next, following = tz, cell + step_z
             iz += one
             tz = times_z[iz]
         else:
-            break
-    count = _note(hits, cells, t_cells, count, cell, t, t_last, shortest)
+            t_next, on = t_last, False
+        crossed = t_next - t > shortest
+        if cells is None:
+            hits[cell] += amount * crossed  # no branch: faster, and nearly always 1
+        else:
+            cells[count], t_cells[count, 0], t_cells[count, 1] = cell, t, t_next
+            count += crossed
+        t, cell = t_next, following
     return count, t_first, t_last
 
 
@@ -202,7 +190,7 @@ def walk(o, d, shape, voxel_m, hits, cells, t_cells):  # type: ignore[no-untyped
         Number of voxels listed (0 where they are counted); the part of the segment inside the grid (none when
         ``t_last <= t_first``).
     """
-    return _walk(o, d, shape, voxel_m, hits, cells, t_cells, _scratch(shape))
+    return _walk(o, d, shape, voxel_m, hits, np.uint32(1), cells, t_cells, _scratch(shape))
 
 
 @_kernel
@@ -222,7 +210,15 @@ def count_hits(o, d, shape, voxel_m, hits):  # type: ignore[no-untyped-def]
     """
     times = _scratch(shape)
     for beam in range(d.shape[0]):
-        _walk(o, d[beam], shape, voxel_m, hits, None, None, times)
+        _walk(o, d[beam], shape, voxel_m, hits, np.uint32(1), None, None, times)
+
+
+@_kernel
+def add_hits(o, d, shape, voxel_m, weights, hits):  # type: ignore[no-untyped-def]
+    """As :func:`count_hits`, for beams that weigh ``weights`` (n,) int64; ``hits`` are int64."""
+    times = _scratch(shape)
+    for beam in range(d.shape[0]):
+        _walk(o, d[beam], shape, voxel_m, hits, weights[beam], None, None, times)
 
 
 @_kernel
@@ -275,7 +271,7 @@ def audit(o, d, shape, voxel_m, last_beam):  # type: ignore[no-untyped-def]
     worst_sum, longest_gap, misplaced, doubled = 0.0, 0.0, 0, 0
     slack = 1e-9 * max(shape[0], shape[1], shape[2])
     for beam in range(d.shape[0]):
-        count, t_first, t_last = _walk(o, d[beam], shape, voxel_m, last_beam, cells, t_cells, times)
+        count, t_first, t_last = _walk(o, d[beam], shape, voxel_m, last_beam, np.uint32(1), cells, t_cells, times)
         if not t_first < t_last:
             continue
         size = CHORD_M / _shortest(d[beam, 0], d[beam, 1], d[beam, 2], voxel_m)

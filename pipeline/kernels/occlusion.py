@@ -10,11 +10,12 @@ where it enters the shrunk box:
 with the sensor :math:`o` and the unit direction :math:`d` along the box's own axes (slabs: Kay and Kajiya 1986, "Ray
 Tracing Complex Scenes"). A box that holds the sensor stops nothing.
 
-Steps of :func:`count_blocked`: the beams come sorted by azimuth. A box asks only those within its azimuths and
-elevations, seen from the sensor; those bounds are taken round the *unshrunk* box, so rounding loses no beam. In a frame
-each beam keeps the nearest box; when the frame is over, one is added at the first crossing that lies behind it. Sums
-along each beam then give the frames in which a crossing was not reached. Memory holds a number a beam and a number a
-crossing, however many frames there are.
+Steps: :func:`face` turns each box that can stand before the grid into what a beam asks of it: its axes and half sizes,
+where the sensor is along them, and the azimuths and slopes within which it lies. Those bounds are taken round the
+*unshrunk* box, so rounding loses no beam. :func:`gather` sorts the boxes into cells of azimuth, frame by frame.
+:func:`count_blocked` then takes beam after beam: the boxes in its cell of azimuth and at its slope, the nearest of each
+frame, and one is added at the first crossing that lies behind it. Sums along the beam give the frames in which a
+crossing was not reached. All that a beam needs lies together, and memory does not grow with beams times frames.
 """
 
 from __future__ import annotations
@@ -105,100 +106,164 @@ def _directions(box, low, high, o):  # type: ignore[no-untyped-def]
 
 
 @_kernel
-def _stop(box, o, d, slope, azimuth, limit, bound, scratch, nearest, touched, count):  # type: ignore[no-untyped-def]
-    """Shorten ``nearest`` of the beams that a box stops; list those that no box of the frame stopped before in
-    ``touched``.
-
-    ``bound`` is what :func:`_directions` returned. Returns how many are listed now.
-    """
-    first, last, slope_low, slope_high = bound
-    axes_of(box[3], box[4], scratch)
-    a, b, c = scratch[0], scratch[1], scratch[2]
-    x, y, z = o[0] - box[0], o[1] - box[1], o[2] - box[2]
-    ou, ov, ow = a[0] * x + a[1] * y + a[2] * z, b[0] * x + b[1] * y + b[2] * z, c[0] * x + c[1] * y + c[2] * z
-    half_u, half_v, half_w = 0.5 * box[5] - SHRINK_M, 0.5 * box[6] - SHRINK_M, 0.5 * box[7] - SHRINK_M
-    for turn in (-2.0 * math.pi, 0.0, 2.0 * math.pi):
-        if first + turn > math.pi or last + turn < -math.pi:
-            continue
-        begin = np.searchsorted(azimuth, first + turn)
-        end = np.searchsorted(azimuth, last + turn, side="right")
-        for i in range(begin, end):
-            if slope[i] < slope_low or slope[i] > slope_high:
-                continue
-            x, y, z = d[i, 0], d[i, 1], d[i, 2]
-            t, leave = 0.0, np.inf
-            t, leave = _slab(ou, a[0] * x + a[1] * y + a[2] * z, half_u, t, leave)
-            t, leave = _slab(ov, b[0] * x + b[1] * y + b[2] * z, half_v, t, leave)
-            t, leave = _slab(ow, c[0] * x + c[1] * y + c[2] * z, half_w, t, leave)
-            if t < leave and t < limit[i]:
-                if nearest[i] == np.inf:
-                    touched[count] = i
-                    count += 1
-                nearest[i] = min(nearest[i], t)
-    return count
-
-
-@_kernel
-def _note(touched, count, nearest, row, first, enter_m, blocked):  # type: ignore[no-untyped-def]
-    """Add the frame that is over: one at the first crossing behind where each of ``count`` beams ended. Clears
-    ``nearest``."""
-    for k in range(count):
-        i = touched[k]
-        begin, end = first[row[i]], first[row[i] + 1]
-        at = begin + np.searchsorted(enter_m[begin:end], nearest[i], side="right")
-        if at < end:
-            blocked[at] += 1
-        nearest[i] = np.inf
-
-
-@_kernel
-def count_blocked(o, d, azimuth, slope, row, first, enter_m, frames, boxes, low, high, blocked):  # type: ignore[no-untyped-def]
-    """Count the frames in which a box stops a beam before it gets as far as each of its crossings.
+def face(o, frames, boxes, low, high, size_m, facing, frame, span):  # type: ignore[no-untyped-def]
+    """Turn boxes towards the sensor; leave out those that cannot stand between it and the grid, or hold it.
 
     Parameters
     ----------
     o
         The sensor, (3,) float64.
-    d, azimuth, slope
-        Unit directions (n, 3), their azimuths in [-pi, pi], ascending, and their rise over run, (n,) each.
-    row
-        Which beam of ``first`` each of these is, (n,) int64; each has at least one crossing.
-    first, enter_m
-        Crossings first[i] to first[i + 1] belong to beam i, int64; range at which each is entered, ascending along a
-        beam, (k,) float64.
     frames, boxes
         Frame of each box, ascending, (m,) int64; the boxes as in :func:`bounds`, (m, 8).
     low, high
         As :func:`bounds` fills them, (m, 3) each.
-    blocked
-        Zeros, filled, (k,) int64.
+    size_m
+        The grid is the box from 0 to ``size_m`` (3,).
+    facing
+        Filled, (m, 15) float64: for each axis of the box the axis (3), where the sensor is along it, the half size.
+    frame
+        Filled, (m,) int64.
+    span
+        Filled, (m, 4) float64: first and last azimuth, lowest and highest slope, see :func:`_directions`.
+
+    Returns
+    -------
+    int
+        How many boxes are left, in order.
     """
-    n = d.shape[0]
-    if n == 0:
-        return
-    nearest, touched, limit = np.full(n, np.inf), np.empty(n, np.int64), np.empty(n)
-    scratch, count = np.empty((3, 3)), 0
-    reach_low, reach_high = o.copy(), o.copy()  # all that these beams pass through
-    for i in range(n):
-        limit[i] = enter_m[first[row[i] + 1] - 1]
-        for a in range(3):
-            reach_low[a] = min(reach_low[a], o[a] + limit[i] * d[i, a])
-            reach_high[a] = max(reach_high[a], o[a] + limit[i] * d[i, a])
+    axes, count = np.empty((3, 3)), 0
     for b in range(frames.shape[0]):
-        if b > 0 and frames[b] != frames[b - 1]:
-            _note(touched, count, nearest, row, first, enter_m, blocked)
-            count = 0
         apart = False
         for a in range(3):
-            apart |= low[b, a] > reach_high[a] or high[b, a] < reach_low[a]
+            apart |= low[b, a] > max(o[a], size_m[a]) or high[b, a] < min(o[a], 0.0)
         if apart or holds(boxes[b], o):
             continue
-        bound = _directions(boxes[b], low[b], high[b], o)
-        count = _stop(boxes[b], o, d, slope, azimuth, limit, bound, scratch, nearest, touched, count)
-    _note(touched, count, nearest, row, first, enter_m, blocked)
-    for i in range(n):
-        for at in range(first[row[i]] + 1, first[row[i] + 1]):
-            blocked[at] += blocked[at - 1]
+        axes_of(boxes[b, 3], boxes[b, 4], axes)
+        x, y, z = o[0] - boxes[b, 0], o[1] - boxes[b, 1], o[2] - boxes[b, 2]
+        for a in range(3):
+            row = facing[count, 5 * a : 5 * a + 5]
+            row[:3] = axes[a]
+            row[3] = axes[a, 0] * x + axes[a, 1] * y + axes[a, 2] * z
+            row[4] = 0.5 * boxes[b, 5 + a] - SHRINK_M
+        first, last, slope_low, slope_high = _directions(boxes[b], low[b], high[b], o)
+        span[count, 0], span[count, 1], span[count, 2], span[count, 3] = first, last, slope_low, slope_high
+        frame[count] = frames[b]
+        count += 1
+    return count
+
+
+@_inlined
+def _cell(azimuth, cells):  # type: ignore[no-untyped-def]
+    """The cell of an azimuth, unwrapped: 0 begins at -pi."""
+    return np.int64(np.floor((azimuth + math.pi) * (cells / (2.0 * math.pi))))
+
+
+@_kernel
+def gather(span, cells):  # type: ignore[no-untyped-def]
+    """Sort boxes into cells of azimuth.
+
+    Parameters
+    ----------
+    span
+        As :func:`face` fills it, (m, 4).
+    cells
+        How many cells the circle has.
+
+    Returns
+    -------
+    starts, members
+        members[starts[c]] to members[starts[c + 1]] are the boxes that reach into cell c, ascending, int64.
+    """
+    starts = np.zeros(cells + 1, np.int64)
+    for b in range(span.shape[0]):
+        first = _cell(span[b, 0], cells)
+        for c in range(first, min(_cell(span[b, 1], cells), first + cells - 1) + 1):
+            starts[c % cells + 1] += 1
+    for c in range(cells):
+        starts[c + 1] += starts[c]
+    members, filled = np.empty(starts[cells], np.int64), starts[:-1].copy()
+    for b in range(span.shape[0]):
+        first = _cell(span[b, 0], cells)
+        for c in range(first, min(_cell(span[b, 1], cells), first + cells - 1) + 1):
+            members[filled[c % cells]] = b
+            filled[c % cells] += 1
+    return starts, members
+
+
+@_inlined
+def _entered(facing, m, x, y, z):  # type: ignore[no-untyped-def]
+    """Where a ray along (x, y, z) enters box m of ``facing``; infinity where it does not."""
+    t, leave = 0.0, np.inf
+    for a in (0, 5, 10):
+        along = facing[m, a] * x + facing[m, a + 1] * y + facing[m, a + 2] * z
+        t, leave = _slab(facing[m, a + 3], along, facing[m, a + 4], t, leave)
+    return t if t < leave else np.inf
+
+
+@_inlined
+def _behind(enter_m, begin, last, range_m):  # type: ignore[no-untyped-def]
+    """The first of the crossings ``begin`` to ``last`` that is entered behind a range below the last one's.
+
+    Guessed, since planes lie evenly, then settled."""
+    at = begin
+    if last > begin:
+        share = (range_m - enter_m[begin]) / (enter_m[last] - enter_m[begin])
+        at = begin + min(max(np.int64(share * (last - begin)), 0), last - begin)
+    while at > begin and enter_m[at - 1] > range_m:
+        at -= 1
+    while enter_m[at] <= range_m:
+        at += 1
+    return at - begin
+
+
+@_kernel
+def count_blocked(d, azimuth, slope, first, enter_m, frame, facing, slopes, starts, members, levels, share):  # type: ignore[no-untyped-def]
+    """Count the frames in which a box stops a beam before it gets as far as each of its crossings.
+
+    Parameters
+    ----------
+    d, azimuth, slope
+        Unit directions (n, 3), their azimuths in [-pi, pi], and their rise over run, (n,) each.
+    first, enter_m
+        Crossings first[i] to first[i + 1] belong to beam i, (n + 1,) int64; range at which each is entered, ascending
+        along a beam, (k,) float64.
+    frame, facing, slopes
+        Of each box, as :func:`face` fills them; slopes are the last two columns of ``span``.
+    starts, members
+        As :func:`gather` returns them.
+    levels
+        What is said of a crossing that is not reached in so many frames, from 0 on.
+    share
+        Filled, (k,), ``levels`` of each crossing.
+    """
+    cells, most = starts.shape[0] - 1, 0
+    for i in range(d.shape[0]):
+        most = max(most, first[i + 1] - first[i])
+    blocked = np.zeros(most, np.int64)
+    for i in range(d.shape[0]):
+        begin, last = first[i], first[i + 1] - 1
+        if last < begin:
+            continue
+        limit, rise = enter_m[last], slope[i]
+        nearest, now, cell = np.inf, np.int64(-1), _cell(azimuth[i], cells) % cells
+        for k in range(starts[cell], starts[cell + 1]):
+            m = members[k]
+            if rise < slopes[m, 0] or rise > slopes[m, 1]:
+                continue
+            t = _entered(facing, m, d[i, 0], d[i, 1], d[i, 2])
+            if t < limit:
+                if frame[m] != now:
+                    if nearest < np.inf:
+                        blocked[_behind(enter_m, begin, last, nearest)] += 1
+                    nearest, now = np.inf, frame[m]
+                nearest = min(nearest, t)
+        if nearest < np.inf:
+            blocked[_behind(enter_m, begin, last, nearest)] += 1
+        total = 0
+        for k in range(begin, last + 1):
+            total += blocked[k - begin]
+            blocked[k - begin] = 0
+            share[k] = levels[total]
 
 
 @_kernel

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from pipeline.artefacts.readers import Tpog
 from pipeline.scoring.egvs import EntropyField
+from pipeline.scoring.thinning import Hits
 from pipeline.scoring.uncertainty import LeaveOut
-from pipeline.scoring.visibility import Beams, Hits, Visibility
+from pipeline.scoring.visibility import Beams, Visibility
 from pipeline.sensing.scanner import Scan
 from pipeline.sensing.scene import Scene
 

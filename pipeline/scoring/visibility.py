@@ -1,14 +1,19 @@
 """Counts how many beams of a scan cross each voxel.
 
-Steps: move the scan into the grid's frame in float64, march every beam, count. Where the scan's rows are shares of
-beams, or effects of the score stage act, the crossings are listed, weighted, and added up in whole multiples of 2**-32
-instead.
+Steps: move the scan into the grid's frame in float64, march every beam, count. Effects change as little of that as
+they need to:
+
+- where the scan's rows are shares of beams, each beam adds its share, in whole multiples of 2**-32;
+- where an effect says what gets as far as a voxel, crossings are listed, and each adds what gets there;
+- what effects detect of a voxel depends on its range alone, so hits are added up first, then thinned.
 """
 
 from __future__ import annotations
 
+import math
 import threading
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +25,13 @@ from pipeline.core.errors import InputError, RunError
 from pipeline.core.grid import Grid
 from pipeline.effects.base import Detect, Effect, TransmitScore
 from pipeline.kernels import march
-from pipeline.kernels.crossings import accumulate
+from pipeline.kernels.crossings import add_shares
+from pipeline.scoring.thinning import Hits, RangeTable
 from pipeline.sensing import crossings
 from pipeline.sensing.scanner import Scan
 from pipeline.sensing.scene import Scene
 from pipeline.sensing.sensors import Sensor
 from pipeline.sensing.sites import Pose
-
-Hits = NDArray[np.uint32] | NDArray[np.int64]
 
 FARTHEST_M = 2e7
 """From further away, float64 cannot tell whether a chord is longer than 1 micrometre."""
@@ -86,55 +90,81 @@ class Visibility:
 
     def __init__(self, scene: Scene, tpog: Tpog, trajectories: Path | None = None) -> None:
         self._grid = tpog.grid
-        live: tuple[Effect[Any], ...] = scene.acting(Effect, "score")
-        self._effects = tuple(
-            effect.prepare(scene, tpog, trajectories) if isinstance(effect, TransmitScore) else effect
-            for effect in live
-        )
-        self.unit = UNIT if live or scene.weights_beams else 1
+        transmit: tuple[TransmitScore[Any], ...] = scene.acting(TransmitScore, "score")
+        self._transmit = tuple(effect.prepare(scene, tpog, trajectories) for effect in transmit)
+        self._detect: tuple[Detect[Any], ...] = scene.acting(Detect, "score")
+        self.unit = UNIT if transmit or self._detect or scene.weights_beams else 1
         self._local = threading.local()
 
     def borrowed_hits(self, beams: Beams) -> Hits:
         """Hits of one scan in each voxel, flat, (nx * ny * nz,), in ``unit``; valid until this thread's next call, so
         that counters of a million voxels are not made anew."""
-        hits = self._counters()
         o, d, shape = in_voxels(beams, self._grid)
-        if self.unit == 1:
-            march.count_hits(o, d, shape, self._grid.voxel_m, hits)
-        else:
-            self._add_weighted(beams, hits)
-        return hits
+        self._refuse_too_many(beams)
+        counted, weighted = self._counters()
+        if beams.weight is None and not self._transmit:
+            counted.fill(0)
+            march.count_hits(o, d, shape, self._grid.voxel_m, counted)
+            if self.unit == 1:
+                return counted
+            return self._thinned(counted, UNIT, beams.sensor, o, weighted)
+        weighted.fill(0)
+        self._add_shares(beams, o, d, weighted)
+        return self._thinned(weighted, 1, beams.sensor, o, weighted)
 
-    def _counters(self) -> Hits:
-        """This thread's counters, set to 0."""
-        if not hasattr(self._local, "hits"):
-            kind = np.uint32 if self.unit == 1 else np.int64
-            self._local.hits = np.zeros(int(np.prod(self._grid.shape)), dtype=kind)
-        hits: Hits = self._local.hits
-        hits.fill(0)
-        return hits
+    def _counters(self) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
+        """This thread's counters: of beams, and in ``UNIT`` where anything weights beams."""
+        if not hasattr(self._local, "counters"):
+            cells = int(np.prod(self._grid.shape))
+            weighted = np.zeros(cells if self.unit == UNIT else 0, dtype=np.int64)
+            self._local.counters = np.zeros(cells, dtype=np.uint32), weighted
+        counters: tuple[NDArray[np.uint32], NDArray[np.int64]] = self._local.counters
+        return counters
 
-    def _add_weighted(self, beams: Beams, hits: Hits) -> None:
+    def _thinned(
+        self, hits: Hits, whole: int, sensor: Sensor, o: NDArray[np.float64], thinned: NDArray[np.int64]
+    ) -> NDArray[np.int64]:
+        """``hits`` times ``whole``, less what is not detected, in ``thinned``."""
+        if self._detect:
+            table = RangeTable.over(partial(self._detected, sensor), o * self._grid.voxel_m, self._grid)
+            table.thin(hits, whole, o, self._grid, thinned)
+        elif hits is not thinned:
+            np.multiply(hits, whole, out=thinned, dtype=np.int64)
+        return thinned
+
+    def _refuse_too_many(self, beams: Beams) -> None:
+        """InputError where a sum of weighted hits might leave 64 bits."""
         whole = float(len(beams.ends_m) if beams.weight is None else beams.weight.sum())
         most = MOST_CROSSINGS / (sum(self._grid.shape) + 3)
-        if whole >= most:  # no sum over voxels may leave 64 bits
+        if self.unit > 1 and whole >= most:
             raise InputError(beams.place, f"{whole:g} beams with effects", f"fewer than {most:g}")
+
+    def _add_shares(self, beams: Beams, o: NDArray[np.float64], d: NDArray[np.float64], hits: Hits) -> None:
+        """Add what each beam is worth in each voxel, in ``UNIT``, before detection."""
+        weights = np.ones(len(d)) if beams.weight is None else beams.weight
+        if not self._transmit:
+            shape = np.asarray(self._grid.shape, dtype=np.int64)
+            march.add_hits(o, d, shape, self._grid.voxel_m, np.rint(weights * UNIT).astype(np.int64), hits)
+            return
+        effects = [effect.seen_from(o * self._grid.voxel_m, self._grid) for effect in self._transmit]
         for piece in crossings.listed(beams.pose.position_m, beams.ends_m, self._grid):
-            share = np.ones(len(piece.cells)) if beams.weight is None else beams.weight[piece.rows][piece.piece]
-            for effect in self._effects:
-                if isinstance(effect, Detect):
-                    share = share * _shares(effect, effect.detect(piece.middle_m, beams.sensor), share)
-                elif isinstance(effect, TransmitScore):
-                    share = share * _shares(effect, effect.share(piece), share)
-            accumulate(piece.cells, np.rint(share * UNIT).astype(np.int64), hits)
+            shares = [_shares(effect, effect.share(piece), len(piece.cells), "crossings") for effect in effects]
+            add_shares(piece.first, piece.cells, weights[piece.rows], math.prod(shares), UNIT, hits)
+
+    def _detected(self, sensor: Sensor, range_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What all effects together detect at ranges (n,)."""
+        found = np.ones(len(range_m))
+        for effect in self._detect:
+            found = found * _shares(effect, effect.detect(range_m, sensor), len(range_m), "ranges")
+        return found
 
 
-def _shares(effect: Effect[Any], given: object, like: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What an effect gives, ``like`` many shares; RunError for anything else, since a wrong share is a wrong score."""
+def _shares(effect: Effect[Any], given: object, count: int, of: str) -> NDArray[np.float64]:
+    """What an effect gives, ``count`` shares; RunError for anything else, since a wrong share is a wrong score."""
     if not isinstance(given, np.ndarray) or given.dtype.kind not in "fiub":
         found = f"gives {type(given).__name__}" + (f" of {given.dtype}" if isinstance(given, np.ndarray) else "")
-    elif given.shape != like.shape:
-        found = f"gives an array of the shape {given.shape} for {len(like)} crossings"
+    elif given.shape != (count,):
+        found = f"gives an array of the shape {given.shape} for {count} {of}"
     elif given.size and not (given.min() >= 0 and given.max() <= 1):  # false where one is NaN
         found = f"gives values from {given.min():g} to {given.max():g}"
     else:

@@ -1,7 +1,7 @@
 """Lists which voxels each beam of a scan crosses, and at which range.
 
-Where effects weight beams, counting is not enough: every crossing is listed with its range, a few thousand pieces at a
-time.
+Where an effect says what gets as far as a voxel, counting is not enough: every crossing is listed with its range, some
+ten thousand at a time, so that they stay near the processor.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pipeline.core.grid import Grid
 from pipeline.kernels import crossings as kernels
 
-_ROWS = 2048  # beams listed at once: bounds the memory
+_ROOM = 2**16  # crossings that are listed at once at most: bounds the memory; about a third of it is used
 
 
 @dataclass(frozen=True)
@@ -50,11 +50,6 @@ class Crossings:
     leave_m: NDArray[np.float64]
 
     @property
-    def middle_m(self) -> NDArray[np.float64]:
-        """Range of the middle of each chord, (k,) float64."""
-        return 0.5 * (self.enter_m + self.leave_m)
-
-    @property
     def piece(self) -> NDArray[np.int64]:
         """The piece of each crossing, (k,) int64, from 0."""
         return np.repeat(np.arange(len(self.first) - 1), np.diff(self.first))
@@ -65,14 +60,12 @@ def listed(position_m: tuple[float, float, float], ends_m: NDArray[np.float64], 
     sensor_m = grid.to_grid_m(np.array(position_m))
     o = sensor_m / grid.voxel_m
     shape = np.asarray(grid.shape, dtype=np.int64)
-    for start in range(0, len(ends_m), _ROWS):
-        rows = slice(start, min(start + _ROWS, len(ends_m)))
+    step = max(1, _ROOM // sum(grid.shape))
+    for start in range(0, len(ends_m), step):
+        rows = slice(start, min(start + step, len(ends_m)))
         ends = ends_m[rows]
-        first = np.zeros(len(ends) + 1, dtype=np.int64)
-        nothing = np.empty(0, dtype=np.int64), np.empty(0), np.empty(0)
-        kernels.crossings(o, ends / grid.voxel_m, shape, grid.voxel_m, first, *nothing)
-        np.cumsum(first, out=first)
-        total = int(first[-1])
-        cells, enter, leave = np.empty(total, dtype=np.int64), np.empty(total), np.empty(total)
+        first, room = np.empty(len(ends) + 1, dtype=np.int64), len(ends) * sum(grid.shape)
+        cells, enter, leave = np.empty(room, dtype=np.int64), np.empty(room), np.empty(room)
         kernels.crossings(o, ends / grid.voxel_m, shape, grid.voxel_m, first, cells, enter, leave)
-        yield Crossings(sensor_m, grid, rows, first, ends, cells, enter, leave)
+        total = int(first[-1])
+        yield Crossings(sensor_m, grid, rows, first, ends, cells[:total], enter[:total], leave[:total])

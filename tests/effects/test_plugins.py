@@ -197,13 +197,13 @@ class Given(Detect[EffectParameters]):
 )
 def test_what_is_no_share_is_refused(given: object, found: str) -> None:
     with pytest.raises(RunError, match=rf"^effects\.given: {found}; right are shares from 0 to 1, one each$"):
-        visibility._shares(Given(EffectParameters()), given, np.ones(2))
+        visibility._shares(Given(EffectParameters()), given, 2, "crossings")
 
 
 def test_shares_of_no_crossing_and_of_bits_are_shares() -> None:
     effect = Given(EffectParameters())
-    assert visibility._shares(effect, np.ones(0), np.ones(0)).size == 0
-    assert visibility._shares(effect, np.array([True, False]), np.ones(2)).tolist() == [True, False]
+    assert visibility._shares(effect, np.ones(0), 0, "ranges").size == 0
+    assert visibility._shares(effect, np.array([True, False]), 2, "ranges").tolist() == [True, False]
 
 
 @pytest.mark.system

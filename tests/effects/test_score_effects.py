@@ -294,6 +294,21 @@ def test_effects_multiply(one_beam: tuple[Path, Path]) -> None:
     np.testing.assert_allclose(together, np.prod(alone, axis=0), rtol=0, atol=2.0**-31)
 
 
+@pytest.mark.parametrize("name", ON)
+def test_a_voxel_keeps_what_is_detected_at_the_range_of_its_centre(done: tuple[Path, Path], name: str) -> None:
+    """Every voxel's plain hits, times the effect asked at that voxel; to 2**-33 of each, and what rounding adds."""
+    here = scene(done, *ON[name])
+    (only,), sensor = registry.named(here.scenario, "score"), here.sensor(here.sites[0].sensor)
+    assert isinstance(only, Detect)
+    grid = here.scenario.roi.grid
+    centres_m = (np.stack(np.meshgrid(*map(np.arange, grid.shape), indexing="ij"), axis=-1) + 0.5) * grid.voxel_m
+    away_m = centres_m - grid.to_grid_m(np.array(here.sites[0].pose.position_m))
+    chance = only.detect(np.sqrt((away_m**2).sum(axis=-1)).ravel(), sensor).reshape(grid.shape)
+    plain, found = hits(done, []), hits(done, ON[name])
+    np.testing.assert_allclose(found, plain * chance, rtol=0, atol=float(plain.max()) * 2.0**-33 + 2.0**-33)
+    assert (found < plain).any()
+
+
 # Against the sources
 
 

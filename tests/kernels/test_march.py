@@ -434,10 +434,10 @@ def with_fault(*replacements):
 
 
 AUDIT_FAULTS = {
-    "worst_sum": ("cell += step_y", "cell += step_z"),
+    "worst_sum": ("cell + step_y", "cell + step_z"),
     "longest_gap": ("crossed = t_next - t > shortest", "crossed = t_next - t > 1e5 * shortest"),
-    "misplaced": ("cell += step_y", "cell += step_y + step_z"),
-    "doubled": ("cell += step_x", "cell += step_x - step_x"),
+    "misplaced": ("cell + step_y", "cell + step_y + step_z"),
+    "doubled": ("cell + step_x", "cell + step_x - step_x"),
 }
 
 
@@ -469,9 +469,7 @@ FAULTS = {
         ("count = np.int64(abs(last - plane)) + 2", "count = 1"),
         ("while times[count - 1] < np.inf:", "while False:"),
     ),
-    "the last chord is forgotten": (
-        ("    count = _note(hits, cells, t_cells, count, cell, t, t_last, shortest)\n", ""),
-    ),
+    "the last chord is forgotten": (("t_next, on = t_last, False", "break"),),
     "ends at the border only": (("_clip(ox, dx, 0.0, nx, 0.0, 1.0)", "_clip(ox, dx, 0.0, nx, 0.0, np.inf)"),),
     "starts behind the sensor": (("_clip(ox, dx, 0.0, nx, 0.0, 1.0)", "_clip(ox, dx, 0.0, nx, -np.inf, 1.0)"),),
 }

@@ -50,14 +50,12 @@ from pipeline.artefacts.recorded_boxes import FrameBoxes, read_boxes
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Grid
 from pipeline.effects.base import TransmitScore
-from pipeline.kernels import boxes as box_kernels
 from pipeline.kernels import occlusion as kernels
 from pipeline.scenario.effects import EffectParameters, MovingOcclusionParameters
 from pipeline.sensing.crossings import Crossings
 from pipeline.sensing.scene import Scene
 
-_BOX = ("x_m", "y_m", "z_m", "yaw_rad", "pitch_rad", "length_m", "width_m", "height_m")
-_SMALLEST_M = 10 * box_kernels.SHRINK_M
+_AZIMUTHS = 1024  # cells of azimuth, 0.35 degrees each: next to a car at 100 m
 
 Count = Annotated[int, Field(ge=0, strict=True), BeforeValidator(lambda given: 0 if given == "all" else given)]
 
@@ -94,27 +92,46 @@ class Replay:
         near = np.flatnonzero(((self.low < sensor_m) & (sensor_m < self.high)).all(axis=1))
         return sum(bool(kernels.holds(self.values[b], sensor_m)) for b in near)
 
+    def seen_from(self, sensor_m: NDArray[np.float64], grid: Grid) -> FacingBoxes:
+        """The boxes that can stand between a sensor, given in the grid's frame (3,), and a voxel."""
+        most, size_m = len(self.frame), np.asarray(grid.roi.size_m)
+        facing, frame, span = np.empty((most, 15)), np.empty(most, dtype=np.int64), np.empty((most, 4))
+        kept = kernels.face(sensor_m, self.frame, self.values, self.low, self.high, size_m, facing, frame, span)
+        starts, members = kernels.gather(span[:kept], _AZIMUTHS)
+        return FacingBoxes(self.frames, frame[:kept], facing[:kept], span[:kept, 2:].copy(), starts, members)
+
+
+@dataclass(frozen=True, eq=False)
+class FacingBoxes:
+    """Replayed boxes as one sensor sees them; the fields are those of :mod:`pipeline.kernels.occlusion`."""
+
+    frames: int
+    frame: NDArray[np.int64]
+    facing: NDArray[np.float64]
+    slopes: NDArray[np.float64]
+    starts: NDArray[np.int64]
+    members: NDArray[np.int64]
+
     def share(self, crossings: Crossings) -> NDArray[np.float64]:
         """Share of the frames in which the beam gets as far as each crossing, (k,) float64."""
-        return (self.frames - self.blocked(crossings)) / self.frames
+        return self._levels(crossings, (self.frames - np.arange(self.frames + 1)) / self.frames)
 
     def blocked(self, crossings: Crossings) -> NDArray[np.int64]:
         """Frames in which the beam does not get as far as each crossing, (k,) int64."""
-        row = np.flatnonzero(np.diff(crossings.first))
-        ends = crossings.ends_m[row]
+        return self._levels(crossings, np.arange(self.frames + 1))
+
+    def _levels(self, crossings: Crossings, levels: NDArray[Any]) -> NDArray[Any]:
+        """What ``levels`` says for the frames in which each crossing is not reached."""
+        ends = crossings.ends_m
         run = np.hypot(ends[:, 0], ends[:, 1])
-        azimuth = np.arctan2(ends[:, 1], ends[:, 0])
-        order = np.argsort(azimuth, kind="stable")
-        row, ends, run = row[order], ends[order], run[order]
-        directions = ends / np.hypot(run, ends[:, 2])[:, None]
-        with np.errstate(divide="ignore"):
-            slope = ends[:, 2] / run
-        blocked = np.zeros(len(crossings.cells), dtype=np.int64)
+        with np.errstate(divide="ignore", invalid="ignore"):  # a beam without length crosses nothing
+            directions, slope = ends / np.hypot(run, ends[:, 2])[:, None], ends[:, 2] / run
+        share = np.empty(len(crossings.cells), dtype=levels.dtype)
         kernels.count_blocked(
-            crossings.sensor_m, directions, azimuth[order], slope, row, crossings.first, crossings.enter_m,
-            self.frame, self.values, self.low, self.high, blocked,
+            directions, np.arctan2(ends[:, 1], ends[:, 0]), slope, crossings.first, crossings.enter_m,
+            self.frame, self.facing, self.slopes, self.starts, self.members, levels, share,
         )  # fmt: skip
-        return blocked
+        return share
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +157,7 @@ class MovingOcclusion(TransmitScore[MovingOcclusionParameters]):
     Model: ClassVar[type[EffectParameters]] = MovingOcclusionParameters
     QUALITY: ClassVar[dict[str, tuple[Any, ...]]] = {"frames": (50, 500, 0)}
 
-    ready: Replay | Independent | None = field(default=None, compare=False, repr=False)
+    ready: Replay | FacingBoxes | Independent | None = field(default=None, compare=False, repr=False)
 
     @property
     def reads(self) -> tuple[str, ...]:
@@ -156,10 +173,14 @@ class MovingOcclusion(TransmitScore[MovingOcclusionParameters]):
             raise InputError("effects.moving_occlusion", "no trajectories to replay", 'method = "independent"')
         return replace(self, ready=read_replay(trajectories, tpog.grid, self.parameters.frames))
 
+    def seen_from(self, sensor_m: NDArray[np.float64], grid: Grid) -> MovingOcclusion:
+        """With the boxes turned towards the sensor, where they are replayed."""
+        return replace(self, ready=self.ready.seen_from(sensor_m, grid)) if isinstance(self.ready, Replay) else self
+
     def share(self, crossings: Crossings) -> NDArray[np.float64]:
         """Share of the beam that gets as far as each crossing."""
-        if self.ready is None:
-            raise RuntimeError("moving_occlusion: prepare() returns the effect that can share()")
+        if not isinstance(self.ready, FacingBoxes | Independent):
+            raise RuntimeError("moving_occlusion: prepare() and seen_from() return the effect that can share()")
         return self.ready.share(crossings)
 
 

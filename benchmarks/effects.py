@@ -1,0 +1,79 @@
+"""What do named effects cost, beside the plain march?
+
+Each setting's hits of some sites of the shipped junction, from scans that are cast beforehand, on one thread.
+Repeats are interleaved with the plain march of the same sites; medians of the ratios are shown.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import pipeline
+from pipeline.artefacts.readers import Tpog, read_tpog
+from pipeline.effects import scene_resolving
+from pipeline.scoring.visibility import Beams, Visibility
+from pipeline.sensing.scanner import Scanner
+from pipeline.world.mesh import World, read_ply
+
+ROOT = Path(__file__).resolve().parent.parent
+SCENARIO = ROOT / "scenarios" / "nishishinjuku"
+REPEATS = 7
+SITES = 4
+
+COSTS: dict[str, tuple[list[str], float | None]] = {
+    "dropout": (["effects.dropout.share=0.1"], 1.5),
+    "rain": (["effects.rain.rate_mm_h=20"], 1.5),
+    "fog": (["effects.fog.visibility_m=200"], 1.5),
+    "range_limit": (["effects.range_limit.reflectivity=0.1"], 1.5),
+    "range_limit, hard": (["effects.range_limit={softness = 0, reflectivity = 0.1}"], 1.5),
+    "foliage": (["effects.foliage.leaf_area_density=1"], None),
+    "moving_occlusion, 500 frames": (["effects.moving_occlusion.frames=500"], 4.0),
+    "divergence, 7 sub-beams": (["effects.divergence.sub_beams=7"], 8.0),
+}
+"""Settings, and how many marches each may cost at most."""
+
+
+@dataclass(frozen=True)
+class Work:
+    """Scans of some sites, and what counts their hits."""
+
+    visibility: Visibility
+    beams: list[Beams]
+
+    @classmethod
+    def of(cls, settings: list[str], world: World, tpog: Tpog, run: Path) -> Work:
+        """For a finished run's static world, TPOG and trajectories."""
+        scene = scene_resolving.resolve(pipeline.load(SCENARIO, settings), world)
+        scanner = Scanner(scene)
+        beams = [Beams.of(scanner.scan_site(site)) for site in scene.sites[:SITES]]
+        return cls(Visibility(scene, tpog, run / "trajectories.parquet"), beams)
+
+    def seconds(self) -> float:
+        """Processor seconds of a round."""
+        start = time.process_time()
+        for beams in self.beams:
+            self.visibility.borrowed_hits(beams)
+        return time.process_time() - start
+
+
+def rows(run: Path) -> list[tuple[str, str, str, bool]]:
+    """(what, marches, allowed, reached) for each effect, on the artefacts of a finished run."""
+    world, tpog = read_ply(run / "statics.ply")[0], read_tpog(run / "tpog.parquet")
+    plain = Work.of([], world, tpog, run)
+    named = {name: Work.of(settings, world, tpog, run) for name, (settings, _) in COSTS.items()}
+    ratios: dict[str, list[float]] = {name: [] for name in named}
+    for turn in range(REPEATS + 1):
+        march = plain.seconds()
+        for name, work in named.items():
+            took = work.seconds()
+            if turn:  # the first compiles
+                ratios[name].append(took / march)
+    found = []
+    for name, (_, most) in COSTS.items():
+        ratio = statistics.median(ratios[name])
+        bound = "" if most is None else f"{most:g} x"
+        found.append((f"  {name}, against the plain march", f"{ratio:.2f} x", bound, most is None or ratio <= most))
+    return found

@@ -1,0 +1,86 @@
+"""Is what is left of each voxel's hits what the function of range says, asked voxel by voxel?"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+from pipeline.core.grid import Grid
+from pipeline.scoring.thinning import TOLERANCE, ByRange, RangeTable
+
+GRID = Grid((0.0, 0.0, 0.0), 0.5, (30, 20, 6))
+WHOLE = 2**32
+
+FUNCTIONS: dict[str, ByRange] = {
+    "nothing is lost": np.ones_like,
+    "everything is lost": np.zeros_like,
+    "a constant": lambda r: np.full(len(r), 0.3),
+    "rain": lambda r: np.exp(-0.02 * r),
+    "thick fog": lambda r: np.exp(-3.0 * r),
+    "a soft limit nearby": lambda r: ndtr(2 * np.log(2.5 / np.maximum(r, 1e-300)) / 0.05),
+    "a hard limit": lambda r: (r <= 7.25).astype(float),
+    "a blind zone": lambda r: np.where(r < 1.5, 0.0, 1.0),
+    "a kink": lambda r: np.minimum(1.0, 4.0 / np.maximum(r, 1e-300)),
+    "narrow bands": lambda r: 0.5 + 0.5 * np.sin(700 * r) ** 2,
+}
+SENSORS = {
+    "inside": (7.1, 3.3, 1.2),
+    "in the middle of a voxel": (7.25, 3.25, 1.25),
+    "on a corner of the grid": (0.0, 0.0, 0.0),
+    "beside and above": (-3.0, 12.5, 6.0),
+    "far away": (4e5, -3e6, 20.0),
+}
+
+
+def asked(function: ByRange, sensor_m: tuple[float, float, float]) -> np.ndarray:
+    """The function at the centre of every voxel, one by one."""
+    found = []
+    for index in np.ndindex(GRID.shape):
+        centre = [(i + 0.5) * GRID.voxel_m for i in index]
+        found.append(float(function(np.array([math.dist(centre, sensor_m)]))[0]))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_every_voxel_is_thinned_by_its_range(name: str, sensor: str) -> None:
+    o_m, hits = np.array(SENSORS[sensor]), np.random.default_rng(1).integers(0, 9, math.prod(GRID.shape))
+    hits[:3] = 0, 2**20, 1
+    table, thinned = RangeTable.over(FUNCTIONS[name], o_m, GRID), np.empty(len(hits), dtype=np.int64)
+    table.thin(hits.astype(np.uint32), WHOLE, o_m / GRID.voxel_m, GRID, thinned)
+    # From afar a rounding of the range is 1e-9 m, and these functions are not that smooth.
+    steep = 1e-9 * 700 if sensor == "far away" else 1e-12 * 700
+    off = np.abs(thinned - hits * WHOLE * asked(FUNCTIONS[name], SENSORS[sensor]))
+    assert (off <= 0.5 + hits * WHOLE * (1.1 * TOLERANCE + steep)).all()
+    weighted = hits * WHOLE
+    table.thin(weighted, 1, o_m / GRID.voxel_m, GRID, weighted)
+    assert weighted.tolist() == thinned.tolist()
+
+
+def test_a_limit_is_met_to_the_last_bit() -> None:
+    """Centres at 0.5, 1.0, ... from a sensor in the middle of the first voxel: 7.0 counts, one bit less does not."""
+    o, ones = np.array([0.5, 0.5, 0.5]), np.ones(math.prod(GRID.shape), dtype=np.uint32)
+    for limit_m, seen in ((7.0, 15), (math.nextafter(7.0, 0.0), 14)):
+        table = RangeTable.over(lambda r, limit_m=limit_m: (r <= limit_m).astype(float), o * GRID.voxel_m, GRID)
+        thinned = np.empty(len(ones), dtype=np.int64)
+        table.thin(ones, WHOLE, o, GRID, thinned)
+        assert thinned.reshape(GRID.shape)[:, 0, 0].tolist() == [WHOLE] * seen + [0] * (30 - seen)
+
+
+def test_a_smooth_function_is_asked_seldom_and_a_rough_one_for_each_voxel() -> None:
+    calls: list[int] = []
+
+    def counted(function: ByRange) -> ByRange:
+        return lambda r: calls.append(len(r)) or function(r)  # type: ignore[func-returns-value]
+
+    o_m, hits = np.array(SENSORS["inside"]), np.ones(math.prod(GRID.shape), dtype=np.uint32)
+    for name, most in (("rain", 0), ("a hard limit", 60), ("narrow bands", len(hits))):
+        calls.clear()
+        table = RangeTable.over(counted(FUNCTIONS[name]), o_m, GRID)
+        tried, thinned = len(calls), np.empty(len(hits), dtype=np.int64)
+        table.thin(hits, WHOLE, o_m / GRID.voxel_m, GRID, thinned)
+        assert sum(calls[tried:]) <= most
+        assert tried == (1 if name != "narrow bands" else 3)
