@@ -122,7 +122,7 @@ def _check_columns(path: Path, artefact: str, schema: pa.Schema) -> None:
 
 _PROMISED: dict[str, tuple[str, ...]] = {
     "trajectories": ("frames",),
-    "tpog": ("grid", "frames", "block_frames"),
+    "tpog": ("grid", "frames", "block_frames", "memory_frames"),
     "scans": ("sites",),
     "visibility": ("grid", "sites"),
     "accuracy": ("inputs", "tolerance", "stages"),
@@ -162,8 +162,8 @@ def _is_sound(key: str, value: Any) -> bool:
         return isinstance(value, str)
     if key == "stages":
         return isinstance(value, dict)
-    if key == "tolerance":
-        return isinstance(value, float) and value > 0
+    if key in ("tolerance", "memory_frames"):
+        return isinstance(value, float) and 0 < value < math.inf
     return isinstance(value, int) and not isinstance(value, bool) and value > 0
 
 

@@ -52,19 +52,21 @@ def _near(triangles: NDArray[np.float64], grid: Grid) -> NDArray[np.bool_]:
 
 def count_blocks(
     batches: Iterator[FrameBoxes], grid: Grid, block_frames: int, blocks: int
-) -> Iterator[tuple[NDArray[np.int32], int]]:
-    """The counts (nx, ny, nz) of one block after another, and how many boxes were near the grid."""
+) -> Iterator[tuple[NDArray[np.int32], NDArray[np.int64]]]:
+    """The counts (nx, ny, nz) of one block after another, and how many boxes were near the grid in each of its frames,
+    (block_frames,)."""
     nx, ny, nz = grid.shape
     shape = np.asarray(grid.shape, dtype=np.int64)
     steps, seen = np.zeros((nz + 1, nx, ny), dtype=np.int32), np.full((3, nx, ny), -1, dtype=np.int64)
     batch = FrameBoxes(np.empty(0, dtype=np.int64), np.empty((0, 8)))
     for block in range(blocks):
-        met, end = 0, (block + 1) * block_frames
+        start, end = block * block_frames, (block + 1) * block_frames
+        met = np.zeros(block_frames, dtype=np.int64)
         steps[:] = 0
         while True:
             here = int(np.searchsorted(batch.frame, end))
             near = near_grid(batch.values[:here], grid)
-            met += int(near.sum())
+            met += np.bincount(batch.frame[:here][near] - start, minlength=block_frames)
             boxes.count_boxes(batch.frame[:here][near], batch.values[:here][near], shape, grid.voxel_m, steps, seen)
             batch = FrameBoxes(batch.frame[here:], batch.values[here:])
             if len(batch.frame):

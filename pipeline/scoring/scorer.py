@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from pipeline.artefacts.readers import Tpog
 from pipeline.scoring.egvs import EntropyField
+from pipeline.scoring.leave_out import LeaveOut
 from pipeline.scoring.thinning import Hits
-from pipeline.scoring.uncertainty import LeaveOut
 from pipeline.scoring.visibility import Beams, Visibility
 from pipeline.sensing.scanner import Scan
 from pipeline.sensing.scene import Scene
@@ -35,7 +35,7 @@ class SiteScore:
         Share of the TPOG's entropy in voxels crossed at least once.
     left_out
         The score of all frames, then with each group of blocks left out, (1 + k,) float64, see
-        :class:`pipeline.scoring.uncertainty.LeaveOut`; None where that was not asked for.
+        :class:`pipeline.scoring.leave_out.LeaveOut`; None where that was not asked for.
     """
 
     egvs: float

@@ -26,7 +26,9 @@ from pipeline.effects import registry
 from pipeline.effects.base import Effect
 from pipeline.formats.georeference import Georeference
 from pipeline.kernels import march
+from pipeline.scenario.models import FILE
 from pipeline.scoring import uncertainty
+from pipeline.scoring.leave_out import LeaveOut
 from pipeline.scoring.scorer import Scorer, SiteScore
 from pipeline.scoring.visibility import Beams, in_voxels
 from pipeline.sensing.sites import ScannedSite
@@ -99,7 +101,7 @@ def run(
         ``sites``, ``best`` (names), ``egvs_limit``; with ``audit`` the worst case found.
     """
     tpog, wanted = read_tpog(work.path("tpog.parquet")), work.scenario.score
-    leave_out = uncertainty.LeaveOut.of(work.path("tpog.parquet"), tpog) if wanted.standard_error else None
+    leave_out = LeaveOut.of(work.path("tpog.parquet"), tpog) if wanted.standard_error else None
     scorer = Scorer(scene_of(work), tpog, work.path(TRAJECTORIES), leave_out)
 
     def score(scan: SiteBeams) -> ScoredSite:
@@ -129,7 +131,10 @@ def run(
     if skipped := scene_of(work).skipped(NAME):
         summary["skipped"] = skipped
     if estimate is not None:
-        summary |= uncertainty.in_words(estimate, tpog.frames)
+        summary |= uncertainty.in_words(estimate)
+        place, period_s = f"{FILE}: traffic.frames", work.scenario.traffic.frame_period_s
+        if doubts := uncertainty.doubts(estimate, place, period_s):
+            summary[WARNINGS] = [doubt.to_json() for doubt in doubts]
     if audit:
         summary["audit"] = _worst([d.audit for d in done if d.audit is not None])
     if work.scenario.traffic.fcd is not None:  # without a network, the record alone knows the road
@@ -174,11 +179,11 @@ def _degrees(done: list[ScoredSite], world: Georeference) -> dict[str, Any]:
     return {} if lon_lat_deg is None else {"longitude_deg": lon_lat_deg[:, 0], "latitude_deg": lon_lat_deg[:, 1]}
 
 
-def _estimate(done: list[ScoredSite], leave_out: uncertainty.LeaveOut | None) -> uncertainty.Estimate | None:
+def _estimate(done: list[ScoredSite], leave_out: LeaveOut | None) -> uncertainty.Estimate | None:
     """What leaving blocks out says of all sites; None when it is not asked for, or there is one block only."""
     if leave_out is None:
         return None
-    return uncertainty.Estimate.of(np.array([d.score.left_out for d in done]).reshape(len(done), -1), leave_out.frames)
+    return uncertainty.Estimate.of(np.array([d.score.left_out for d in done]).reshape(len(done), -1), leave_out.groups)
 
 
 def _error_columns(estimate: uncertainty.Estimate | None) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from pipeline.artefacts.recorded_boxes import read_boxes
 from pipeline.checks import recorded
 from pipeline.core.errors import InputError
 from pipeline.core.findings import WARNINGS
+from pipeline.scoring.memory import memory_frames
 from pipeline.scoring.occupancy import count_blocks, static_voxels
 from pipeline.stages.base import StageInputs, Summary, Workspace
 from pipeline.stages.shared.world import world_of
@@ -57,7 +58,8 @@ def run(work: Workspace, inputs: StageInputs) -> Summary:
     filled = static_voxels(world_of(work), grid)
     solid, seen = np.flatnonzero(filled), 0
     hidden = np.zeros(len(solid), dtype=np.int64)
-    block_frames, in_roi, ever = frames // blocks, 0, np.zeros(grid.shape, dtype=np.bool_)
+    block_frames, ever = frames // blocks, np.zeros(grid.shape, dtype=np.bool_)
+    boxes: list[NDArray[np.int64]] = []
     with tables.writer(work.path(ARTEFACTS[0]), "tpog") as file:
         counted = count_blocks(read_boxes(source, grid), grid, block_frames, blocks)
         for block, (counts, boxes_near) in enumerate(counted):
@@ -67,17 +69,21 @@ def run(work: Workspace, inputs: StageInputs) -> Summary:
             file.write(rows)
             seen += int(rows["count"].sum())
             ever |= counts > 0
-            in_roi += boxes_near
+            boxes.append(boxes_near)
             work.progress("blocks", block + 1, blocks)
-        file.describe(work.metadata(inputs, grid=grid.to_json(), frames=frames, block_frames=block_frames))
+        in_roi = np.concatenate(boxes)
+        memory = memory_frames(in_roi)
+        about: dict[str, Any] = {"frames": frames, "block_frames": block_frames, "memory_frames": memory}
+        file.describe(work.metadata(inputs, grid=grid.to_json(), **about))
     doubts = [
-        *recorded.in_region(in_roi / frames),
+        *recorded.in_region(float(in_roi.mean())),
         *recorded.through_solids(hidden, seen, solid, grid, world_of(work)),
     ]
     summary: Summary = {
         "occupied_voxels": int(ever.sum()),
         "static_voxels": len(solid),
-        "boxes_in_roi": in_roi / frames,
+        "boxes_in_roi": float(in_roi.mean()),
+        "memory_frames": memory,
         WARNINGS: [finding.to_json() for finding in doubts],
     }
     if left_over:

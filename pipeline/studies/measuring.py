@@ -39,8 +39,9 @@ from pipeline.runs.workflow import fetch_or_make
 from pipeline.scenario.loading import load
 from pipeline.scenario.models import Scenario, SiteGrid
 from pipeline.scoring.egvs import EntropyField
+from pipeline.scoring.leave_out import LeaveOut
 from pipeline.scoring.scorer import Scorer
-from pipeline.scoring.uncertainty import Estimate, LeaveOut, order
+from pipeline.scoring.uncertainty import Estimate, order
 from pipeline.sensing import sites
 from pipeline.stages.base import Workspace
 from pipeline.stages.score import ScoredSite
@@ -316,8 +317,8 @@ def _scores(work: Workspace, keys: dict[str, str], weight: float, scored: list[S
         worths = [scorer.score(scan.beams) for scan in scans(work)]
     left_out = np.array([worth.left_out for worth in worths], dtype=np.float64)
     limits = leave_out.limits(unit)
-    raw = Estimate.of(left_out, leave_out.frames)
-    normal = Estimate.of(left_out / np.where(limits > 0, limits, 1.0), leave_out.frames)
+    raw = Estimate.of(left_out, leave_out.groups)
+    normal = Estimate.of(left_out / np.where(limits > 0, limits, 1.0), leave_out.groups)
     return SettingScores(
         names, shares.tolist(), normal.se.tolist(), scores.tolist(), raw.se.tolist(), raw.bias.tolist(),
         raw.quantile(), _neighbours(raw, names, tpog.frames), keys,

@@ -100,7 +100,7 @@ def finished(folder, sites=SITES, counts=lane, record=True, **keys):
     flat = np.flatnonzero(counted)
     index = dict(zip(("ix", "iy", "iz"), (a.astype(np.int32) for a in np.unravel_index(flat, grid.shape)), strict=True))
     columns = {"block": np.zeros(len(flat), dtype=np.uint16), **index, "count": counted.ravel()[flat].astype(np.uint32)}
-    more = {"grid": grid.to_json(), "frames": FRAMES, "block_frames": FRAMES}
+    more = {"grid": grid.to_json(), "frames": FRAMES, "block_frames": FRAMES, "memory_frames": 1.0}
     tables.write(out / "tpog.parquet", "tpog", columns, {"schema": 1, **more})
     write_ply(out / "statics.ply", world(), {})
     run_stage(scan, about, out, jobs=1)

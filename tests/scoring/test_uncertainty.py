@@ -22,8 +22,9 @@ from pipeline.core.grid import Grid
 from pipeline.report.ranking import ScoredSite
 from pipeline.scoring import egvs, uncertainty
 from pipeline.scoring.egvs import EntropyField, binary_entropy
+from pipeline.scoring.leave_out import FEWEST, Groups, LeaveOut, group_sizes
 from pipeline.scoring.scorer import Scorer
-from pipeline.scoring.uncertainty import Estimate, LeaveOut
+from pipeline.scoring.uncertainty import Estimate
 from pipeline.stages.base import Workspace
 from pipeline.stages.shared.scans import scans
 from pipeline.stages.shared.scene import scene_of
@@ -32,11 +33,16 @@ GRID = Grid.from_json({"origin_m": [0.0, 0.0, 0.0], "voxel_m": 1.0, "shape": [6,
 CELLS = np.arange(60)
 
 
+def record(frames: np.ndarray, memory: float = 0.0) -> tuple[Groups, ...]:
+    """One record's groups; without a memory nothing is widened."""
+    return (Groups(frames, memory),)
+
+
 def left_out_of(blocks: np.ndarray, block_frames: int, cells: np.ndarray = CELLS) -> LeaveOut:
     """From the counts of blocks, (blocks, n), joined to groups."""
-    sizes = uncertainty.group_sizes(len(blocks))
+    sizes = group_sizes(len(blocks))
     counts = np.array([part.sum(axis=0) for part in np.split(blocks, np.cumsum(sizes)[:-1])]).astype(np.uint32)
-    return LeaveOut.from_counts(counts, cells, block_frames * np.array(sizes), GRID)
+    return LeaveOut.from_counts(counts, cells, Groups(block_frames * np.array(sizes), 0.0), GRID)
 
 
 def random_counts(blocks: int, block_frames: int = 20) -> np.ndarray:
@@ -48,7 +54,7 @@ def random_counts(blocks: int, block_frames: int = 20) -> np.ndarray:
 def test_each_column_is_the_score_without_that_group(blocks: int, groups: int, gamma: float, unit: int) -> None:
     counts = random_counts(blocks)
     leave_out = left_out_of(counts, 20)
-    assert leave_out.frames.tolist() == [20 * len(p) for p in np.array_split(np.arange(blocks), groups)]
+    assert leave_out.groups[0].frames.tolist() == [20 * len(p) for p in np.array_split(np.arange(blocks), groups)]
     hits = np.random.default_rng(4).integers(0, 30, size=60).astype(np.uint32 if unit == 1 else np.int64)
     found = leave_out.scores(hits, gamma, unit)
     capped = np.minimum(gamma, hits / unit)
@@ -86,8 +92,8 @@ def left_out_means(values: np.ndarray, frames: np.ndarray) -> np.ndarray:
 
 def test_of_a_mean_it_is_the_textbook_s_standard_error_without_bias() -> None:
     values = np.random.default_rng(5).normal(10.0, 2.0, size=(12, 3))
-    found = Estimate.of(left_out_means(values, np.full(12, 50)), np.full(12, 50))
-    assert found.joined == 1
+    found = Estimate.of(left_out_means(values, np.full(12, 50)), record(np.full(12, 50)))
+    assert found.strata[0].joined == 1
     assert found.se == pytest.approx(values.std(axis=0, ddof=1) / np.sqrt(12))
     assert found.bias == pytest.approx(np.zeros(3), abs=1e-9)
     assert found.intervals()[:, 1] - found.intervals()[:, 0] == pytest.approx(2 * 1.795885 * found.se, rel=1e-6)
@@ -98,7 +104,7 @@ def test_unequal_groups_weigh_by_their_frames() -> None:
     errors, said = [], []
     for _ in range(400):
         values = rng.normal(0.0, 1.0, size=(10, 1)) / np.sqrt(frames[:, None])
-        found = Estimate.of(left_out_means(values, frames), frames)
+        found = Estimate.of(left_out_means(values, frames), record(frames))
         errors.append(found.scores[0])
         said.append(found.se[0] ** 2)
     assert np.sqrt(np.mean(said)) == pytest.approx(np.std(errors), rel=0.1)
@@ -107,7 +113,7 @@ def test_unequal_groups_weigh_by_their_frames() -> None:
 def test_chances_add_up_and_equal_sites_are_even() -> None:
     values = np.random.default_rng(7).normal(0.0, 1.0, size=(10, 3))
     values[:, 2] = values[:, 0]
-    found = Estimate.of(left_out_means(values, np.full(10, 5)), np.full(10, 5))
+    found = Estimate.of(left_out_means(values, np.full(10, 5)), record(np.full(10, 5)))
     a, b = np.array([0, 1, 0]), np.array([1, 0, 2])
     chances = found.beats(a, b)
     assert chances[0] + chances[1] == pytest.approx(1.0)
@@ -120,8 +126,8 @@ def test_a_site_s_error_knows_nothing_of_the_others() -> None:
     values = np.random.default_rng(8).normal(0.0, 1.0, size=(10, 5))
     rows = left_out_means(values, np.full(10, 5))
     order = [3, 0, 4, 1, 2]
-    one, other = Estimate.of(rows, np.full(10, 5)), Estimate.of(rows[order], np.full(10, 5))
-    assert one.joined == other.joined == 1
+    one, other = Estimate.of(rows, record(np.full(10, 5))), Estimate.of(rows[order], record(np.full(10, 5)))
+    assert one.strata[0].joined == other.strata[0].joined == 1
     assert (one.se[order] == other.se).all()
 
 
@@ -134,15 +140,17 @@ def wandering(groups: int, memory: float, seed: int) -> np.ndarray:
 
 
 def test_groups_too_short_for_the_traffic_are_joined_or_warned_of() -> None:
-    patient = [Estimate.of(wandering(16, 0.9, seed), np.full(16, 10)) for seed in range(60)]
-    assert np.mean([e.joined > 1 for e in patient]) > 0.8
-    assert all(e.groups >= uncertainty.FEWEST for e in patient)
-    few = [Estimate.of(wandering(7, 0.97, seed), np.full(7, 10)) for seed in range(200)]
-    warned = [e for e in few if e.still_alike]
+    patient = [Estimate.of(wandering(16, 0.9, seed), record(np.full(16, 10))) for seed in range(60)]
+    assert np.mean([e.strata[0].joined > 1 for e in patient]) > 0.8
+    assert all(e.groups >= FEWEST for e in patient)
+    few = [Estimate.of(wandering(7, 0.97, seed), record(np.full(7, 10))) for seed in range(200)]
+    warned = [e for e in few if e.strata[0].still_alike]
     assert warned
-    assert all("more frames" in str(uncertainty.in_words(e, 70)["warning"]) for e in warned)
-    honest = [Estimate.of(wandering(16, 0.0, seed), np.full(16, 10)) for seed in range(200)]
-    assert np.mean([e.joined > 1 for e in honest]) < 0.1
+    doubts = [uncertainty.doubts(e, "scenario.toml: traffic.frames", 0.5) for e in warned]
+    assert all("neighbouring groups of 10 frames are alike" in doubt.found for (doubt,) in doubts)
+    assert {doubt.cure for (doubt,) in doubts} == {"at least 140 frames, better 560"}
+    honest = [Estimate.of(wandering(16, 0.0, seed), record(np.full(16, 10))) for seed in range(200)]
+    assert np.mean([e.strata[0].joined > 1 for e in honest]) < 0.1
 
 
 def occupied(runs: int, chains: int, frames: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -178,7 +186,7 @@ def test_intervals_cover_the_truth_as_often_as_they_say(
     held, ses, scores = [], [], []
     for run in counts:
         leave_out = left_out_of(run, frames // blocks)
-        found = Estimate.of(np.array([leave_out.scores(w, 10.0) for w in weights]), leave_out.frames)
+        found = Estimate.of(np.array([leave_out.scores(w, 10.0) for w in weights]), leave_out.groups)
         low, high = found.intervals().T
         held.append((low <= truth) & (truth <= high))
         ses.append(found.se)
@@ -194,7 +202,7 @@ def test_scores_say_how_sure_they_are(mini: Path, tmp_path: Path) -> None:
     rows = pipeline.read_scores(tmp_path / "out" / "scores.parquet").to_pylist()
     assert all(row["egvs_se"] > 0 and row["egvs_bias"] < 0 for row in rows)
     assert sorted(row["beats_next"] for row in rows)[-1] == 1.0
-    assert record.stages["score"].summary["standard_errors_from"] == "4 groups of 10 frames"
+    assert record.stages["score"].summary["standard_errors_from"] == "4 groups of 10 frames, widened by 5%"
     leave_out = LeaveOut.of(tmp_path / "out" / "tpog.parquet", pipeline.read_tpog(tmp_path / "out" / "tpog.parquet"))
     assert leave_out is not None
     work, tpog = Workspace(scenario, tmp_path / "out"), pipeline.read_tpog(tmp_path / "out" / "tpog.parquet")
@@ -212,11 +220,11 @@ def test_many_blocks_are_joined_as_they_are_read(mini: Path, tmp_path: Path) -> 
     dense[tuple(table[name] for name in ("block", "ix", "iy", "iz"))] = table["count"]
     leave_out = LeaveOut.of(path, tpog)
     assert leave_out is not None
-    assert leave_out.frames.tolist() == [4] * 10
+    assert leave_out.groups[0].frames.tolist() == [10] * 4  # two cars that drive through are remembered
     weights = np.arange(tpog.counts.size, dtype=np.uint32) % 7
     found = leave_out.scores(weights, 5.0)
-    for column in range(1 + 10):
-        kept = np.delete(dense, slice(4 * column - 4, 4 * column) if column else [], axis=0)
+    for column in range(1 + 4):
+        kept = np.delete(dense, slice(10 * column - 10, 10 * column) if column else [], axis=0)
         entropy = np.array([binary_entropy(c, len(kept)) for c in range(len(kept) + 1)])[kept.sum(axis=0).ravel()]
         assert found[column] == pytest.approx(float(np.minimum(weights, 5) @ entropy), rel=1e-12)
 
@@ -256,6 +264,6 @@ def test_an_empty_road_has_no_error() -> None:
     counts = np.zeros((4, 0), dtype=np.uint32)
     leave_out = left_out_of(counts, 10, np.empty(0, dtype=np.int64))
     scores = np.array([leave_out.scores(np.ones(60, dtype=np.uint32), 10.0) for _ in range(2)])
-    found = Estimate.of(scores, leave_out.frames)
+    found = Estimate.of(scores, leave_out.groups)
     assert found.se.tolist() == [0.0, 0.0]
     assert uncertainty.beats_next(found).tolist() == [0.5, 1.0]
