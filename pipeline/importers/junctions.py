@@ -37,7 +37,7 @@ KERB_M = 1.0
 KERB_LEAST_M = 0.5
 CLEARANCE_M = 1.0
 BEYOND_ROI_M = 5.0
-HEIGHTS_M = (3.0, 4.5)
+HEIGHTS_M = (3.0, 4.5, 6.0)
 MOST_PLACES = 12
 
 _HAIR_M = 0.01
@@ -117,11 +117,10 @@ class Region:
 
 @dataclass(frozen=True)
 class KerbPlace:
-    """A place for a pole and where a sensor there would look: x, y in metres, yaw in degrees."""
+    """A place for a pole: x, y in metres."""
 
     x_m: float
     y_m: float
-    yaw_deg: float
 
 
 def read(path: Path) -> Streets:
@@ -204,7 +203,7 @@ def kerb_places(streets: Streets, junction: Junction, roi: Region, objects: Sequ
     center = junction.area.centroid
     taken = _nearest(places, (center.x, center.y))
     yaws = [(math.degrees(math.atan2(center.y - y, center.x - x)), x, y) for x, y in taken]
-    return [KerbPlace(x, y, float(round(yaw_deg))) for yaw_deg, x, y in sorted(yaws)]
+    return [KerbPlace(x, y) for _, x, y in sorted(yaws)]
 
 
 def _nearest(places: Sequence[XY], center: XY) -> list[XY]:

@@ -66,6 +66,9 @@ Up to 28 m/s instead of 13.89: that is what netconvert takes a main street witho
 
 PEOPLE = "people come with --set effects.pedestrians_bicycles.pedestrians_per_h=300 (bicycles_per_h for bicycles)"
 
+PITCHES_DEG: tuple[float | str, ...] = (0.0, -10.0, "aim")
+"""Tilts that each height is tried with; which is best at which height depends on sensor and junction."""
+
 SURROUNDINGS_LEAST_M = 100.0
 SURROUNDINGS_M = 300.0
 """How far from the junction streets are simulated: far enough for the queues and platoons that reach it."""
@@ -73,15 +76,20 @@ SURROUNDINGS_M = 300.0
 
 @dataclass(frozen=True)
 class NewScenario:
-    """What :func:`new` made; ``sites`` counts poles times heights, ``notes`` say what to know before trusting it."""
+    """What :func:`new` made; ``poles`` are places for one, ``notes`` say what to know before trusting it."""
 
     folder: Path
     junction: Junction
     roi: Region
     streets: Streets
-    sites: int
+    poles: int
     statics: ImportCounts
     notes: tuple[str, ...]
+
+    @property
+    def sites(self) -> int:
+        """Candidates: each pole with each height and each tilt."""
+        return self.poles * len(HEIGHTS_M) * len(PITCHES_DEG)
 
     @cached_property
     def flows(self) -> tuple[CountModel, ...]:
@@ -106,6 +114,7 @@ class NewScenario:
             "assumed_traffic": {
                 "flows": len(self.flows), "vehicles_per_hour": round(math.fsum(f.per_hour for f in self.flows)),
             },
+            "poles": self.poles,
             "sites": self.sites,
             "statics": self.statics.to_json(),
             "notes": list(self.notes),
@@ -157,7 +166,7 @@ def new(
         problem = f"no place for a pole is free along the kerbs of the {junction.title}"
         raise InputError(osm, problem, "another junction: --at LAT,LON")
     notes = (*_notes(junction, roi, counts), *([PEOPLE] if walk else []))
-    made = NewScenario(folder, junction, roi, streets, len(places) * len(HEIGHTS_M), counts, notes)
+    made = NewScenario(folder, junction, roi, streets, len(places), counts, notes)
     files = {NETWORK: network, STATICS: _geojson(mapped, counts), SITES: _sites(places), FILE: _toml(name, made)}
     _publish(folder, files)
     return made
@@ -273,9 +282,8 @@ def _geojson(mapped: Sequence[MappedSolid], counts: ImportCounts) -> str:
 
 
 def _sites(places: Sequence[KerbPlace]) -> str:
-    header = "site,x_m,y_m,z_m,yaw_deg,pitch_deg,roll_deg,sensor"
-    rows = [f"{p.x_m},{p.y_m},{z_m},{p.yaw_deg},0.0,0.0,{SENSOR}" for p in places for z_m in HEIGHTS_M]
-    return "\n".join([header, *(f"k{number:02d},{row}" for number, row in enumerate(rows, 1)), ""])
+    rows = (f"k{number:02d},{place.x_m},{place.y_m}" for number, place in enumerate(places, 1))
+    return "\n".join(["site,x_m,y_m", *rows, ""])
 
 
 def _toml(name: str, made: NewScenario) -> str:
@@ -299,7 +307,7 @@ def _toml(name: str, made: NewScenario) -> str:
             "footprints": [STATICS],
         }),
         "sites": (f"poles {junctions.KERB_M:g} m behind the kerbs of the junction; add or remove rows at will", {
-            "file": SITES,
+            "file": SITES, "sensor": SENSOR, "heights_m": list(HEIGHTS_M), "aim": "roi", "pitch_deg": list(PITCHES_DEG),
         }),
         "score": ("", {"gamma": ScoreModel.model_fields["gamma"].default}),
     }  # fmt: skip
@@ -313,6 +321,8 @@ def _toml(name: str, made: NewScenario) -> str:
         document["traffic"]["counts"].comment(
             "assumed by the class of the streets: put what was counted in their place"
         )
+    document["sites"]["aim"].comment("sensors are turned towards the middle of the region")
+    document["sites"]["pitch_deg"].comment("each height with each tilt is a candidate; 'aim': the middle ray meets it")
     return tomlkit.dumps(document)
 
 

@@ -23,6 +23,7 @@ from shapely.geometry import LineString, Point, shape
 from pipeline.formats import osm as osm_reader
 from pipeline.importers import openstreetmap as osm
 from pipeline.scenario import loading
+from pipeline.sensing import sites
 from tests.formats.test_osm import pbf_of
 from tests.stages import run_stage
 
@@ -188,12 +189,11 @@ def test_buildings_lie_where_the_network_says(made: Made, footprints: dict[str, 
 
 
 def check_sites(folder: Path, poles: int) -> None:
-    """Sites stand beside the carriageway, clear of everything, in or near the region, at two heights each."""
+    """Sites stand beside the carriageway, clear of everything, in or near the region."""
     rows = sites_of(folder)
     places = [(float(row["x_m"]), float(row["y_m"])) for row in rows]
     assert [row["site"] for row in rows] == [f"k{i:02d}" for i in range(1, len(rows) + 1)]
-    assert len(rows) == 2 * poles and len(set(places)) == poles
-    assert all(places.count(p) == 2 for p in places) and {row["z_m"] for row in rows} == {"3.0", "4.5"}
+    assert len(rows) == poles and len(set(places)) == poles
     lanes = lanes_of(folder)
     features = json.loads((folder / "statics.geojson").read_text(encoding="utf-8"))["features"]
     solids = [area_of(f) for f in features]
@@ -210,11 +210,19 @@ def test_sites(made: Made) -> None:
     check_sites(made[0], 12)
 
 
-def test_sites_look_at_the_junction(made: Made) -> None:
-    for row in sites_of(made[0]):
-        to_x_m, to_y_m = made[1].junction.at_m[0] - float(row["x_m"]), made[1].junction.at_m[1] - float(row["y_m"])
-        off_deg = math.degrees(math.atan2(to_y_m, to_x_m)) - float(row["yaw_deg"])
-        assert abs((off_deg + 180) % 360 - 180) < 2
+def test_each_pole_is_tried_at_three_heights_and_tilts_and_looks_at_the_region(made: Made) -> None:
+    scenario = loading.load(made[0])
+    found = sites.of(scenario)
+    assert len(found) == made[1].sites == 9 * made[1].poles == 9 * 12
+    assert [site.name for site in found[:4]] == ["k01@3m+0deg", "k01@3m-10deg", "k01@3m+aim", "k01@4.5m+0deg"]
+    x_m, y_m, z_m = scenario.roi.center_m
+    for site in found:
+        east_m, north_m = x_m - site.pose.x_m, y_m - site.pose.y_m
+        off_deg = math.degrees(math.atan2(north_m, east_m)) - site.pose.yaw_deg
+        assert (off_deg + 180) % 360 - 180 == pytest.approx(0, abs=1e-5)
+        down_deg = math.degrees(math.atan2(z_m - site.pose.z_m, math.hypot(east_m, north_m)))
+        assert site.pose.pitch_deg in (0, -10, pytest.approx(down_deg + 5, abs=1e-5))
+        assert site.sensor == "VLP-32C"
 
 
 def test_the_scenario_loads(made: Made) -> None:
