@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from pipeline.core import files
 from pipeline.core.errors import InputError
 from pipeline.core.findings import Finding
+from pipeline.formats import point_clouds
 from pipeline.scenario.models import Scenario
 from pipeline.sensing import sites
+from pipeline.sensing.sites import Site
 from pipeline.traffic import sumo_folder
 
-FCD = "traffic.fcd"
+UNOPENED = ("traffic.fcd", "sites.points")
 ABSENT = "absent"
 
 
@@ -23,37 +25,50 @@ def named(scenario: Scenario) -> Iterator[tuple[str, str]]:
     yield from (("statics.polygons", name) for name in statics.polygons)
     yield from (("statics.meshes", mesh.file) for mesh in statics.meshes)
     yield from (("traffic.routes", name) for name in traffic.routes)
+    yield from (("traffic.vtypes", name) for name in traffic.vtypes)
     for key, name in (
-        ("traffic.network", traffic.network), ("traffic.sumocfg", traffic.sumocfg), (FCD, traffic.fcd),
+        ("traffic.network", traffic.network), ("traffic.sumocfg", traffic.sumocfg), ("traffic.fcd", traffic.fcd),
         ("sites.file", of_sites.file), ("sites.points", of_sites.points),
     ):  # fmt: skip
         if name is not None:
             yield key, name
+    for sensor, model in scenario.sensors.items():
+        if model.beams is not None:
+            yield f"sensors.{sensor}.beams", model.beams
 
 
 def missing(scenario: Scenario) -> Iterator[Finding]:
-    """An error for each file that is not there."""
-    for key, name in named(scenario):
+    """An error for each file that is not there, and for each measured scan that nothing can read."""
+    scans = list(measured(sound_sites(scenario)))
+    for key, name in (*named(scenario), *scans):
         try:
             scenario.find(name, key)
+            if (key, name) in scans:
+                point_clouds.reader_of(Path(name), key)
         except InputError as error:
             yield Finding.of("files", error)
 
 
-def measured(scenario: Scenario) -> Iterator[tuple[str, str]]:
-    """(key, file name) of the measured scans that a file of sites names; none where that file is wrong."""
+def sound_sites(scenario: Scenario) -> tuple[Site, ...]:
+    """All candidates; none where they cannot be read, which is told elsewhere."""
     try:
-        candidates = sites.of(scenario) if scenario.sites.file is not None else ()
+        return sites.of(scenario)
     except InputError:
-        return
+        return ()
+
+
+def measured(candidates: Iterable[Site]) -> Iterator[tuple[str, str]]:
+    """(key, file name) of the measured scans of some sites."""
     yield from ((f"site {site.name}: points", site.points) for site in candidates if site.points is not None)
 
 
-def digests(scenario: Scenario) -> dict[str, str]:
-    """Hash of every file that the check reads, ``ABSENT`` where it is not there; of a finished FCD file the name only,
-    since that is not opened."""
-    wanted = [*((key, name) for key, name in named(scenario)), *measured(scenario)]
-    found = {f"{key} = {name}": _digest(scenario, key, name) for key, name in wanted}
+def digests(scenario: Scenario, candidates: Iterable[Site]) -> dict[str, str]:
+    """Hash of every file that the check reads, ``ABSENT`` where it is not there.
+
+    Of a finished FCD file and of measured scans, which it does not open, only whether they are there.
+    """
+    found = {f"{key} = {name}": _digest(scenario, key, name) for key, name in named(scenario)}
+    found |= {f"{key} = {name}": _presence(scenario, key, name) for key, name in measured(candidates)}
     if scenario.traffic.sumocfg is not None:
         try:
             paths = sumo_folder.sources(scenario).all()
@@ -64,8 +79,13 @@ def digests(scenario: Scenario) -> dict[str, str]:
 
 
 def _digest(scenario: Scenario, key: str, name: str) -> str:
+    presence = _presence(scenario, key, name)
+    return presence if presence == ABSENT or key in UNOPENED else files.sha256_of(scenario.find(name, key))
+
+
+def _presence(scenario: Scenario, key: str, name: str) -> str:
     try:
-        path: Path = scenario.find(name, key)
+        scenario.find(name, key)
     except InputError:
         return ABSENT
-    return "there" if key == FCD else files.sha256_of(path)
+    return "there"

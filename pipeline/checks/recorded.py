@@ -7,10 +7,12 @@ solids, and, where no network tells the lanes, whether sites stand where they dr
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.artefacts import tables
 from pipeline.artefacts.readers import Tpog
 from pipeline.core.findings import Finding
 from pipeline.core.grid import Grid
@@ -19,13 +21,17 @@ from pipeline.world import limits
 from pipeline.world.mesh import World
 
 
-def in_region(boxes: float) -> Iterator[Finding]:
-    """A warning where fewer than two vehicles are in the region of interest in a mean frame."""
+def in_region(boxes: float, trajectories: Path) -> Iterator[Finding]:
+    """A warning where fewer than two vehicles are in the region of interest in a mean frame.
+
+    Where there is none at all, ``trajectories.parquet`` is asked where they are instead.
+    """
     if boxes >= limits.FEW_BOXES:
         return
     cure = "a region where vehicles drive, more traffic, or coordinates of one frame"
     if boxes == 0:
-        yield Finding("traffic in the region", "roi", "no vehicle is ever in it: the sites cannot be ranked", cure)
+        what = f"no vehicle is ever in it{_extent(trajectories)}: the sites cannot be ranked"
+        yield Finding("traffic in the region", "roi", what, cure)
     else:
         what = f"{boxes:.2g} vehicles are in it in a mean frame: the ranking rests on hardly any traffic"
         yield Finding("traffic in the region", "roi", what, cure)
@@ -70,6 +76,15 @@ def on_the_road(sites: Iterable[Site], tpog: Tpog) -> Iterator[Finding]:
             often = f"in {column.max() / tpog.frames:.1%} of the frames"
             what = f"vehicles are where it stands, at ({at_m[0]:g}, {at_m[1]:g}), {often}"
             yield Finding("sites on the road", f"site {site.name}", what, cure)
+
+
+def _extent(trajectories: Path) -> str:
+    """Where recorded vehicles are, in words; nothing where there is none."""
+    table, _ = tables.read(trajectories, "trajectories", ["x_m", "y_m"])
+    if not table.num_rows:
+        return ""
+    (x0, x1), (y0, y1) = ((c.min(), c.max()) for c in (table.column(name).to_numpy() for name in ("x_m", "y_m")))
+    return f", all are between ({x0:.0f}, {y0:.0f}) and ({x1:.0f}, {y1:.0f})"
 
 
 def _solid_at(world: World, at_m: NDArray[np.float64], within_m: float) -> str:

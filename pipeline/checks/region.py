@@ -22,7 +22,9 @@ def lanes(subject: Subject) -> Iterator[Finding]:
         yield Finding("region", place, "the network has no lane for vehicles of the road", cure, is_error=True)
         return
     if (far_m := subject.carriageway.distance_m(low_m.tolist(), high_m.tolist())) > 0:
-        what = f"no lane leads through it: the nearest is {far_m:,.1f} m away"
+        (x0, y0), (x1, y1) = subject.carriageway.bounds_m
+        extent = f"lanes reach from ({x0:.0f}, {y0:.0f}) to ({x1:.0f}, {y1:.0f})"
+        what = f"no lane leads through it: the nearest is {far_m:,.1f} m away, {extent}"
         yield Finding("region", place, what, cure, is_error=True)
         return
     at_m = (low_m + high_m)[:2] / 2.0

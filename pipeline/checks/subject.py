@@ -12,7 +12,7 @@ from typing import TypeVar
 
 from pipeline.checks import files
 from pipeline.core.errors import InputError
-from pipeline.core.findings import Finding
+from pipeline.core.findings import Finding, FindingsError
 from pipeline.effects import on_traffic, scene_resolving
 from pipeline.scenario.models import Scenario
 from pipeline.sensing import sites
@@ -63,6 +63,9 @@ class Refusals:
         """What ``make`` gives; None, and an error among the findings, where the input is wrong."""
         try:
             return make()
+        except FindingsError as error:
+            self.found += error.findings
+            return None
         except InputError as error:
             self.found.append(Finding.of(rule, error))
             return None

@@ -42,3 +42,17 @@ def kinds(subject: Subject) -> Iterator[Finding]:
         if not any(edge.lanes_for(kind.vclass) for edge in subject.network.edges):
             found = f"kind {kind.name!r} (vClass {kind.vclass}) may use no lane of the network"
             yield Finding("traffic", f"{place}.kinds", found, "a kind that the network admits", is_error=True)
+
+
+def counts(subject: Subject) -> Iterator[Finding]:
+    """An error for each count at an edge, or of a kind, that is not there."""
+    traffic, place = subject.scenario.traffic, sumo_folder.place_of(subject.scenario)
+    names, network = [kind.name for kind in traffic.kinds], subject.network
+    for count in traffic.counts:
+        where = f"{place}.counts ({count.title})"
+        if count.kind and count.kind not in names:
+            found, right = f"the fleet has no kind {count.kind!r}", f"one of {', '.join(names)}"
+            yield Finding("traffic", where, found, right, is_error=True)
+        for edge in filter(None, (count.edge, count.from_edge, count.to_edge)):
+            if network is not None and edge not in {road.id for road in network.edges}:
+                yield Finding("traffic", where, f"the network has no edge {edge!r}", "the id of an edge", is_error=True)

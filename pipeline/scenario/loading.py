@@ -85,7 +85,7 @@ def _making_way(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
         source = next((key for key in sources if key in new), None)
         if source is None or all(key in new for key in sources if key in old):
             continue
-        idle = _left_behind(source) if table == "traffic" else {"points"}
+        idle = _left_behind(source) if table == "traffic" else {"points", "only_free"}
         left[table] = {key: value for key, value in old.items() if key not in idle and key not in sources}
     return left
 

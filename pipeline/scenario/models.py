@@ -185,6 +185,8 @@ class SitesModel(StrictModel):
         given = [key for key in SITE_SOURCES if getattr(self, key)]
         if len(given) != 1:
             raise ValueError(f"exactly one of file, grid and along is needed, found {' and '.join(given) or 'none'}")
+        if self.file is not None and not self.only_free:
+            raise ValueError("only_free acts on grid and along; all sites of a file are kept")
         if self.heights_m and self.file is None:
             raise ValueError(f"heights_m is for places in a file: {given[0]} has heights_m of its own")
         return self

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.core.errors import InputError
+from pipeline.core.findings import Finding, FindingsError
 from pipeline.formats import located_rows
 from pipeline.formats.georeference import Georeference, Reading
 from pipeline.scenario.models import Scenario, SiteGrid, SiteLine
@@ -112,8 +113,8 @@ def of(scenario: Scenario) -> tuple[Site, ...]:
     Raises
     ------
     InputError
-        Naming file and row: a missing or misspelt column, a value that is no finite number, a name used twice; or a key
-        of ``[sites]`` that acts on no site.
+        Naming file and row, all wrong ones at once: a missing or misspelt column, a value that is no finite number, a
+        name used twice; or a key of ``[sites]`` that acts on no site.
     """
     model = scenario.sites
     if model.file is not None:
@@ -128,11 +129,18 @@ def of(scenario: Scenario) -> tuple[Site, ...]:
     poles: dict[tuple[float, float], str] = {}
     used: set[str] = set()
     known: dict[str, Sensor] = {}
+    refused: list[InputError] = []
     for row in rows:
-        for site in _candidates(row, scenario, poles, used, known):
-            if site.name in found:
-                raise InputError(row.place, f"site {site.name!r} stands there twice", "a name of its own for each site")
-            found[site.name] = site
+        try:
+            for site in _candidates(row, scenario, poles, used, known):
+                if site.name in found:
+                    right = "a name of its own for each site"
+                    raise InputError(row.place, f"site {site.name!r} stands there twice", right)
+                found[site.name] = site
+        except InputError as error:
+            refused.append(error)
+    if refused:
+        raise FindingsError(Finding.of("sites", error) for error in refused)
     if not found:
         raise InputError(path, "holds no site", "at least one")
     if idle := aiming.idle_keys(scenario.sites, used):

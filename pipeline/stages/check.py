@@ -7,9 +7,13 @@ warnings stay in the stage's summary.
 from __future__ import annotations
 
 from pipeline.checks import checking, files
+from pipeline.core.errors import InputError
 from pipeline.core.findings import WARNINGS, FindingsError
+from pipeline.scenario.models import Scenario
+from pipeline.sensing.sites import Site
 from pipeline.stages.base import StageInputs, Summary, Workspace
 from pipeline.stages.shared.built import built
+from pipeline.stages.shared.scene import sensor_digests
 
 NAME = "check"
 ARTEFACTS = ()
@@ -18,10 +22,19 @@ ARTEFACTS = ()
 def inputs(work: Workspace) -> StageInputs:
     """Every file by hash, and all settings but voxels and those of what comes of a run (:data:`UNREAD`)."""
     scenario = work.scenario
-    hashes = files.digests(scenario)
+    candidates = files.sound_sites(scenario)
+    hashes = files.digests(scenario, candidates) | _sensors(scenario, candidates)
     settings = scenario.model_dump(mode="json", exclude={**dict.fromkeys(UNREAD, True), "roi": {"voxel_m"}})
     settings["keep_visibility"] = scenario.score.keep_visibility
     return StageInputs(settings, hashes)
+
+
+def _sensors(scenario: Scenario, candidates: tuple[Site, ...]) -> dict[str, str]:
+    """Beam tables and entries of the catalogue, by hash; none where one is not there, which is known already."""
+    try:
+        return sensor_digests(scenario, candidates)
+    except InputError:
+        return {}
 
 
 UNREAD = ("description", "extends", "seed", "tpog", "scan", "score")

@@ -76,7 +76,7 @@ def run(work: Workspace, inputs: StageInputs) -> Summary:
         about: dict[str, Any] = {"frames": frames, "block_frames": block_frames, "memory_frames": memory}
         file.describe(work.metadata(inputs, grid=grid.to_json(), **about))
     doubts = [
-        *recorded.in_region(float(in_roi.mean())),
+        *recorded.in_region(float(in_roi.mean()), source),
         *recorded.through_solids(hidden, seen, solid, grid, world_of(work)),
     ]
     summary: Summary = {

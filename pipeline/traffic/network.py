@@ -251,9 +251,7 @@ class Network:
 
 
 def read(path: Path, name: Path | None = None) -> Network:
-    """Read a network; messages call it ``name`` where it is a copy of what the user named.
-
-    The same content under the same name is read once: the check, the ground and the traffic all ask for it.
+    """Read a network, once for all who ask; messages call it ``name`` where it is a copy of what the user named.
 
     InputError when the file is no SUMO network, is damaged, or has no road.
     """

@@ -117,6 +117,13 @@ class Carriageway:
         nearest = self._tree.nearest(box)
         return float(shapely.distance(self.areas[nearest], box))
 
+    @property
+    def bounds_m(self) -> Floats:
+        """South-west and north-east corner of all lanes, (2, 2)."""
+        import shapely
+
+        return np.reshape(shapely.total_bounds(self.areas), (2, 2))
+
     def height_m(self, lane: int, at_m: Floats) -> float:
         """The road's z beside a place (2,), on the middle line of a lane."""
         line = self.lanes[lane].shape_m

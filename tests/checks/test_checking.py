@@ -11,8 +11,10 @@ import pipeline
 from pipeline.checks import checking
 from pipeline.core.errors import InputError
 from pipeline.core.findings import FindingsError
+from pipeline.stages import check
 from tests.checks.conftest import LANES, net_xml
 from tests.conftest import collection, feature
+from tests.stages import inputs_of
 
 
 def found(folder: Path, *settings: str) -> dict[str, list[str]]:
@@ -202,7 +204,12 @@ def test_a_region_without_lanes(street: Path) -> None:
     sites(street, "a,20,210,3")
     statics(street)
     told = found(street, "roi.center_m=[20,200,2.5]")
-    assert told == {"region": ["scenario.toml: roi: no lane leads through it: the nearest is 187.1 m away"]}
+    assert told == {
+        "region": [
+            "scenario.toml: roi: no lane leads through it: the nearest is 187.1 m away, "
+            "lanes reach from (-40, -3) to (80, 3)"
+        ]
+    }
 
 
 def test_a_region_above_the_road(street: Path) -> None:
@@ -279,3 +286,67 @@ def test_findings_errors_are_errors_of_input(street: Path) -> None:
     with pytest.raises(InputError) as caught:
         pipeline.run(pipeline.load(street, ['sites.sensor="smal"', "traffic.edge_weights={north=2}"]), street / "out")
     assert len(str(caught.value).splitlines()) == 2
+
+
+# ---- files, and the keys of the stage
+
+
+def test_all_wrong_rows_of_a_sites_file_are_told_at_once(street: Path) -> None:
+    sites(street, "a,10,12,x", "b,10,12,3", "b,11,12,3", "c,,12,3", "d,10,12,3")
+    assert found(street) == {
+        "sites": [
+            "sites.csv: row a: z_m: 'x'",
+            "sites.csv: row b: site 'b' stands there twice",
+            "sites.csv: row c: x_m is missing",
+        ]
+    }
+
+
+def test_files_that_are_not_there_or_have_no_reader(street: Path) -> None:
+    (street / "sites.csv").write_text("site,x_m,y_m,z_m,points\na,10,12,3,gone.pcd\nb,12,12,3,scan.xyz\nc,14,12,3,\n")
+    (street / "scan.xyz").write_text("")
+    told = found(street, 'statics.polygons=["gone.poly.xml"]', 'sensors.own={beams="beams.csv",range_m=50}')
+    assert {line.partition(": no such")[0] for line in told["files"][:3]} == {
+        "scenario.toml: statics.polygons = 'gone.poly.xml'",
+        "scenario.toml: sensors.own.beams = 'beams.csv'",
+        "scenario.toml: site a: points = 'gone.pcd'",
+    }
+    assert "scan.xyz" in told["files"][3]
+    assert len(told["files"]) == 4
+
+
+def test_counts_at_edges_and_of_kinds_that_are_not_there(street: Path) -> None:
+    counts = (
+        '[{edge="east",per_hour=100},{edge="north",per_hour=9},{from_edge="east",to_edge="up",per_hour=9,kind="ox"}]'
+    )
+    told = found(street, f"traffic.counts={counts}")
+    assert [line.partition("): ")[2] for line in told["traffic"]] == [
+        "the network has no edge 'north'", "the fleet has no kind 'ox'", "the network has no edge 'up'",
+    ]  # fmt: skip
+
+
+def test_a_file_keeps_all_its_sites(street: Path) -> None:
+    with pytest.raises(InputError, match="only_free acts on grid and along"):
+        pipeline.load(street, ["sites.only_free=false"])
+
+
+def test_what_the_check_reads_makes_it_again(street: Path) -> None:
+    """Each file that it reads, and no setting of what comes of a run."""
+    (street / "scan.csv").write_text("x_m,y_m,z_m\n30.5,0,0\n")
+    (street / "sites.csv").write_text("site,x_m,y_m,z_m,points\na,10,12,3,\nb,12,12,3,scan.csv\n")
+
+    def key(*settings: str) -> object:
+        return inputs_of(check, pipeline.load(street, settings), street / "out").to_json()
+
+    before = key()
+    for setting in ("roi.voxel_m=0.25", "score.gamma=9", "tpog.blocks=2", "seed=3", "scan.keep=false"):
+        assert key(setting) == before
+    for setting in ("roi.center_m=[21,0,2.5]", "sites.roll_deg=1", "traffic.step_s=0.5", "effects.rain.rate_mm_h=9"):
+        assert key(setting) != before
+    for name in ("net.net.xml", "sites.csv", "statics.geojson"):
+        (street / name).write_text((street / name).read_text() + "\n")
+        now = key()
+        assert now != before, name
+        before = now
+    (street / "scan.csv").unlink()
+    assert key() != before

@@ -25,17 +25,19 @@ def warnings(folder: Path, out: Path, *settings: str) -> dict[str, list[str]]:
 
 def test_two_vehicles_in_a_mean_frame_are_enough(mini: Path, tmp_path: Path) -> None:
     """Two cars pass each other along the whole region, but in the first and last frames one of them is outside."""
-    assert [str(f) for f in recorded.in_region(2.0)] == []
+    assert list(recorded.in_region(2.0, tmp_path / "is not read")) == []
     assert warnings(mini, tmp_path / "out") == {}
     few = warnings(mini, tmp_path / "few", "roi.center_m=[30,0,2.5]", "roi.size_m=[20,20,5]")
-    assert list(few) == ["tpog"]
+    assert len(few["tpog"]) == 1
     assert few["tpog"][0].endswith(" vehicles are in it in a mean frame: the ranking rests on hardly any traffic")
 
 
 def test_a_region_that_no_vehicle_enters(mini: Path, tmp_path: Path) -> None:
     sites(mini, "a,10,52,3")
     told = warnings(mini, tmp_path / "out", "roi.center_m=[20,60,2.5]")
-    assert told == {"tpog": ["roi: no vehicle is ever in it: the sites cannot be ranked"]}
+    assert told == {
+        "tpog": ["roi: no vehicle is ever in it, all are between (-1, -2) and (41, 3): the sites cannot be ranked"]
+    }
 
 
 def test_vehicles_that_drive_through_a_wall_are_told_with_the_place(mini: Path, tmp_path: Path) -> None:
