@@ -295,8 +295,14 @@ def effects(
         tables.print_effects(effect_overview.catalogue())
         return
     resolved, folder = _resolved(scenario, set_, out)
-    prices, calls = effect_overview.prices(resolved, folder), effect_overview.called(resolved)
+    with Screen() as screen:
+        prices = effect_overview.prices(resolved, folder)
+        calls = effect_overview.called(resolved, folder, screen.progress)
     tables.print_effects(calls, prices)
+    if any(call.change == effect_overview.UNTRIED for call in calls):
+        print(f"to measure what each would change, first: {arguments.command('run', scenario, set_, out)}")
+    if wanted := [f"effects.{call.name}={{}}" for call in calls if call.state == "called for"]:
+        print(f"with what is called for: {arguments.command('run', scenario, [*(set_ or ()), *wanted], out)}")
     on = [call.name for call in calls if call.state == "on" and call.name in resolved.effects.named]
     unpriced = [name for name in on if name not in (prices or {})]
     if prices is None or unpriced:

@@ -42,6 +42,7 @@ def print_effects(calls: Sequence[Call], prices: Mapping[str, Price] | None = No
         "kind",
         "state",
         "why",
+        *(["expected change"] if any(call.change for call in calls) else []),
         *(["costs", "changes"] if prices is not None else []),
         "source",
     ]
@@ -51,7 +52,7 @@ def print_effects(calls: Sequence[Call], prices: Mapping[str, Price] | None = No
     for call in calls:
         costs, changes = _price((prices or {}).get(call.name))
         cells = {"effect": call.name, "acts in": call.stage, "kind": call.kind, "state": call.state, "why": call.why,
-                 "costs": costs, "changes": changes, "source": call.source}  # fmt: skip
+                 "expected change": call.change, "costs": costs, "changes": changes, "source": call.source}  # fmt: skip
         rows.add_row(*(cells[name] for name in names))
     out.print(rows)
 

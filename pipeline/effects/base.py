@@ -45,6 +45,9 @@ if TYPE_CHECKING:
 
 P = TypeVar("P", bound=EffectParameters)
 
+_SAMPLES = 8
+"""Places along each side of the region of interest at which a chance is averaged."""
+
 
 @dataclass(frozen=True)
 class Effect(Generic[P]):
@@ -62,6 +65,11 @@ class Effect(Generic[P]):
         The class of ``parameters``.
     QUALITY
         Parameters that trade time for accuracy, and values from cheap to fine; the accuracy study tries them.
+    TRIAL
+        Values for parameters without a default, with which ``egvs effects`` tries the effect before a scene that does
+        not name it.
+    UNTOLD
+        What a scene does not tell that decides whether it needs the effect ("the weather"); empty where it tells.
     """
 
     parameters: P
@@ -71,6 +79,8 @@ class Effect(Generic[P]):
     KIND: ClassVar[str]
     Model: ClassVar[type[EffectParameters]]
     QUALITY: ClassVar[dict[str, tuple[Any, ...]]] = {}
+    TRIAL: ClassVar[dict[str, Any]] = {}
+    UNTOLD: ClassVar[str] = ""
 
     def why_idle(self, scene: Scene) -> str | None:
         """Why the effect provably cannot change the result in this scene; None when it can."""
@@ -81,6 +91,11 @@ class Effect(Generic[P]):
         """What a run of this scene would be refused for; None when nothing is missing."""
         del scene
         return None
+
+    def seen(self, scene: Scene) -> str:
+        """What in the scene the effect is about, in words and with its numbers; empty where there is nothing to say."""
+        del scene
+        return ""
 
     @property
     def reads(self) -> tuple[str, ...]:
@@ -141,6 +156,19 @@ class Detect(Effect[P]):
         except InputError as error:
             return error
         return None
+
+    def seen(self, scene: Scene) -> str:
+        """The share of returns from the region of interest that is noticed, by the effect's own formula."""
+        low, size = np.asarray(scene.roi.origin_m), np.asarray(scene.roi.size_m)
+        parts = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+        places = low + size * np.stack(np.meshgrid(parts, parts, parts), axis=-1).reshape(-1, 3)
+        shares = [
+            self.detect(np.sqrt(((places - site.pose.position_m) ** 2).sum(axis=1)), scene.sensor(site.sensor)).mean()
+            for site in scene.sites
+        ]
+        worst, best = (f"{share:.0%}" for share in (min(shares), max(shares)))
+        spread = best if worst == best else f"{worst} to {best}"
+        return f"by its formula, {spread} of returns from the region are noticed"
 
     def detect(self, range_m: NDArray[np.float64], sensor: Sensor) -> NDArray[np.float64]:
         """Chance (n,), 0 to 1, for targets at ``range_m`` (n,) metres from the sensor.

@@ -14,6 +14,7 @@ from pipeline.scenario.effects import RainParameters
 from pipeline.studies import effect_overview
 from pipeline.studies.ablation import ablation
 from pipeline.studies.measuring import inputs_of
+from tests.conftest import collection, feature
 
 
 def states(mini: Path, *overrides: str) -> dict[str, tuple[str, str]]:
@@ -29,12 +30,78 @@ def test_every_effect_is_listed_with_its_source(egvs) -> None:
         assert call.why.endswith((".", "?"))  # the sentence that its module opens with
 
 
-def test_a_plain_scene_calls_for_none(mini: Path) -> None:
+def advice(folder: Path, out: Path, *overrides: str) -> dict[str, effect_overview.Call]:
+    """What is said of each effect, tried on the run in ``out``."""
+    return {call.name: call for call in effect_overview.called(pipeline.load(folder, overrides), out)}
+
+
+def test_a_plain_scene_is_told_what_it_has_and_what_only_its_user_knows(mini: Path) -> None:
     found = states(mini)
     assert set(found) == set(registry.names())
-    assert {state for state, _ in found.values()} == {"off"}
-    assert found["rain"] == ("off", "not named")
+    assert {name: state for name, (state, _) in found.items() if state != "off"} == {
+        "rain": "your choice",
+        "fog": "your choice",
+        "dropout": "your choice",
+        "mount_sway": "your choice",
+        "moving_occlusion": "called for",
+        "divergence": "called for",
+    }
+    assert found["rain"][1].startswith("the weather decides; by its formula, ")
+    assert found["foliage"][1] == "not called for: there is no closed tree crown"
+    assert "cannot act here: no rated_range_m" in found["range_limit"][1]
+    assert "a finished FCD file, so nobody can be added" in found["pedestrians_bicycles"][1]
+    assert "no kind of vehicle has more than one part" in found["articulated"][1]
     assert "flat" in found["slope"][1] or "no network" in found["slope"][1] or "relief" in found["slope"][1]
+
+
+def test_the_change_that_is_expected_is_the_one_that_a_run_finds(mini: Path, tmp_path: Path) -> None:
+    plain = tmp_path / "plain"
+    pipeline.run(pipeline.load(mini), plain)
+    before = {row["site"]: row["egvs"] for row in results.read_scores(plain / "scores.parquet").to_pylist()}
+    found = advice(mini, plain)
+    for name, words in (
+        ("dropout", "share=0.1"),
+        ("moving_occlusion", "method='frames'"),
+        ("divergence", "sub_beams=7"),
+    ):
+        pipeline.run(pipeline.load(mini, [f"effects.{name}.{words}"]), tmp_path / name)
+        rows = results.read_scores(tmp_path / name / "scores.parquet").to_pylist()
+        changes = sorted((row["egvs"] / before[row["site"]] - 1 for row in rows), key=abs)
+        assert f"scores by {changes[0]:+.1%} to {changes[-1]:+.1%}" in found[name].change, name
+        assert "measured on 2 of 2 sites, with the last run's traffic" in found[name].change
+    assert found["dropout"].why.endswith("; tried with share = 0.1")
+    assert found["foliage"].change == ""
+
+
+def test_trees_and_long_trucks_in_the_scene_are_seen(mini: Path, tmp_path: Path) -> None:
+    crown = feature({"type": "Point", "coordinates": [12, 9]}, kind="tree_crown", height_m=5, base_m=1, radius_m=1.5)
+    far = feature({"type": "Point", "coordinates": [900, 9]}, kind="tree_crown", height_m=5, base_m=1, radius_m=1.5)
+    (mini / "statics.geojson").write_text(collection(crown, far))
+    (mini / "truck.xml").write_text("<a><vType id='car' vClass='trailer' length='18' width='2.5' height='4'/></a>")
+    text = (mini / "scenario.toml").read_text()
+    kind = text[text.index("[[traffic.kinds]]") : text.index("[statics]")]
+    (mini / "scenario.toml").write_text(text.replace(kind, "").replace('fcd.csv"', "fcd.csv\"\nvtypes = ['truck.xml']"))
+    pipeline.run(pipeline.load(mini), tmp_path / "out")
+    found = advice(mini, tmp_path / "out")
+    assert (found["foliage"].state, found["foliage"].why) == (
+        "called for",
+        "1 of 2 tree crowns may stand between a site and the region",
+    )
+    assert found["articulated"].state == "called for"
+    assert found["articulated"].change.startswith("100.0% of the boxes in the last run get parts")
+
+
+def test_traffic_of_another_scenario_is_not_tried_on(mini: Path, tmp_path: Path, egvs) -> None:
+    out = tmp_path / "out"
+    code, printed, _ = egvs("effects", mini, "--out", out)
+    assert (code, out.exists()) == (0, False)
+    assert f"to measure what each would change, first: egvs run {mini} --out {out}" in printed
+    assert "--set 'effects.moving_occlusion={}' --set 'effects.divergence={}'" in printed
+    assert egvs("run", mini, "--out", out)[0] == 0
+    assert "to measure what" not in egvs("effects", mini, "--out", out)[1]
+    assert "to measure what" in egvs("effects", mini, "--out", out, "--set", "traffic.frames=20")[1]
+    (out / "trajectories.parquet").unlink()
+    assert "to measure what" in egvs("effects", mini, "--out", out)[1]
 
 
 def test_a_named_effect_is_on_with_its_parameters(mini: Path) -> None:

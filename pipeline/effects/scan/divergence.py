@@ -72,6 +72,17 @@ class Divergence(Expand[DivergenceParameters]):
         known = {site.sensor: scene.sensor(site.sensor, f"site {site.name}") for site in cast}
         return None if any(any(self.angles_mrad(sensor)) for sensor in known.values()) else "divergence_mrad is 0"
 
+    def seen(self, scene: Scene) -> str:
+        """How wide a beam is at the far end of the region of interest."""
+        low = np.asarray(scene.roi.origin_m)
+        high = low + np.asarray(scene.roi.size_m)
+        widths_m = []
+        for site in scene.cast_sites:
+            at = np.asarray(site.pose.position_m)
+            far_m = float(np.sqrt((np.maximum(np.abs(low - at), np.abs(high - at)) ** 2).sum()))
+            widths_m.append(1e-3 * max(self.angles_mrad(scene.sensor(site.sensor))) * far_m)
+        return f"at the far end of the region a beam is {100 * max(widths_m):.0f} cm wide"
+
     def angles_mrad(self, sensor: Sensor) -> tuple[float, float]:
         """Full angles across and along the elevation."""
         across, along = self.parameters.divergence_mrad or sensor.divergence_mrad

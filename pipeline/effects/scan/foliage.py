@@ -83,6 +83,14 @@ class Foliage(TransmitScan[FoliageParameters]):
         met = may_meet(boxes, scene.scenario.roi.box, np.array(cast)).any()
         return None if met else "no crown lies between any site and the ROI"
 
+    def seen(self, scene: Scene) -> str:
+        """How many crowns there are, and how many beams may meet before they have left the region of interest."""
+        world, cast = scene.world, np.array([site.pose.position_m for site in scene.cast_sites])
+        faces = _of_crowns(world)
+        boxes = _boxes(world.triangles_m[faces], world.solid_of_face[faces])
+        near = int(raycast.between(boxes, scene.scenario.roi.box, cast).sum())
+        return f"{near} of {len(boxes)} tree crowns may stand between a site and the region"
+
     def opaque(self, world: World) -> World:
         """The world without closed crowns."""
         stays = ~_of_crowns(world)

@@ -11,7 +11,7 @@ or weather is better named as such.
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,8 @@ class Dropout(Detect[DropoutParameters]):
     NAME: ClassVar[str] = "dropout"
     SOURCE: ClassVar[str] = "Dosovitskiy et al. 2017 (CARLA), dropoff_general_rate, as an expectation"
     Model: ClassVar[type[EffectParameters]] = DropoutParameters
+    TRIAL: ClassVar[dict[str, Any]] = {"share": 0.1}
+    UNTOLD: ClassVar[str] = "how dirty the sensor gets"
 
     def why_idle(self, scene: Scene) -> str | None:
         """Nothing is lost when the share is nothing."""

@@ -28,7 +28,7 @@ return loses more. Homogeneous fog; single scattering; wavelengths from 400 to 1
 from __future__ import annotations
 
 import math
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,8 @@ class Fog(Detect[FogParameters]):
     NAME: ClassVar[str] = "fog"
     SOURCE: ClassVar[str] = "Kim, McArthur and Korevaar 2001, Proc. SPIE 4214; Kruse et al. 1962"
     Model: ClassVar[type[EffectParameters]] = FogParameters
+    TRIAL: ClassVar[dict[str, Any]] = {"visibility_m": 200.0}
+    UNTOLD: ClassVar[str] = "the weather"
 
     def extinction_per_m(self, wavelength_nm: float) -> float:
         """Extinction coefficient in nepers a metre."""

@@ -159,6 +159,11 @@ class MovingOcclusion(TransmitScore[MovingOcclusionParameters]):
 
     ready: Replay | FacingBoxes | Independent | None = field(default=None, compare=False, repr=False)
 
+    def seen(self, scene: Scene) -> str:
+        """Wherever there is traffic."""
+        del scene
+        return "vehicles hide what is behind them"
+
     @property
     def reads(self) -> tuple[str, ...]:
         """Trajectories, when they are replayed."""

@@ -30,7 +30,7 @@ wet surfaces or windows.
 from __future__ import annotations
 
 import math
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +58,8 @@ class Rain(Detect[RainParameters]):
         "ITU-R P.1814, power law k R^beta; the default pair is that of Marshall and Palmer's drops (1948)"
     )
     Model: ClassVar[type[EffectParameters]] = RainParameters
+    TRIAL: ClassVar[dict[str, Any]] = {"rate_mm_h": 10.0}
+    UNTOLD: ClassVar[str] = "the weather"
 
     def why_idle(self, scene: Scene) -> str | None:
         """Without rain nothing is lost."""

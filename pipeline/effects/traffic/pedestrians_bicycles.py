@@ -34,7 +34,7 @@ import heapq
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -45,6 +45,8 @@ from pipeline.effects.base import Traffic
 from pipeline.scenario.effects import EffectParameters, PedestriansBicyclesParameters
 from pipeline.scenario.models import Scenario
 from pipeline.scenario.traffic import TrafficModel, VehicleKind
+from pipeline.sensing.scene import Scene
+from pipeline.traffic import network, sumo_folder
 from pipeline.traffic.boxes import Size
 from pipeline.traffic.demand import trips as demand
 from pipeline.traffic.extensions import TrafficPlan
@@ -77,6 +79,8 @@ class PedestriansBicycles(Traffic[PedestriansBicyclesParameters]):
         "Erdmann and Krajzewicz 2015 (SUMO's striping model); box sizes: Lang et al. 2019, arXiv 1812.05784"
     )
     Model: ClassVar[type[EffectParameters]] = PedestriansBicyclesParameters
+    TRIAL: ClassVar[dict[str, Any]] = {"pedestrians_per_h": 100.0}
+    UNTOLD: ClassVar[str] = "whether people must be seen"
     ADDS_TRAFFIC: ClassVar[bool] = True
 
     def refuses(self, scenario: Scenario) -> InputError | None:
@@ -90,6 +94,16 @@ class PedestriansBicycles(Traffic[PedestriansBicyclesParameters]):
         """Rates of 0 bring nobody."""
         both = self.parameters.pedestrians_per_h == 0 and self.parameters.bicycles_per_h == 0
         return (False, "both rates are 0") if both else (True, "named")
+
+    def seen(self, scene: Scene) -> str:
+        """Where people could walk."""
+        path = sumo_folder.network_path(scene.scenario)
+        if path is None or network.is_osm(path):
+            return ""
+        ways = network.read(path).walkways
+        if not ways.sidewalks or not ways.areas:
+            return "the network has no sidewalks that hang together (egvs new --walk makes some)"
+        return f"the network has {len(ways.sidewalks)} sidewalks and {ways.crossings} crossings"
 
     def sizes(self) -> dict[str, Size]:
         """Sizes of the types that this effect adds."""
