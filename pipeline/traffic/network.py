@@ -99,6 +99,11 @@ class Lane(Shape):
         """Whether it is for people on foot alone."""
         return self.permission.allow == frozenset({_PEDESTRIAN})
 
+    @property
+    def is_sidewalk(self) -> bool:
+        """Whether people, but no cars, may use it."""
+        return self.permission.admits(_PEDESTRIAN) and not self.permission.admits("passenger")
+
 
 @dataclass(frozen=True)
 class Edge:
@@ -239,7 +244,7 @@ class Network:
         walked = [
             (edge, index)
             for edge in self.edges
-            if (index := next((i for i, lane in enumerate(edge.lanes) if _is_sidewalk(lane)), None)) is not None
+            if (index := next((i for i, lane in enumerate(edge.lanes) if lane.is_sidewalk), None)) is not None
         ]
         parts = _parts([f"{edge.id}_{index}" for edge, index in walked], self.lane_links)
         sidewalks = [
@@ -381,11 +386,6 @@ def may_have_heights(path: Path) -> bool:
         return False
     with safe_xml.opened(path) as file:
         return any(_HEIGHT.search(line, line.find(b"shape=")) is not None for line in file if b"shape=" in line)
-
-
-def _is_sidewalk(lane: Lane) -> bool:
-    """Whether people, but no cars, may use it."""
-    return lane.permission.admits(_PEDESTRIAN) and not lane.permission.admits("passenger")
 
 
 def _parts(lanes: Sequence[str], links: Sequence[tuple[str, str]]) -> list[int]:
