@@ -7,8 +7,9 @@ from collections.abc import Iterator
 from pipeline.checks.subject import Refusals, Subject
 from pipeline.core.errors import InputError
 from pipeline.core.findings import Finding
-from pipeline.traffic import sumo, sumo_folder
+from pipeline.traffic import fcd, sumo, sumo_folder
 from pipeline.traffic.demand import trips
+from pipeline.world import world_frame
 
 
 def times(subject: Subject) -> Iterator[Finding]:
@@ -19,6 +20,16 @@ def times(subject: Subject) -> Iterator[Finding]:
         given = refusals.unless_refused("traffic", lambda: sumo_folder.sources(scenario))
         begin_s = 0.0 if given is None else given.begin_s
         refusals.unless_refused("traffic", lambda: sumo_folder.timing(scenario.traffic, begin_s, place))
+    yield from refusals.found
+
+
+def recorded_places(subject: Subject) -> Iterator[Finding]:
+    """An error where a finished file is in other coordinates than the scenario, or cannot be read from its start."""
+    scenario, refusals = subject.scenario, Refusals()
+    if (name := scenario.traffic.fcd) is not None:
+        refusals.unless_refused(
+            "traffic", lambda: fcd.check_place(scenario.find(name, "traffic.fcd"), world_frame.of(scenario))
+        )
     yield from refusals.found
 
 

@@ -197,6 +197,7 @@ class Scanner:
         if (farthest_m := np.abs(points).max()) > FARTHEST_M:
             raise InputError(place, f"a point lies {farthest_m:g} m from the world's zero", f"within {FARTHEST_M:g} m")
         world, declared = world_frame.of(self.scene.scenario), point_clouds.crs_of(path, place)
+        place = f"{place}: {path}"
         if declared is None:
             world.metres(points[:, :2], place, "metres of the world frame, or a LAS file that names its system")
             return points

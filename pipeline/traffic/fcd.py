@@ -11,8 +11,8 @@ milliseconds, SUMO's own unit. Rows without a vehicle (SUMO writes one for an em
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Generator, Iterable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +47,7 @@ RIGHT = "FCD with the attributes id, x, y, angle and type (--fcd-output.attribut
 _RIGHT_PLACE = "x and y in metres of the world frame, or longitude and latitude (--fcd-output.geo)"
 
 
-def located(tables: Iterable[pa.Table], world: Georeference, path: Path) -> Iterator[pa.Table]:
+def located(tables: Iterable[pa.Table], world: Georeference, path: Path) -> Generator[pa.Table, None, None]:
     """The rows of a user's file with x, y in the world frame, whether they are metres or degrees.
 
     The first table tells. InputError where it is neither, or no vehicle of it is near the region of interest.
@@ -61,6 +61,12 @@ def located(tables: Iterable[pa.Table], world: Georeference, path: Path) -> Iter
             for name, values in (("x", x_m), ("y", y_m)):
                 table = table.set_column(SCHEMA.get_field_index(name), SCHEMA.field(name), pa.array(values))
         yield table
+
+
+def check_place(path: Path, world: Georeference) -> None:
+    """InputError where a user's file lies in other coordinates, or is none; only its head is read."""
+    with closing(located(read(path), world, path)) as tables:
+        next(tables, None)
 
 
 def read(path: Path, who: str = "vehicle") -> Iterator[pa.Table]:

@@ -72,19 +72,26 @@ def read_geojson(path: Path, world: Georeference) -> FootprintFile:
         if not isinstance(feature, dict) or not isinstance(feature.get("properties") or {}, dict):
             raise InputError(place, "is not a GeoJSON feature", "an object with geometry and properties")
         properties = feature.get("properties") or {}
-        name = str(properties.get("name", f"{path.stem}_{number}"))
+        name = str(_named(properties, "name", f"{path.stem}_{number}"))
         place = f"{place} ({name})"
         height, base = _metres(properties, "height_m", place), _metres(properties, "base_m", place, 0.0)
         if not height > base:
             raise InputError(place, f"height_m = {height:g} with base_m = {base:g}", "a top above the underside")
-        kind = str(properties.get("kind", "footprint"))
+        kind = str(_named(properties, "kind", "footprint"))
         for part in polygons_of(feature.get("geometry"), properties, place, file.mended, reading):
             file.footprints.append(Footprint(name, kind, part, base, height))
     return file
 
 
+def _named(properties: dict[str, Any], key: str, default: str) -> Any:
+    value = properties.get(key)
+    return default if value is None else value
+
+
 def _metres(properties: dict[str, Any], key: str, place: str, default: float | None = None) -> float:
-    value = properties.get(key, default)
+    value = properties.get(key)
+    if value is None:  # a GIS writes null where another feature of the table has the property
+        value = default
     if value is None:
         raise InputError(place, f"{key} is missing", "a number of metres")
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= FARTHEST_M:
@@ -115,6 +122,8 @@ def polygons_of(
         raise InputError(shape_place, "has z coordinates", "two coordinates a point; heights go into base_m, height_m")
     if reading.convert is not None:
         shape = shapely.transform(shape, reading.to_world)
+    if shape.geom_type == "GeometryCollection":
+        shape = _areas_alone(shape, mended)
     if shape.geom_type.endswith(("Point", "LineString")):
         radius = _metres(properties, "radius_m", place)
         if radius <= 0:
@@ -127,6 +136,19 @@ def polygons_of(
     if not parts:
         raise InputError(shape_place, "encloses no area", "a polygon with three corners that are not in line")
     return parts
+
+
+def _areas_alone(collection: BaseGeometry, mended: Counter[str]) -> BaseGeometry:
+    """The polygons of a collection. A GIS that rounds degrees turns the thinnest corners of a polygon into lines beside
+    it; a collection without a polygon stays what it is."""
+    import shapely
+
+    parts = shapely.get_parts(collection)
+    areas = [part for part in parts if "Polygon" in part.geom_type]
+    if not areas:
+        return collection
+    mended["lines and points beside polygons, left out"] += len(parts) - len(areas)
+    return shapely.MultiPolygon([area for part in areas for area in shapely.get_parts(part)])
 
 
 def _sound(shape: BaseGeometry, place: str, mended: Counter[str]) -> BaseGeometry:

@@ -6,11 +6,13 @@ import math
 from pathlib import Path
 
 import numpy as np
+import pyproj
 import pytest
 import trimesh
 
 from pipeline.core.errors import InputError
 from pipeline.effects import scene_resolving
+from pipeline.formats.crs import WorldFrame
 from pipeline.scenario import loading
 from pipeline.scenario.loading import from_values
 from pipeline.sensing.scanner import Scanner
@@ -401,3 +403,81 @@ def test_shipped_statics_are_closed_and_clean():
         assert not counts.left_out
         features = json.loads((Path("scenarios") / name / "statics.geojson").read_text())["features"]
         assert sum(counts.built.values()) >= len(features)
+
+
+# ---- where files lie on the Earth
+
+CRS = {"epsg": 32632, "offset_m": [-550_700, -5_635_200]}
+FRAME = WorldFrame("EPSG:32632", (-550_700.0, -5_635_200.0))
+
+
+def located(folder, **settings):
+    values = {
+        "roi": {"center_m": [20, 20, 2.5], "size_m": [80, 80, 5], "voxel_m": 0.5},
+        "traffic": {"fcd": "none.csv"},
+        "crs": CRS,
+        "sites": {"file": "sites.csv", "sensor": "VLP-16"},
+        "statics": {"ground": False, **settings},
+    }
+    return static_world.build(from_values(values, folder, "scenario.toml"))
+
+
+def test_features_in_degrees_are_counted_and_stand_where_metres_put_them(tmp_path):
+    """Radii and heights stay metres; what is null is as if it were not there, as a GIS writes it."""
+    square, lamp = [FRAME.to_degrees(np.array(some, dtype=float)).tolist() for some in (SQUARE, [[9, 9]])]
+    more = {"name": None, "kind": None, "base_m": None}
+    degrees = (polygon(square, **more), feature({"type": "Point", "coordinates": lamp[0]}, height_m=5, radius_m=0.1))
+    metres = (polygon(SQUARE), feature({"type": "Point", "coordinates": [9, 9]}, height_m=5, radius_m=0.1))
+    (tmp_path / "s.geojson").write_text(collection(*degrees))
+    world, counts = located(tmp_path, footprints=["s.geojson"])
+    assert np.array_equal(world.vertices_m, built(tmp_path, *metres)[0].vertices_m)
+    assert counts.mended == {"features in degrees, brought into the world frame": 2}
+    assert world.solids[0] == ("s_0", "footprint")
+
+
+def test_lines_that_rounding_has_left_beside_a_polygon_are_counted(tmp_path):
+    """GDAL makes a collection of a polygon whose thin corner fell together."""
+    thin = {"type": "LineString", "coordinates": [[4, 4], [6, 4]]}
+    both = {"type": "GeometryCollection", "geometries": [{"type": "Polygon", "coordinates": [SQUARE]}, thin]}
+    world, counts = built(tmp_path, feature(both, height_m=3))
+    assert volumes(world) == pytest.approx([48], rel=1e-12)
+    assert counts.mended == {"lines and points beside polygons, left out": 1}
+
+
+@pytest.mark.parametrize("way", ["epsg", "epsg with offset", "origin"])
+def test_a_mesh_may_be_in_a_system_of_its_own(tmp_path, way):
+    box = trimesh.creation.box((4, 6, 8))
+    eastings = np.array([550_720.0, 5_635_230.0, 4.0])  # (20, 30) in the world
+    lon, lat = FRAME.to_degrees(np.array([[20.0, 30.0]]))[0].tolist()
+    box.apply_translation(eastings if way == "epsg" else [0, 0, 4])
+    settings = {
+        "epsg": {"epsg": 25832},
+        "epsg with offset": {"epsg": 25832, "offset_m": [*eastings[:2].tolist(), 0]},
+        "origin": {"origin_deg": [lon, lat]},
+    }[way]
+    box.export(tmp_path / "m.ply")
+    world, _ = located(tmp_path, meshes=[{"file": "m.ply", **settings}])
+    assert world.closed.all()
+    near = 0.5 if way == "epsg" else 1e-3  # PLY holds float32: at 5,600 km its last bit is half a metre
+    corners = np.array([[x, y] for x in (-2, 2) for y in (-3, 3)], dtype=float)
+    expected = np.add(corners, (20.0, 30.0))
+    if way == "origin":  # metres to the east and north of a place on the Earth: north is half a degree off the grid's
+        bearings_deg = np.degrees(np.arctan2(corners[:, 0], corners[:, 1]))
+        ends = pyproj.Geod(ellps="WGS84").fwd([lon] * 4, [lat] * 4, bearings_deg, np.hypot(*corners.T))
+        expected = FRAME.from_degrees(np.column_stack(ends[:2]))
+        assert np.abs(expected - corners - [20.0, 30.0]).max() > 0.01
+    found = np.unique(np.round(world.vertices_m[:, :2], 1 if way == "epsg" else 6), axis=0)
+    assert sorted(found.tolist()) == [pytest.approx(spot, abs=near) for spot in sorted(expected.tolist())]
+    assert [world.vertices_m[:, 2].min(), world.vertices_m[:, 2].max()] == pytest.approx([0, 8], abs=1e-6)
+
+
+def test_a_mesh_that_lies_elsewhere_is_refused(tmp_path):
+    box = trimesh.creation.box((4, 6, 8))
+    box.apply_translation([550_720, 5_635_230, 4])
+    box.export(tmp_path / "m.ply")
+    with pytest.raises(
+        InputError, match=r"m.ply: .*would lie beside it as eastings and northings of EPSG:32632; offset_m"
+    ):
+        located(tmp_path, meshes=[{"file": "m.ply"}])
+    with pytest.raises(InputError, match="epsg and origin_deg: a mesh is in one system"):
+        located(tmp_path, meshes=[{"file": "m.ply", "epsg": 25832, "origin_deg": [9, 51]}])
