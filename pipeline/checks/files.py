@@ -67,8 +67,8 @@ def measured(candidates: Iterable[Site]) -> Iterator[tuple[str, str]]:
 def digests(scenario: Scenario, candidates: Iterable[Site]) -> dict[str, str]:
     """Hash of every file that the check reads, ``ABSENT`` where it is not there.
 
-    Of a finished FCD file, of which it reads the head, the hash of that; of measured scans, which it does not open, only
-    whether they are there.
+    Of a finished FCD file, of which it reads the head, the hash of that; of measured scans, which it does not open,
+    only whether they are there.
     """
     found = {f"{key} = {name}": _digest(scenario, key, name) for key, name in named(scenario)}
     found |= {f"{key} = {name}": _presence(scenario, key, name) for key, name in measured(candidates)}
