@@ -8,17 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.artefacts import tables
-from pipeline.artefacts.readers import Tpog
 from pipeline.core.findings import Finding
 from pipeline.core.grid import Grid
-from pipeline.sensing.sites import Site
 from pipeline.world import limits
 from pipeline.world.mesh import World
+
+if TYPE_CHECKING:
+    from pipeline.artefacts.readers import Tpog
+    from pipeline.sensing.sites import Site
 
 
 def in_region(boxes: float, trajectories: Path) -> Iterator[Finding]:

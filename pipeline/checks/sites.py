@@ -79,7 +79,9 @@ def dropped(subject: Subject) -> Iterator[Finding]:
         why = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
         what = f"{len(gone)} of {len(gone) + len(subject.sites)} candidates are dropped, since no pole can stand there"
         place = "sites.grid" if subject.scenario.sites.grid is not None else "sites.along"
-        yield Finding("dropped candidates", place, f"{what} ({why})", "name a sensor on a gantry in a file of sites")
+        yield Finding(
+            "dropped candidates", place, f"{what} ({why})", "name a sensor on a gantry or an island in a file of sites"
+        )
 
 
 def _meets(subject: Subject, site: Site, sensor: Sensor) -> bool:

@@ -156,7 +156,7 @@ class SitesModel(StrictModel):
     along: tuple[SiteLine, ...] = ()
     only_free: bool = Field(
         True,
-        description="Drop those places of grid and along that stand in a lane or in a solid",
+        description="Drop those places of grid and along that stand in a lane, amid a junction or in a solid",
     )
     points: str | None = Field(
         None, description="A measured empty scan (PCD, PLY, LAS, LAZ, CSV; world frame) of the only site"

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.traffic.network import LANE_WIDTH_M, Lane, Network, Permission
+from pipeline.traffic.network import LANE_WIDTH_M, Lane, Network, Permission, Shape
 from pipeline.world import limits
 
 if TYPE_CHECKING:
@@ -45,10 +45,14 @@ class Carriageway:
         SUMO's id of each lane.
     lanes
         Their middle lines and widths.
+    junctions, corners
+        Outlines of junctions, and of the walking areas in them.
     """
 
     names: tuple[str, ...]
     lanes: tuple[Lane, ...]
+    junctions: tuple[Shape, ...] = ()
+    corners: tuple[Shape, ...] = ()
 
     @classmethod
     def of(cls, network: Network) -> Carriageway:
@@ -60,7 +64,10 @@ class Carriageway:
             for index, lane in enumerate(edge.lanes)
             if is_carriageway(lane.permission) and len(lane.shape_m) > 1
         ]
-        return cls(tuple(name for name, _ in found), tuple(lane for _, lane in found))
+        junctions = tuple(j for j in network.junctions if j.type != "internal" and len(j.shape_m) > 2)
+        walked = (lane for edge in network.all_edges if edge.function == "walkingarea" for lane in edge.lanes)
+        corners = tuple(lane for lane in walked if len(lane.shape_m) > 2)
+        return cls(tuple(name for name, _ in found), tuple(lane for _, lane in found), junctions, corners)
 
     @cached_property
     def areas(self) -> NDArray[Any]:
@@ -89,6 +96,16 @@ class Carriageway:
         for place, lane in sorted(zip(*self._tree.query(shapely.points(at_m), "intersects").tolist(), strict=True)):
             if found[place] is None:
                 found[place] = lane
+        return found
+
+    def in_junctions(self, at_m: Floats) -> NDArray[np.bool_]:
+        """Whether each place (n, 2) lies in a junction, deeper than at a kerb, and not where people walk."""
+        import shapely
+
+        inner = shapely.difference(
+            shapely.buffer(_outlines(self.junctions), -limits.LANE_INSET_M), shapely.union_all(_outlines(self.corners))
+        )
+        found: NDArray[np.bool_] = shapely.intersects(shapely.union_all(inner), shapely.points(at_m))
         return found
 
     def touching(self, shapes: Sequence[BaseGeometry] | NDArray[Any]) -> NDArray[np.int64]:
@@ -132,6 +149,14 @@ class Carriageway:
         share = np.clip(((at_m - start) * along).sum(axis=1) / length2, 0.0, 1.0)
         i = int(np.argmin(((start + share[:, None] * along - at_m) ** 2).sum(axis=1)))
         return float(line[i, 2] + share[i] * (line[i + 1, 2] - line[i, 2]))
+
+
+def _outlines(shapes: Sequence[Shape]) -> NDArray[Any]:
+    import shapely
+
+    rings = [shape.shape_m[:, :2] for shape in shapes]
+    outlines: NDArray[Any] = shapely.make_valid(np.array([shapely.Polygon(ring) for ring in rings], dtype=object))
+    return outlines
 
 
 def is_carriageway(permission: Permission) -> bool:

@@ -101,7 +101,7 @@ def test_a_rule_drops_places_in_lanes_and_solids_and_says_how_many(street: Path)
     checked = checking.check(pipeline.load(street))
     assert [str(finding) for finding in checked.findings] == [
         "sites.grid: 11 of 40 candidates are dropped, since no pole can stand there (10 in a lane, 1 in a solid);"
-        " name a sensor on a gantry in a file of sites"
+        " name a sensor on a gantry or an island in a file of sites"
     ]
     scene = pipeline.build_scene(pipeline.load(street))
     assert (len(scene.sites), checked.sites) == (29, 29)
@@ -109,6 +109,19 @@ def test_a_rule_drops_places_in_lanes_and_solids_and_says_how_many(street: Path)
     assert [(site.pose.position_m, why) for site, why in scene.dropped if site.pose.y_m > 4] == [
         ((16.0, 9.0, 3.0), "in a solid")
     ]
+
+
+def test_a_rule_drops_places_amid_a_junction_but_not_where_people_walk(street: Path) -> None:
+    """A junction of 8 x 8 m beside the lanes, its corner in the north-east a walking area of 2 x 2 m."""
+    area = '<edge id=":j_w0" function="walkingarea"><lane id=":j_w0_0" index="0" allow="pedestrian" length="2"'
+    corner = f'{area} width="2" shape="18,-6 20,-6 20,-8 18,-8"/></edge>'
+    shape = 'shape="12,-6 20,-6 20,-14 12,-14"'
+    junction = f'<junction id="j" type="priority" x="16" y="-10" incLanes="east_1" {shape}/>'
+    (street / "net.net.xml").write_text(net_xml(f"{LANES}{corner}{junction}"))
+    rule(street, "{ low_m=[11,-15], high_m=[19,-7], spacing_m=2, heights_m=[3.0] }")
+    scene = pipeline.build_scene(pipeline.load(street))
+    dropped = {site.pose.position_m[:2] for site, why in scene.dropped if why == "in a junction"}
+    assert dropped == {(x, y) for x in (13, 15, 17, 19) for y in (-13, -11, -9, -7)} - {(19, -7)}
 
 
 def test_a_rule_may_keep_all_and_is_then_told_as_a_file_is(street: Path) -> None:
