@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -15,9 +14,8 @@ from pipeline.sensing import sites
 from pipeline.sensing.sites import Site
 from pipeline.traffic import sumo_folder
 
-FCD, UNOPENED = "traffic.fcd", "sites.points"
+UNOPENED = "sites.points"
 ABSENT = "absent"
-_HEAD_BYTES = 1 << 20
 
 
 def named(scenario: Scenario) -> Iterator[tuple[str, str]]:
@@ -67,8 +65,7 @@ def measured(candidates: Iterable[Site]) -> Iterator[tuple[str, str]]:
 def digests(scenario: Scenario, candidates: Iterable[Site]) -> dict[str, str]:
     """Hash of every file that the check reads, ``ABSENT`` where it is not there.
 
-    Of a finished FCD file, of which it reads the head, the hash of that; of measured scans, which it does not open,
-    only whether they are there.
+    Of measured scans, which it does not open, only whether they are there.
     """
     found = {f"{key} = {name}": _digest(scenario, key, name) for key, name in named(scenario)}
     found |= {f"{key} = {name}": _presence(scenario, key, name) for key, name in measured(candidates)}
@@ -85,13 +82,7 @@ def _digest(scenario: Scenario, key: str, name: str) -> str:
     presence = _presence(scenario, key, name)
     if presence == ABSENT or key == UNOPENED:
         return presence
-    path = scenario.find(name, key)
-    return _head_digest(path) if key == FCD else files.sha256_of(path)
-
-
-def _head_digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.sha256(file.read(_HEAD_BYTES)).hexdigest()
+    return files.sha256_of(scenario.find(name, key))
 
 
 def _presence(scenario: Scenario, key: str, name: str) -> str:

@@ -9,6 +9,7 @@ from pipeline.core.errors import InputError
 from pipeline.core.findings import Finding
 from pipeline.traffic import fcd, sumo, sumo_folder
 from pipeline.traffic.demand import trips
+from pipeline.traffic.finished import sizes, survey
 from pipeline.world import world_frame
 
 
@@ -30,6 +31,17 @@ def recorded_places(subject: Subject) -> Iterator[Finding]:
         refusals.unless_refused(
             "traffic", lambda: fcd.check_place(scenario.find(name, "traffic.fcd"), world_frame.of(scenario))
         )
+    yield from refusals.found
+
+
+def finished(subject: Subject) -> Iterator[Finding]:
+    """An error where a finished file does not hold the frames that are asked for, or vehicles of unknown size."""
+    scenario, refusals = subject.scenario, Refusals()
+    if scenario.traffic.fcd is None:
+        return
+    if (taken := refusals.unless_refused("traffic", lambda: survey.window(scenario))) is not None:
+        types = taken[1].types
+        refusals.unless_refused("traffic", lambda: sizes.check_types(scenario, types))
     yield from refusals.found
 
 

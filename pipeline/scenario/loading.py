@@ -128,7 +128,7 @@ def json_schema() -> str:
 
 def _left_behind(source: str) -> frozenset[str]:
     """The keys of another traffic that a new source of it does not take over."""
-    simulated = {"frames", "warmup_s"} if source == "fcd" else set()  # a finished file is taken whole
+    simulated = {"frames", "frame_period_s", "warmup_s"} if source == "fcd" else set()  # a finished file is taken whole
     return idle_beside(source) | {"routes"} | simulated
 
 

@@ -20,6 +20,7 @@ network = "a.net.xml"
 routes = ["a.rou.xml"]
 vehicles = 30
 warmup_s = 60
+frame_period_s = 0.25
 
 [[traffic.kinds]]
 name = "car"
@@ -62,7 +63,8 @@ def test_a_table_of_the_same_source_still_merges(tmp_path: Path) -> None:
 
 def test_a_finished_file_takes_the_place_of_a_network_and_of_what_it_alone_needed(tmp_path: Path) -> None:
     traffic = extended(tmp_path, '[traffic]\nfcd = "fcd.csv"\n').traffic
-    assert (traffic.network, traffic.fcd, traffic.warmup_s, traffic.frames) == (None, "fcd.csv", 0, None)
+    assert (traffic.network, traffic.fcd) == (None, "fcd.csv")
+    assert (traffic.warmup_s, traffic.frames, traffic.frame_period_s) == (0, None, 1.0)
     assert "vehicles" not in traffic.model_fields_set
     assert [kind.name for kind in traffic.kinds] == ["car"]  # its sizes
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -151,3 +152,27 @@ def test_what_is_wrong_with_a_file_of_vtypes_is_said(
 def test_vtypes_act_on_a_finished_file_alone(mini: Path) -> None:
     with pytest.raises(InputError, match=r"vtypes.* would act on nothing beside network"):
         pipeline.load(mini, ["traffic.network=n.net.xml", 'traffic.vtypes=["x.xml"]'])
+
+
+# ---- before anything is made
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("traffic.frames=400", r"frames = 400: the file has 40 frames 0\.5 s apart"),
+        ("traffic.frame_period_s=0.75", r"frame_period_s = 0\.75: the file's time steps are 0\.5 s apart"),
+        ("traffic.warmup_s=20", r"warmup_s = 20: fcd\.csv lasts 19\.5 s"),
+    ],
+)
+def test_what_a_file_does_not_hold_is_told_by_the_check(mini: Path, egvs, override: str, message: str) -> None:
+    code, said, _ = egvs("check", unsaid(mini), "--set", override)
+    assert code == 2
+    assert re.search(message, said)
+
+
+def test_sizes_are_missed_by_the_check(mini: Path, egvs) -> None:
+    retyped(mini, "tram", "car", "lorry", "DEFAULT_VEHTYPE")
+    code, said, _ = egvs("check", mini)
+    assert code == 2
+    assert "vehicle types 'lorry', 'tram' of fcd.csv have no known size" in said

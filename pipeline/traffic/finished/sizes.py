@@ -21,8 +21,8 @@ from pipeline.traffic import live, sumo, sumo_folder
 from pipeline.traffic.boxes import Size
 
 _SIZES = ("length", "width", "height")
-_SUMO_OWN = "DEFAULT_"
-"""What the types begin with that SUMO has without being told."""
+_SUMO_OWN = frozenset(f"DEFAULT_{what}TYPE" for what in ("VEH", "TAXI", "BIKE", "RAIL", "PED", "CONTAINER"))
+"""Types that SUMO has without being told."""
 
 _NETWORK = """\
 <net version="1.20">
@@ -50,21 +50,31 @@ def of_types(scenario: Scenario, types: Collection[str]) -> dict[str, Size]:
 
     InputError naming all types without a known size, or what is wrong with a file of vTypes.
     """
-    traffic, paths = scenario.traffic, files(scenario)
+    traffic, vtypes = scenario.traffic, check_types(scenario, types)
     sizes = kind_sizes(traffic.kinds)
-    if paths or any(name.startswith(_SUMO_OWN) and name not in sizes for name in types):
-        sizes |= _asked(list(_vtypes(paths))) | kind_sizes(traffic.own_kinds)
-    if missing := sorted(set(types) - set(sizes)):
-        many = len(missing) > 1
-        names = ", ".join(map(repr, missing))
-        known = ", ".join(sorted(name for name in sizes if not name.startswith(_SUMO_OWN)))
+    if vtypes or any(name not in sizes for name in types):
+        sizes |= _asked(vtypes) | kind_sizes(traffic.own_kinds)
+    return sizes
+
+
+def check_types(scenario: Scenario, types: Collection[str]) -> list[Element]:
+    r"""The ``<vType>``\ s of the scenario's files.
+
+    InputError naming all ``types`` that neither these nor the scenario's kinds give a size, or what is wrong with a
+    file.
+    """
+    vtypes = list(_vtypes(files(scenario)))
+    known = {kind.name for kind in scenario.traffic.kinds} | {vtype.attrib["id"] for vtype in vtypes}
+    if missing := sorted(name for name in set(types) - known if name not in _SUMO_OWN):
+        each, have = ("each", "have") if len(missing) > 1 else ("that", "has")
         raise InputError(
             f"{sumo_folder.place_of(scenario)}.kinds",
-            f"vehicle type{'s' if many else ''} {names} of {traffic.fcd} {'have' if many else 'has'} no known size",
-            f"a kind of {'each' if many else 'that'} name with length_m, width_m and height_m, or the SUMO file with"
-            f" their <vType> in vtypes (known: {known})",
+            f"vehicle type{'s' * (len(missing) > 1)} {', '.join(map(repr, missing))} of {scenario.traffic.fcd} {have}"
+            " no known size",
+            f"a kind of {each} name with length_m, width_m and height_m, or the SUMO file with their <vType> in vtypes"
+            f" (known: {', '.join(sorted(known))})",
         )
-    return sizes
+    return vtypes
 
 
 def _vtypes(paths: Collection[Path]) -> Iterator[Element]:

@@ -12,14 +12,17 @@ import pyarrow.compute as pc
 from pipeline.core.errors import InputError
 from pipeline.scenario.models import Scenario
 from pipeline.traffic import fcd, sumo_folder
-from pipeline.traffic.frames import Window
+from pipeline.traffic.frames import Window, check_span
 
 
 @dataclass(frozen=True)
 class FcdSurvey:
-    """What a finished file holds: the time from its first row to its last, and the types of its vehicles."""
+    """What a finished file holds: the time from its first row to its last, its time steps, and their greatest common
+    divisor; the types of its vehicles."""
 
     lasts_ms: int
+    time_steps: int
+    step_ms: int
     types: frozenset[str]
 
 
@@ -29,9 +32,14 @@ def survey(path: Path, until_ms: int | None = None) -> FcdSurvey:
     InputError as :func:`pipeline.traffic.fcd.read`, and when it holds no vehicle.
     """
     first_ms, last_ms, types = None, 0, set[str]()
+    time_steps, step_ms = 1, 0
     for table in fcd.read(path):
         time_ms = table["time_ms"].to_numpy()
-        first_ms = int(time_ms[0]) if first_ms is None else first_ms
+        if first_ms is None:
+            first_ms = last_ms = int(time_ms[0])
+        steps = np.diff(time_ms, prepend=last_ms)
+        time_steps += int(np.count_nonzero(steps))
+        step_ms = int(np.gcd.reduce(steps, initial=step_ms))
         if until_ms is not None:
             table = table.slice(0, int(np.searchsorted(time_ms, first_ms + until_ms, side="right")))
         types.update(pc.unique(table["type"]).to_pylist())
@@ -40,13 +48,13 @@ def survey(path: Path, until_ms: int | None = None) -> FcdSurvey:
             break
     if first_ms is None:
         raise InputError(path, "holds no vehicle", fcd.RIGHT)
-    return FcdSurvey(last_ms - first_ms, frozenset(types))
+    return FcdSurvey(last_ms - first_ms, time_steps, step_ms, frozenset(types))
 
 
 def window(scenario: Scenario) -> tuple[Window, FcdSurvey]:
     """Which rows of a scenario's finished file are frames, and what the file holds as far as they reach.
 
-    InputError when the file ends before the first frame, or is no sound file.
+    InputError when the file does not hold these frames, or is no sound file.
     """
     traffic, place = scenario.traffic, sumo_folder.place_of(scenario)
     assert traffic.fcd is not None
@@ -59,7 +67,9 @@ def window(scenario: Scenario) -> tuple[Window, FcdSurvey]:
     if frames < 1:
         lasts = f"{path.name} lasts {found.lasts_ms / 1000:g} s"
         raise InputError(f"{place}.warmup_s = {traffic.warmup_s:g}", lasts, "a shorter warm-up")
-    return Window(frames, period_ms, skip_ms=skip_ms), found
+    wanted = Window(frames, period_ms, skip_ms=skip_ms)
+    check_span(wanted, found.lasts_ms - skip_ms, found.step_ms, found.time_steps, place)
+    return wanted, found
 
 
 @lru_cache(maxsize=4)
