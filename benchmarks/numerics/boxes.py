@@ -8,6 +8,7 @@ bound, the pair goes to 50-digit arithmetic. So every answer is certain, and onl
 
 from __future__ import annotations
 
+from fractions import Fraction
 from pathlib import Path
 
 import mpmath
@@ -18,12 +19,13 @@ import pipeline
 from benchmarks.numerics.row import Row
 from benchmarks.scenes import recorded_boxes
 from pipeline.artefacts.recorded_boxes import FrameBoxes
+from pipeline.core.grid import Grid
 from pipeline.kernels import boxes
 from pipeline.scoring.occupancy import count
 from tests.oracles import boxes as oracle
 
 ROOT = Path(__file__).resolve().parents[2]
-RULE = "depth > 1e-4 m"
+RULE = "depth > 0.1 mm + 1 nm"
 UNSURE_M = 1e-8
 
 _kernel = numba.njit(nogil=True, error_model="numpy", cache=True)
@@ -124,13 +126,13 @@ def compare(values, shape, voxel_m, doubtful, nearest):
 
 
 def check(values, shape, voxel_m):
-    """(pairs, asked, excluded, mismatches): voxel and box; settled in 50 digits; within 1e-9 m of the bound; wrong."""
+    """(pairs, asked, excluded, mismatches): voxel and box; settled in 50 digits; within 1e-10 m of the bound; wrong."""
     doubtful, nearest = np.empty((40 * len(values) + 100, 5), np.int64), np.empty(len(values))
     wrong, pairs, n = compare(values, np.asarray(shape, np.int64), voxel_m, doubtful, nearest)
     assert n <= len(doubtful)
     excluded = 0
     with mpmath.workdps(oracle.DIGITS):
-        bound, margin, voxel = mpmath.mpf(1) / 10**4, mpmath.mpf(1) / 10**9, mpmath.mpf(voxel_m)
+        bound, margin, voxel = mpmath.mpf(100001) / 10**9, mpmath.mpf(1) / 10**10, mpmath.mpf(voxel_m)
         for b, ix, iy, iz, said in doubtful[:n].tolist():
             exact = oracle.depth(*oracle.exact_box(values[b]), [ix * voxel, iy * voxel, iz * voxel], voxel) - bound
             if abs(exact) <= margin:
@@ -192,7 +194,7 @@ def hunt(case, make, seed, n, shape, voxel_m):
         done,
         excluded,
         wrong,
-        f"{excluded} pairs within 1e-9 m of the bound",
+        f"{excluded} pairs within 1e-10 m of the bound",
     )
 
 
@@ -235,6 +237,39 @@ def real(scale):
     ]
 
 
+def in_decimals(scale):
+    """Upright boxes whose sides lie on planes, or 0.1 mm before or behind one to the last digit, moved by tenths of a
+    metre, in voxels of 0.1, 0.2 and 0.3 m: each against fractions of the decimals."""
+    rng, n = np.random.default_rng(24), max(60, round(40_000 * scale))
+    shape, mismatches, on_bound, done = (7, 6, 5), 0, 0, 0
+    shrink = Fraction(100001, 10**9)
+    for _ in range(n):
+        tenths = int(rng.integers(1, 4))
+        voxel, moved = Fraction(tenths, 10), Fraction(int(rng.integers(-40_000, 40_000)), 10)
+        beside = rng.choice([0, 1, -1, 2, 1000], (2, 3))
+        low, high = np.sort(rng.integers(-2, np.array(shape) + 3, (2, 3)), axis=0)
+        sides = [
+            [tenths * int(k) * Fraction(1, 10) + int(b) * Fraction(1, 10**4) for k, b in zip(ks, bs, strict=True)]
+            for ks, bs in zip((low, high + 1), beside, strict=True)
+        ]
+        if min(b - a for a, b in zip(*sides, strict=True)) < Fraction(1, 100):
+            continue  # no box
+        done, on_bound = done + 1, on_bound + bool((np.abs(beside) == 1).any())
+        centre = [float((a + b) / 2 + moved) for a, b in zip(*sides, strict=True)]
+        size = [float(b - a) for a, b in zip(*sides, strict=True)]
+        grid = Grid((float(moved),) * 3, float(voxel), shape)
+        values = np.array([[*grid.to_grid_m(np.array(centre)), 0.0, 0.0, *size]])
+        expected = np.zeros(shape, np.int32)
+        spans = [
+            [i for i in range(count_) if a + shrink < (i + 1) * voxel and b - shrink > i * voxel]
+            for a, b, count_ in zip(*sides, shape, strict=True)
+        ]
+        expected[np.ix_(*spans)] = 1
+        mismatches += bool((count(FrameBoxes(np.zeros(1, np.int64), values), grid, 1) != expected).any())
+    told = f"fractions of the decimals; {on_bound} with a side on the bound of 0.1 mm"
+    return Row("boxes with sides on planes of 0.1 to 0.3 m, moved by tenths", RULE, told, done, 0, mismatches, "-")
+
+
 def rows(scale: float) -> list[Row]:
     """All hunts of the occupancy; scale 1 is the long run."""
 
@@ -245,5 +280,6 @@ def rows(scale: float) -> list[Row]:
         hunt("hostile boxes, 0.25 m", hostile, 21, some(500_000), (8, 7, 5), 0.25),
         hunt("hostile boxes, 0.1 m", hostile, 22, some(200_000), (9, 8, 7), 0.1),
         hunt("random vehicles", vehicles, 23, some(300_000), (24, 20, 12), 0.25),
+        in_decimals(scale),
         *real(scale),
     ]

@@ -16,6 +16,7 @@ import numpy as np
 
 import pipeline
 from benchmarks.numerics.row import Row
+from pipeline.core.grid import Grid
 from pipeline.kernels import march
 from pipeline.sensing.scanner import Scanner
 from tests.oracles import march as oracle
@@ -272,10 +273,10 @@ def beams_of(name):
     """(grid, [(site, o, d)]) of a shipped scene."""
     scenario = pipeline.load(ROOT / "scenarios" / name)
     scene, grid = pipeline.build_scene(scenario), scenario.roi.grid
-    scanner, found = Scanner(scene), []
-    for site in scene.sites:
-        o = grid.to_grid_m(np.asarray(site.pose.position_m)) / grid.voxel_m
-        found.append((site.name, o, np.ascontiguousarray(scanner.scan_site(site).rows.ends_m / grid.voxel_m)))
+    scanner = Scanner(scene)
+    found = [
+        (site.name, *grid.segments(site.pose.position_m, scanner.scan_site(site).rows.ends_m)) for site in scene.sites
+    ]
     return grid, found
 
 
@@ -338,6 +339,42 @@ def far_chords(scale):
     )
 
 
+def _tenths(at: np.ndarray) -> tuple[float, float, float]:
+    """Whole tenths of a metre as metres, each the float that its decimal is read as."""
+    x, y, z = (float(Fraction(int(c), 10)) for c in at)
+    return x, y, z
+
+
+def in_decimals(scale):
+    """Beams whose sites and ends lie on tenths of a metre, in voxels of 0.1, 0.2 and 0.3 m, moved by tenths.
+
+    Each beam is built twice, at the origin and moved by k * 0.1 m, from decimals that are rounded as a file's are; both
+    must cross the same voxels, and those that fractions of the decimals say."""
+    rng, n = np.random.default_rng(17), max(60, round(60_000 * scale))
+    shape, excluded, mismatches, in_plane = (12, 8, 5), 0, 0, 0
+    for _ in range(n):
+        tenths, size = int(rng.integers(1, 4)), np.array(shape)
+        low = rng.integers(-60, 60, 3)
+        start, end = (low + tenths * rng.integers(-2, size + 3) for _ in range(2))
+        end = np.where(rng.random(3) < 0.4, start, end)
+        beam_m = [float(Fraction(int(b - a), 10)) for a, b in zip(start, end, strict=True)]
+        noise = rng.choice([0.0, 0.0, 3e-17, -5e-16], 3)
+        found = []
+        for moved in (0, int(rng.integers(1, 40_000_000))):
+            origin, site = (_tenths(at + moved) for at in (low, start))
+            grid = Grid(origin, float(Fraction(tenths, 10)), shape)
+            o, d = grid.segments(site, np.array([beam_m]) + noise)
+            found.append(walk(o, d[0], shape, grid.voxel_m))
+        exact_o, exact_d = oracle.in_world(site, np.add(beam_m, noise).tolist(), origin, grid.voxel_m)
+        in_plane += any(c.denominator == 1 and not x for c, x in zip(exact_o, exact_d, strict=True))
+        doubtful = oracle.doubtful(exact_o, exact_d, shape, Fraction(tenths, 10))
+        excluded += bool(doubtful)
+        wrong = found[1] ^ oracle.crossed(exact_o, exact_d, shape, Fraction(tenths, 10))
+        mismatches += found[0] != found[1] or not wrong <= doubtful
+    told = f"fractions of the decimals, and the same moved by up to 4000 km; {in_plane} beams in a plane"
+    return Row("beams on tenths of a metre, voxels of 0.1 to 0.3 m", RULE, told, 2 * n, excluded, mismatches, "-")
+
+
 def rows(scale: float) -> list[Row]:
     """All hunts of the march; scale 1 is the long run."""
 
@@ -351,6 +388,7 @@ def rows(scale: float) -> list[Row]:
         hunt("random segments", uniform, 14, some(10_000_000), (40, 20, 10), 0.25),
         hunt("corners cut by 0.5 to 2 micrometres", near_the_bound, 15, some(20_000), (20, 20, 6), 0.25),
         far_chords(scale),
+        in_decimals(scale),
     ]
     for name in SCENES:
         found += shipped(name, scale)

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from pipeline.artefacts import tables
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Grid
-from pipeline.kernels.boxes import SHRINK_M
 
 COLUMNS = ("x_m", "y_m", "z_m", "yaw_rad", "pitch_rad", "length_m", "width_m", "height_m")
-SMALLEST_M = 10 * SHRINK_M
+SMALLEST_M = 1e-3
 """What is smaller than this is no box: it must stay one when it is made smaller on each side."""
 
 

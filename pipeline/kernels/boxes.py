@@ -27,8 +27,11 @@ import math
 import numba
 import numpy as np
 
-SHRINK_M = 1e-4
-"""An overlap up to this depth is no contact."""
+SHRINK_M = 1e-4 + 1e-9
+"""An overlap up to this depth is no contact: 0.1 mm, and 1 nanometre for what lies on that bound.
+
+Positions and sizes are decimals, so a side may lie 0.1 mm behind a plane to the last digit; it is no contact then,
+whatever binary numbers make of those decimals."""
 
 TINY = 1e-100
 """A cross product shorter than this is 0 but for products that vanish; any longer one, however rough, is a sound

@@ -175,14 +175,14 @@ def _shares(effect: Effect[Any], given: object, count: int, of: str) -> NDArray[
 def in_voxels(beams: Beams, grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
     """Sensor (3,), beams (n, 3) and shape (3,) as :mod:`pipeline.kernels.march` wants them; InputError for what no grid
     holds."""
-    place, ends_m = beams.place, beams.ends_m
-    o_m = grid.to_grid_m(np.array(beams.pose.position_m))
+    place, o_m = beams.place, grid.to_grid_m(np.array(beams.pose.position_m))
     with np.errstate(over="ignore"):
-        o, d = o_m / grid.voxel_m, ends_m / grid.voxel_m
-    if not (np.isfinite(o).all() and np.isfinite(d).all()):
+        finite = np.isfinite(o_m / grid.voxel_m).all()
+    o, d = grid.segments(beams.pose.position_m, beams.ends_m) if finite else (o_m, beams.ends_m)
+    if not (finite and np.isfinite(d).all()):
         raise InputError(place, "a beam with an end that is no number", "finite metres")
     if np.abs(o_m).max() > FARTHEST_M:
         raise InputError(place, f"stands {np.abs(o_m).max():g} m from the grid", f"within {FARTHEST_M:g} m")
-    if len(ends_m) > np.iinfo(np.uint32).max:
-        raise InputError(place, f"{len(ends_m)} beams", "fewer than 2**32")
+    if len(d) > np.iinfo(np.uint32).max:
+        raise InputError(place, f"{len(d)} beams", "fewer than 2**32")
     return o, d, np.asarray(grid.shape, dtype=np.int64)

@@ -58,7 +58,7 @@ class Crossings:
 def listed(position_m: tuple[float, float, float], ends_m: NDArray[np.float64], grid: Grid) -> Iterator[Crossings]:
     """All crossings of the beams of a sensor at ``position_m`` (world frame), a few thousand beams at a time."""
     sensor_m = grid.to_grid_m(np.array(position_m))
-    o = sensor_m / grid.voxel_m
+    o, d = grid.segments(position_m, ends_m)
     shape = np.asarray(grid.shape, dtype=np.int64)
     step = max(1, _ROOM // sum(grid.shape))
     for start in range(0, len(ends_m), step):
@@ -66,6 +66,6 @@ def listed(position_m: tuple[float, float, float], ends_m: NDArray[np.float64], 
         ends = ends_m[rows]
         first, room = np.empty(len(ends) + 1, dtype=np.int64), len(ends) * sum(grid.shape)
         cells, enter, leave = np.empty(room, dtype=np.int64), np.empty(room), np.empty(room)
-        kernels.crossings(o, ends / grid.voxel_m, shape, grid.voxel_m, first, cells, enter, leave)
+        kernels.crossings(o, d[rows], shape, grid.voxel_m, first, cells, enter, leave)
         total = int(first[-1])
         yield Crossings(sensor_m, grid, rows, first, ends, cells[:total], enter[:total], leave[:total])

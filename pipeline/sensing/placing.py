@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core.errors import InputError
+from pipeline.core.grid import ON_PLANE_M
 from pipeline.kernels import rays, solids
 from pipeline.sensing.scene import Scene
 from pipeline.sensing.sensors import Sensor
@@ -29,7 +30,7 @@ def check(scene: Scene, pose: Pose, sensor: Sensor, place: str) -> None:
         np.subtract(pose.position_m, np.add(roi.origin_m, roi.size_m)),
     )
     far_m = float(np.sqrt((np.maximum(np.maximum(below, above), 0.0) ** 2).sum()))
-    if far_m > sensor.range_m:
+    if far_m > sensor.range_m + ON_PLANE_M:
         raise InputError(
             place,
             f"stands {far_m:.1f} m from the region of interest",

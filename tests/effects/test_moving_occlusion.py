@@ -34,7 +34,7 @@ ALL = "effects.moving_occlusion.frames=all"
 INDEPENDENT = "effects.moving_occlusion.method=independent"
 GRID = Grid.over(Roi((0.0, -5.0, 0.0), (20.0, 10.0, 5.0)), 0.5)
 WIDE = Grid.over(Roi((0.0, 0.0, 0.0), (80.0, 80.0, 80.0)), 1.0)
-SHRINK, CHORD = 1e-4, 1e-6
+SHRINK, CHORD = 1e-4 + 1e-9, 1e-6
 
 
 # The twin

@@ -479,7 +479,7 @@ def test_the_touching_rule_fails_where_the_0_1_mm_rule_holds(real):
     frame, values, grid = real
     few = (frame < 3) & occupancy.near_grid(values, grid)
     frame, values = frame[few], values[few]
-    for kernels, changes in ((with_fault(), False), (with_fault(("SHRINK_M = 1e-4", "SHRINK_M = 0.0")), True)):
+    for kernels, changes in ((with_fault(), False), (with_fault(("SHRINK_M = 1e-4 + 1e-9", "SHRINK_M = 0.0")), True)):
         before = counted_by(kernels, frame, values, grid.shape, grid.voxel_m)
         moved = [counted_by(kernels, frame, values + nudge, grid.shape, grid.voxel_m) for nudge in NUDGES]
         assert any(not np.array_equal(before, after) for after in moved) == changes
@@ -487,8 +487,8 @@ def test_the_touching_rule_fails_where_the_0_1_mm_rule_holds(real):
 
 FAULTS = {
     "none": (),
-    "not shrunk": (("SHRINK_M = 1e-4", "SHRINK_M = 0.0"),),
-    "shrunk by 1 mm": (("SHRINK_M = 1e-4", "SHRINK_M = 1e-3"),),
+    "not shrunk": (("SHRINK_M = 1e-4 + 1e-9", "SHRINK_M = 0.0"),),
+    "shrunk by 1 mm": (("SHRINK_M = 1e-4 + 1e-9", "SHRINK_M = 1e-3"),),
     "wrong sign of yaw": (("axes_of(boxes[b, 3], pitch, axes)", "axes_of(-boxes[b, 3], pitch, axes)"),),
     "wrong sign of pitch": (("axes_of(boxes[b, 3], pitch, axes)", "axes_of(boxes[b, 3], -pitch, axes)"),),
     "whole sizes for half sizes": (("0.5 * boxes[b, 5 + a]", "boxes[b, 5 + a]"),),

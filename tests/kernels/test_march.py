@@ -481,7 +481,7 @@ def test_a_fault_in_the_march_shows_in_the_corpus(fault):
     shown = []
     for entry in SOUND:
         start, beam, origin, voxel_m, shape = of_entry(entry)
-        o, d = converted(start, beam, origin, voxel_m, shape)
+        o, d = np.subtract(start, origin) / voxel_m, np.array(beam) / voxel_m  # not moved to planes: more hostile
         try:
             with np.errstate(all="ignore"):
                 wrong = set(listed(faulty, o, d, shape, voxel_m)) ^ oracle.crossed(o, d, shape, voxel_m)

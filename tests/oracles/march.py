@@ -6,22 +6,39 @@ start ``o``, extent ``d``, both given as floats or fractions; shares of the segm
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from decimal import Decimal
 from fractions import Fraction
 
 Number = float | Fraction
 Voxel = tuple[int, int, int]
 
 CHORD_M = Fraction(1, 10**6)
+ON_PLANE_M = Fraction(1, 10**9)
 MARGIN_M = Fraction(1, 10**8)
 ZERO, ONE = Fraction(0), Fraction(1)
 
 
 def in_world(site_m: Sequence[float], beam_m: Sequence[float], origin_m: Sequence[float], voxel_m: float):
-    """Start and extent in voxel units of a beam that is given in the world frame, without rounding."""
-    size = Fraction(voxel_m)
-    o = [(Fraction(s) - Fraction(z)) / size for s, z in zip(site_m, origin_m, strict=True)]
-    return o, [Fraction(b) / size for b in beam_m]
+    """Start and extent in voxel units of a beam that is given in the world frame, without rounding.
+
+    Site, origin and voxel are the decimals that a person writes; the beam's end was computed. What is within 1 nm of a
+    plane lies on it: a site, and a beam along an axis on which it stands so."""
+    size = decimal(voxel_m)
+    start, extent = [], []
+    for s, b, z in zip(site_m, beam_m, origin_m, strict=True):
+        at = (decimal(s) - decimal(z)) / size
+        on_plane = min(at - at // 1, at // 1 + 1 - at) * size <= ON_PLANE_M
+        start.append(Fraction(math.floor(at + Fraction(1, 2))) if on_plane else at)
+        flat = start[-1].denominator == 1 and abs(Fraction(b)) <= ON_PLANE_M
+        extent.append(ZERO if flat else Fraction(b) / Fraction(voxel_m))
+    return start, extent
+
+
+def decimal(value: float) -> Fraction:
+    """The shortest decimal that stands for a float."""
+    return Fraction(Decimal(repr(float(value))))
 
 
 def slabs(o: Number, d: Number, n: int, grow: Fraction = ZERO) -> list[tuple[int, Fraction, Fraction]]:
