@@ -18,7 +18,7 @@ from pydantic import ValidationError
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Grid
 from pipeline.scenario.messages import explain
-from pipeline.scenario.models import FILE, SITE_SOURCES, Scenario
+from pipeline.scenario.models import FILE, SITE_DIRECTIONS, SITE_SOURCES, Scenario
 from pipeline.scenario.traffic import SOURCES, idle_beside
 
 
@@ -72,20 +72,22 @@ def _read(file: Path, heirs: tuple[Path, ...]) -> dict[str, Any]:
     return _merged(_making_way(below, values), values)
 
 
-_SOURCES = {"traffic": SOURCES, "sites": SITE_SOURCES}
+_OF_SITES = ("points", "only_free", "heights_m")
+_ALTERNATIVES = (("traffic", SOURCES), ("sites", SITE_SOURCES), ("sites", SITE_DIRECTIONS))
 
 
 def _making_way(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
-    """``below`` without the sources of traffic and sites that ``above`` replaces by others, and what hangs on them."""
+    """``below`` without the sources of traffic and sites, and the directions of sensors, that ``above`` replaces by
+    others, and what hangs on them."""
     left = dict(below)
-    for table, sources in _SOURCES.items():
-        old, new = below.get(table), above.get(table)
+    for table, sources in _ALTERNATIVES:
+        old, new = left.get(table), above.get(table)
         if not isinstance(old, dict) or not isinstance(new, dict):
             continue
         source = next((key for key in sources if key in new), None)
         if source is None or all(key in new for key in sources if key in old):
             continue
-        idle = _left_behind(source) if table == "traffic" else {"points", "only_free"}
+        idle = _left_behind(source) if table == "traffic" else _OF_SITES if source in SITE_SOURCES else ()
         left[table] = {key: value for key, value in old.items() if key not in idle and key not in sources}
     return left
 

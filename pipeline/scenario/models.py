@@ -142,6 +142,9 @@ class SiteLine(StrictModel):
     heights_m: tuple[Positive, ...] = Field(min_length=1)
 
 
+SITE_DIRECTIONS = ("aim", "aim_m", "yaw_deg")
+"""Keys that say where sensors look; at most one can hold."""
+
 SITE_SOURCES = ("file", "grid", "along")
 """Keys that say where candidate sites come from; a scenario has one of them."""
 
@@ -193,7 +196,7 @@ class SitesModel(StrictModel):
 
     @model_validator(mode="after")
     def _one_direction(self) -> SitesModel:
-        given = [key for key in ("aim", "aim_m", "yaw_deg") if getattr(self, key) is not None]
+        given = [key for key in SITE_DIRECTIONS if getattr(self, key) is not None]
         if len(given) > 1:
             raise ValueError(f"at most one of aim, aim_m and yaw_deg can hold, found {' and '.join(given)}")
         for key in ("heights_m", "pitch_deg"):

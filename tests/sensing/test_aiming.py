@@ -227,8 +227,6 @@ def test_what_is_wrong_with_an_aim_is_said(mini: Path, rows: str, keys: dict[str
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ({"aim": "roi", "aim_m": "[1, 2]"}, "at most one of aim, aim_m and yaw_deg can hold, found aim and aim_m"),
-        ({"aim": "roi", "yaw_deg": "0"}, "found aim and yaw_deg"),
         ({"aim": "junction"}, r"sites\.aim: 'junction'.*'roi'"),
         ({"aim_m": "[1]"}, r"sites\.aim_m"),
         ({"pitch_deg": "[]"}, r"pitch_deg = \[\] leaves no candidate"),
@@ -241,6 +239,28 @@ def test_what_is_wrong_with_an_aim_is_said(mini: Path, rows: str, keys: dict[str
 def test_senseless_keys_are_refused(mini: Path, keys: dict[str, str], message: str) -> None:
     with pytest.raises(InputError, match=message):
         of(mini, **keys)
+
+
+@pytest.mark.parametrize(("other", "found"), [("aim_m = [1, 2]", "aim and aim_m"), ("yaw_deg = 0", "aim and yaw_deg")])
+def test_two_directions_at_once_are_refused(mini: Path, other: str, found: str) -> None:
+    path = mini / "scenario.toml"
+    path.write_text(path.read_text().replace('sensor = "small"\n', f'sensor = "small"\naim = "roi"\n{other}\n'))
+    with pytest.raises(InputError, match=f"at most one of aim, aim_m and yaw_deg can hold, found {found}"):
+        pipeline.load(mini)
+
+
+def test_a_new_direction_takes_the_place_of_the_old_one(mini: Path) -> None:
+    """As a new source does: in --set, and in a scenario that extends another."""
+    path = mini / "scenario.toml"
+    path.write_text(path.read_text().replace('sensor = "small"\n', 'sensor = "small"\naim = "roi"\nheights_m = [3]\n'))
+    (mini / "sites.csv").write_text("site,x_m,y_m\np,0,0\n")
+    assert of(mini, aim_m="[0, 9]")[0].pose.yaw_deg == 90
+    assert angles(of(mini, yaw_deg="30")) == [("p", 3, 30, 0)]
+    heir = mini.parent / "heir"
+    heir.mkdir()
+    rule = "[sites.grid]\nlow_m = [0, 0]\nhigh_m = [0, 0]\nspacing_m = 1\nheights_m = [5]\n"
+    (heir / "scenario.toml").write_text(f'extends = "../mini"\n[sites]\nyaw_deg = -45\n{rule}')
+    assert angles(sites.of(pipeline.load(heir))) == [("g01", 5, -45, 0)]
 
 
 def test_heights_beside_a_rule_are_refused(mini: Path) -> None:
