@@ -28,7 +28,7 @@ from pipeline.scenario.traffic import CountModel
 from pipeline.traffic.network import Edge
 
 PER_LANE_H = {
-    "motorway": 600.0, "trunk": 500.0, "primary": 300.0, "secondary": 250.0, "tertiary": 150.0, "unclassified": 60.0,
+    "motorway": 600.0, "trunk": 400.0, "primary": 250.0, "secondary": 200.0, "tertiary": 150.0, "unclassified": 60.0,
     "residential": 40.0, "living_street": 20.0, "service": 10.0,
 }  # fmt: skip
 """Vehicles an hour and lane by OpenStreetMap's class of road, on an ordinary day outside the peaks.

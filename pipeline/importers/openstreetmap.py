@@ -41,22 +41,18 @@ from pipeline.scenario.loading import load
 from pipeline.scenario.models import FILE, RoiModel, ScoreModel
 from pipeline.scenario.traffic import FRAMES, WARMUP_S, CountModel, TrafficModel
 from pipeline.scenario.types import Name
-from pipeline.traffic import sumo
+from pipeline.traffic import sumo, sumo_folder
 
 ATTRIBUTION = "(c) OpenStreetMap contributors, ODbL"
 NETWORK, STATICS, SITES = "network.net.xml", "statics.geojson", "sites.csv"
 SENSOR = "VLP-32C"
 
 NETCONVERT = (
-    "--geometry.remove", "--junctions.join", "--tls.guess-signals", "--tls.join",
+    "--geometry.remove", "--junctions.join", *sumo_folder.OSM_SIGNALS,
     "--keep-edges.by-vclass", "passenger,bus,truck", "--remove-edges.isolated",
     "--output.street-names", "--precision", "3",
 )  # fmt: skip
-"""How streets become a network.
-
-Measured on a town with 19 km of lanes: 50 and 80 vehicles are held for 5000 frames without grid-lock. Without
-turnarounds, or with larger junctions, there are more overlaps, and grid-locks.
-"""
+"""How streets become a network."""
 
 WALK = ("--sidewalks.guess", "--sidewalks.guess.max-speed", "28", "--crossings.guess")
 """Sidewalks, walking areas at their corners, and crossings between these.

@@ -19,6 +19,7 @@ from pathlib import Path
 
 from pipeline.artefacts import tables
 from pipeline.core import files
+from pipeline.core.findings import WARNINGS
 from pipeline.core.sumo_home import sumo_home
 from pipeline.effects import on_traffic, registry
 from pipeline.scenario.models import Scenario
@@ -89,7 +90,9 @@ def run(work: Workspace, inputs: StageInputs, traci: tuple[str, int] | None = No
         period_s, frames = recorded.window.period_ms / 1000.0, recorded.window.count
         file.describe(work.metadata(inputs, frames=frames, frame_period_s=period_s, sumo=inputs.more["sumo"]))
         summary = recorded.summary()
+        doubts = trajectories.doubts(tally, recorded, scenario.roi.box)
     result = tally.to_json(period_s) | ({} if summary is None else asdict(summary))
+    result[WARNINGS] = [*result.get(WARNINGS, []), *(finding.to_json() for finding in doubts)]
     if notes:
         result["notes"] = [*result.get("notes", []), *notes]
     return result | reports

@@ -25,11 +25,8 @@ from pipeline.core import files
 from pipeline.core.errors import InputError
 from pipeline.formats import safe_xml
 
-DEFAULT_SPEED_M_S = 13.89
-"""The speed limit of a lane where the network names none."""
-
-LANE_WIDTH_M = 3.2
-"""A lane's width where the network names none: SUMO's default."""
+LANE_WIDTH_M, DEFAULT_SPEED_M_S = 3.2, 13.89
+"""A lane's width and speed limit where the network names none: SUMO's defaults."""
 
 _TURNAROUNDS = ("t", "T")
 _HEIGHT = re.compile(rb'[" ][^", ]+,[^", ]+,[^", ]+[" ]')

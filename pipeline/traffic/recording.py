@@ -6,6 +6,7 @@ running; a finished file, of which nothing is promised.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
@@ -29,9 +30,21 @@ from pipeline.traffic.finished import sizes as finished_sizes
 from pipeline.traffic.finished import survey
 from pipeline.traffic.finished.sizes import kind_sizes
 from pipeline.traffic.frames import Window
-from pipeline.traffic.sumo_folder import COLLISIONS, CONFIG, DRIVEN, FCD, LOG, PERSONS, STOPS, Prepared, as_flags
+from pipeline.traffic.sumo_folder import (
+    COLLISIONS,
+    CONFIG,
+    DRIVEN,
+    FCD,
+    LOG,
+    PERSONS,
+    STATISTICS,
+    STOPS,
+    Prepared,
+    as_flags,
+)
 
 _LEAST_PATIENCE_S = 180.0
+_MOST_WAITING = 0.02
 
 
 @dataclass(frozen=True)
@@ -125,9 +138,10 @@ def _simulated(
     path, persons = folder / FCD, folder / PERSONS
     try:
         seconds, flags = round(simulate(prepared, progress), 3), as_flags(prepared.options | prepared.outputs)
-        summary = RecordingSummary(
-            sumo.version(), seconds, flags, _collisions(prepared), prepared.notes, *_met(scenario, prepared)
-        )
+        crashes = _collisions(prepared)
+        met, warnings = _met(scenario, prepared)
+        warnings += [*_crashed(crashes, scenario), *_waiting(prepared, scenario)]
+        summary = RecordingSummary(sumo.version(), seconds, flags, len(crashes), prepared.notes, met, warnings)
         yield Recording(
             fcd.read(path) if _has_rows(path) else (),
             prepared.timing.window(),
@@ -140,7 +154,7 @@ def _simulated(
             lambda: summary,
         )
     finally:
-        for written in (path, persons, folder / DRIVEN):
+        for written in (path, persons, folder / DRIVEN, folder / STATISTICS):
             written.unlink(missing_ok=True)
 
 
@@ -206,14 +220,39 @@ def type_sizes(prepared: Prepared) -> dict[str, Size]:
         return {name: live.ask_size(connection, name) for name in connection.vehicletype.getIDList()}
 
 
-def _collisions(prepared: Prepared) -> int:
-    """Different pairs of vehicles that SUMO saw collide while frames were recorded."""
-    pairs = {
-        (c.get("collider"), c.get("victim"))
-        for c in safe_xml.children(prepared.folder / COLLISIONS, "collisions")
-        if float(c.get("time", "0")) * 1000.0 >= prepared.timing.first_ms
-    }
-    return len(pairs)
+def _collisions(prepared: Prepared) -> dict[tuple[str, str], str]:
+    """Pairs of vehicles that SUMO saw collide while frames were recorded, and the lane where they did so first."""
+    pairs: dict[tuple[str, str], str] = {}
+    for c in safe_xml.children(prepared.folder / COLLISIONS, "collisions"):
+        if float(c.get("time", "0")) * 1000.0 >= prepared.timing.first_ms:
+            pairs.setdefault((c.get("collider", ""), c.get("victim", "")), c.get("lane", ""))
+    return pairs
+
+
+def _crashed(crashes: dict[tuple[str, str], str], scenario: Scenario) -> list[Finding]:
+    """A warning that vehicles collided, with the junctions and edges where most did."""
+    if not crashes:
+        return []
+    places = Counter(
+        f"junction {lane[1:].rsplit('_', 2)[0]}" if lane.startswith(":") else f"edge {lane.rpartition('_')[0]}"
+        for lane in crashes.values()
+    )
+    shown = ", ".join(f"{n} at {place}" for place, n in places.most_common(3))
+    found = f"{len(crashes)} pairs of vehicles collided, and drove on through each other: {shown}"
+    cure = "look at these places in sumo-gui: right of way, signals, how long the waiting room on a junction is"
+    return [Finding("collisions", sumo_folder.place_of(scenario), found, cure)]
+
+
+def _waiting(prepared: Prepared, scenario: Scenario) -> list[Finding]:
+    """A warning that many vehicles of a demand could not start for want of room."""
+    if prepared.vehicles is not None:
+        return []
+    (vehicles,) = (e for e in safe_xml.children(prepared.folder / STATISTICS, "statistics") if e.tag == "vehicles")
+    loaded, waiting = (int(vehicles.get(key, "0")) for key in ("loaded", "waiting"))
+    if waiting <= _MOST_WAITING * loaded:
+        return []
+    found = f"{waiting} of {loaded} vehicles could not start to the end: the streets where they start are full"
+    return [Finding("waiting", sumo_folder.place_of(scenario), found, "less demand there, or more lanes")]
 
 
 def _met(scenario: Scenario, prepared: Prepared) -> tuple[list[MetCount], list[Finding]]:
@@ -222,8 +261,8 @@ def _met(scenario: Scenario, prepared: Prepared) -> tuple[list[MetCount], list[F
         return [], []
     when = prepared.timing
     first_s, end_s = when.first_ms / 1000.0, (when.first_ms + when.frames * when.period_ms) / 1000.0
-    met = counts.met(scenario.traffic, prepared.folder / DRIVEN, first_s, end_s)
-    return met, counts.findings(met, (end_s - first_s) / 3600.0, sumo_folder.place_of(scenario))
+    passed = counts.met(scenario.traffic, prepared.folder / DRIVEN, first_s, end_s)
+    return passed, counts.findings(passed, (end_s - first_s) / 3600.0, sumo_folder.place_of(scenario))
 
 
 def _stopped_on_purpose(prepared: Prepared) -> set[str]:

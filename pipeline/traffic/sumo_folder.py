@@ -34,8 +34,8 @@ from pipeline.traffic.frames import Window
 
 CONFIG, NETWORK, TRIPS, VTYPES = "run.sumocfg", "network.net.xml", "trips.rou.xml", "vtypes.add.xml"
 FCD, COLLISIONS, STOPS, LOG = "fcd.csv", "collisions.xml", "stops.xml", "sumo.log"
-DRIVEN = "driven.rou.xml"
-"""Who left which edge when; only where vehicles were counted."""
+STATISTICS, DRIVEN = "statistics.xml", "driven.rou.xml"
+"""What SUMO adds up itself where nothing is held; who left which edge when, where vehicles were counted."""
 OTHERS, PERSONS, MAP = "others.rou.xml", "persons.csv", "map.osm.xml"
 """Route file of an extension (those of further ones count up), and what SUMO records of persons."""
 
@@ -49,10 +49,16 @@ _LEFT_OUT = {
 }  # fmt: skip
 _LEFT_OUT_STARTS = ("save-", "gui-", "osg-", "device.fcd.", "summary", "game.")
 _TRUE = {"true", "1", "yes", "on", "t", "x"}
-_OSM_FLAGS = (
-    "--geometry.remove", "--junctions.join", "--tls.guess-signals", "--tls.join", "--sidewalks.guess",
-    "--crossings.guess",
+OSM_SIGNALS = (
+    "--tls.guess-signals", "--tls.join", "--tls.default-type", "actuated", "--default.connection.cont-pos", "0",
 )  # fmt: skip
+"""Signals and right of way on a network made from OpenStreetMap.
+
+Signals stay green while vehicles come; who has to give way waits at the stop line, not on the junction. Measured on a
+town with 50 drawn vehicles, 1000 s: with netconvert's fixed programs gridlock in two seeds of two, with these none.
+"""
+
+_OSM_FLAGS = ("--geometry.remove", "--junctions.join", *OSM_SIGNALS, "--sidewalks.guess", "--crossings.guess")
 FCD_DIGITS = 8
 """Decimals that SUMO writes."""
 
@@ -242,6 +248,8 @@ class Prepared:
         }
         if self.adds_traffic or not self.drawn:  # else SUMO writes a user's persons among the vehicles
             wanted |= {"person-fcd-output": PERSONS}
+        if self.vehicles is None:
+            wanted |= {"statistic-output": STATISTICS}
         if self.counted:
             wanted |= {"vehroute-output": DRIVEN, "vehroute-output.exit-times": "true",
                        "vehroute-output.write-unfinished": "true"}  # fmt: skip
@@ -331,7 +339,10 @@ def _draw(
 
 def _copies(given: Sources, folder: Path, others: Iterable[str]) -> dict[str, str]:
     """Copy every file into the folder, so that it can be moved and opened elsewhere; ``others`` are taken names."""
-    taken, values = {CONFIG, TRIPS, VTYPES, FCD, COLLISIONS, STOPS, LOG, OTHERS, PERSONS, MAP, DRIVEN, *others}, {}
+    taken, values = (
+        {CONFIG, TRIPS, VTYPES, FCD, COLLISIONS, STOPS, LOG, OTHERS, PERSONS, MAP, STATISTICS, DRIVEN, *others},
+        {},
+    )
     for option, paths in given.files.items():
         names = []
         for path in paths:

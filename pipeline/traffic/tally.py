@@ -6,6 +6,7 @@ World frame, metres, metres per second. Vehicles that stand are followed from gr
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Set
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,6 +17,9 @@ from pipeline.traffic.boxes import Ints, VehicleBoxes
 
 STANDING_M_S = 0.1
 """A vehicle slower than this stands."""
+
+SQUARE_M = 20.0
+"""Overlaps are located to squares of this side."""
 
 _SHRINK_M = 1e-3
 _MOST_CELLS = 2**20
@@ -96,6 +100,15 @@ class Presence:
         return {"fewest": int(n.min()), "most": int(n.max()), "mean": mean, "different": different}
 
 
+@dataclass(frozen=True)
+class Stand:
+    """A vehicle that stands: for how many frames, and where."""
+
+    frames: int
+    vehicle: str
+    at_m: tuple[float, float]
+
+
 @dataclass
 class TrafficTally:
     """Adds up a recording group by group."""
@@ -110,6 +123,11 @@ class TrafficTally:
     overlapping_pairs: int = 0
     frames_with_overlap: int = 0
     longest_standing_frames: int = 0
+    on_purpose: Set[str] = frozenset()
+    """Vehicles that may stand where they like; their stands count, but none of them is the longest jam."""
+    longest_jam: Stand | None = None
+    overlaps_at: Counter[tuple[int, int]] = field(default_factory=Counter)
+    """Overlapping pairs in squares of :data:`SQUARE_M`, by the square's number to the east and to the north."""
     stands_since: dict[str, int] = field(default_factory=dict)
     """Vehicles that stand in the last frame added, and the frame since when."""
     uncounted: dict[str, Presence] = field(default_factory=dict)
@@ -136,6 +154,9 @@ class TrafficTally:
         self.standing += int(np.count_nonzero(boxes.speed_m_s < STANDING_M_S))
         self.overlapping_pairs += len(pairs)
         self.frames_with_overlap += np.unique(boxes.frame[pairs[:, 0]]).size
+        first = pairs[:, 0]
+        squares = (np.floor(values[first] / SQUARE_M).astype(int).tolist() for values in (boxes.x_m, boxes.y_m))
+        self.overlaps_at.update(zip(*squares, strict=True))
 
     def _add_uncounted(
         self, boxes: VehicleBoxes, uncounted: NDArray[np.bool_], pairs: Ints
@@ -165,7 +186,11 @@ class TrafficTally:
             name, since = boxes.names[code[first]], int(frame[first])
             if since == boxes.first_frame:
                 since = self.stands_since.get(name, since)
-            self.longest_standing_frames = max(self.longest_standing_frames, int(frame[last]) - since)
+            lasts = int(frame[last]) - since
+            self.longest_standing_frames = max(self.longest_standing_frames, lasts)
+            if name not in self.on_purpose and (self.longest_jam is None or lasts > self.longest_jam.frames):
+                row = stands[last]
+                self.longest_jam = Stand(lasts, name, (float(boxes.x_m[row]), float(boxes.y_m[row])))
             if frame[last] == end - 1:
                 still[name] = since
         self.stands_since = still

@@ -7,11 +7,14 @@ metres, radians.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 from pipeline.artefacts.tables import TableWriter
 from pipeline.core.errors import RunError
+from pipeline.core.findings import Finding
+from pipeline.core.grid import Roi
 from pipeline.core.progress import Progress
 from pipeline.scenario.models import Scenario
 from pipeline.scenario.traffic import TrafficModel
@@ -19,7 +22,10 @@ from pipeline.traffic import boxes, frames
 from pipeline.traffic.extensions import BoxChange, TrafficExtension
 from pipeline.traffic.frames import FrameGroup
 from pipeline.traffic.recording import Recording
-from pipeline.traffic.tally import TrafficTally
+from pipeline.traffic.tally import SQUARE_M, TrafficTally
+
+MOST_OVERLAPS = 0.05
+"""Share of frames with an overlap that SUMO's sublane model makes by itself: 0 to 5 % were measured."""
 
 GROUP_FRAMES = 500
 """Frames in a row group; fixed, so that the bytes do not depend on how the rows arrive."""
@@ -37,7 +43,8 @@ def write(
     InputError when a vehicle's size is unknown, or the file has too few frames; RunError when N vehicles are not held,
     or a vehicle stands without end.
     """
-    tally, period_s = TrafficTally(recording.window.count), recording.window.period_ms / 1000.0
+    tally = TrafficTally(recording.window.count, on_purpose=recording.stopped_on_purpose)
+    period_s = recording.window.period_ms / 1000.0
     changes: list[BoxChange] | None = None
     for group in _groups(recording):
         uncounted = frozenset[str]().union(*(extension.uncounted_types(recording.sizes) for extension in extensions))
@@ -74,6 +81,32 @@ def _check(traffic: TrafficModel, tally: TrafficTally, recording: Recording) -> 
         _check_held(recording.vehicles, tally, recording.place)
     if recording.patience_s is not None:
         _check_moving(tally, recording, recording.patience_s)
+
+
+def doubts(tally: TrafficTally, recording: Recording, roi: Roi) -> list[Finding]:
+    """What does not look like traffic: who stood too long, boxes that overlap too often; each with its place."""
+    found, period_s = [], recording.window.period_ms / 1000.0
+    stand, patience_s = tally.longest_jam, recording.patience_s
+    if stand is not None and patience_s is not None and (stood_s := stand.frames * period_s) > patience_s:
+        what = f"vehicle {stand.vehicle!r} stood there for {stood_s:g} s, longer than two turns of any signal"
+        cure = "look at the signals and connections of the network there, or let fewer vehicles in"
+        found.append(Finding("standing", f"{recording.place}: {where(stand.at_m, roi)}", what, cure))
+    share = tally.frames_with_overlap / tally.frames
+    if share > MOST_OVERLAPS:
+        (square, pairs), *_ = tally.overlaps_at.most_common(1)
+        at_m = ((square[0] + 0.5) * SQUARE_M, (square[1] + 0.5) * SQUARE_M)
+        what = f"vehicles overlap in {share:.0%} of the frames; {pairs} of {tally.overlapping_pairs} pairs do so there"
+        cure = "a larger junction, or signals in place of a right of way that vehicles take on it"
+        found.append(Finding("overlaps", f"{recording.place}: {where(at_m, roi)}", what, cure))
+    return found
+
+
+def where(at_m: tuple[float, float], roi: Roi) -> str:
+    """A place in the world frame, and how far from the region of interest it lies."""
+    low, size = roi.origin_m, roi.size_m
+    off_m = math.hypot(*(max(low[i] - at_m[i], at_m[i] - low[i] - size[i], 0.0) for i in (0, 1)))
+    beside = f"{off_m:.0f} m from the region of interest" if off_m else "in the region of interest"
+    return f"x {at_m[0]:.0f} m, y {at_m[1]:.0f} m ({beside})"
 
 
 def _check_held(vehicles: int, tally: TrafficTally, place: str) -> None:

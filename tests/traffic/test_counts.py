@@ -73,8 +73,9 @@ def test_the_same_seed_gives_the_same_traffic(cross, tmp_path):
 
 def test_counts_that_the_lanes_cannot_carry_are_told(cross, tmp_path):
     result = run_stage(traffic, counted(cross, [turn("left", "top", 9000)], frames=300), tmp_path)
-    (warning,) = result["warnings"]
-    assert warning["rule"] == "counts" and not warning["is_error"]
+    warning, waiting = result["warnings"]
+    assert (warning["rule"], waiting["rule"]) == ("counts", "waiting")
+    assert not warning["is_error"]
     assert re.search(r"1 of 1 counts are missed .*left0A0 to A0top0: \d+(\.\d)? for 9000", warning["found"])
 
 
