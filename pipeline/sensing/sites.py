@@ -140,7 +140,7 @@ def of(scenario: Scenario) -> tuple[Site, ...]:
         except InputError as error:
             refused.append(error)
     if refused:
-        raise FindingsError(Finding.of("sites", error) for error in refused)
+        raise FindingsError(_alike(refused))
     if not found:
         raise InputError(path, "holds no site", "at least one")
     if idle := aiming.idle_keys(scenario.sites, used):
@@ -155,6 +155,16 @@ def of(scenario: Scenario) -> tuple[Site, ...]:
                 f"{scenario.file}: score.keep_visibility", f"no site {name!r}", f"one of {', '.join(found)}, or 'all'"
             )
     return _with_points(tuple(found.values()), scenario)
+
+
+def _alike(refused: list[InputError]) -> Iterator[Finding]:
+    """One finding for each thing that is wrong; a misspelt column is so in every row."""
+    places: dict[tuple[str, str], list[str]] = {}
+    for error in refused:
+        places.setdefault((error.found, error.right), []).append(error.place)
+    for (found, right), (first, *others) in places.items():
+        place = f"{first} and {len(others)} more" if others else first
+        yield Finding.of("sites", InputError(place, found, right))
 
 
 def _with_points(sites: tuple[Site, ...], scenario: Scenario) -> tuple[Site, ...]:

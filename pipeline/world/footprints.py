@@ -21,6 +21,7 @@ import numpy as np
 from pipeline.core.errors import InputError
 from pipeline.core.findings import Finding
 from pipeline.formats.georeference import IN_WORLD, Georeference, Reading, coordinates_of, declared_by
+from pipeline.scenario.near_names import misspelt
 from pipeline.scenario.types import FARTHEST_M
 
 if TYPE_CHECKING:
@@ -28,6 +29,10 @@ if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
 
 _QUARTER_SIDES = 4  # a disc is a regular polygon of four times as many sides
+
+
+_SPELT = ("height_m", "base_m")
+"""Properties that count: what is nearly one of them must not be taken for a stranger."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +79,8 @@ def read_geojson(path: Path, world: Georeference) -> FootprintFile:
         properties = feature.get("properties") or {}
         name = str(_named(properties, "name", f"{path.stem}_{number}"))
         place = f"{place} ({name})"
+        if (odd := misspelt(properties, _SPELT)) is not None:
+            raise InputError(place, f"unknown property {odd[0]!r}", f"did you mean {odd[1]}?")
         height, base = _metres(properties, "height_m", place), _metres(properties, "base_m", place, 0.0)
         if not height > base:
             raise InputError(place, f"height_m = {height:g} with base_m = {base:g}", "a top above the underside")

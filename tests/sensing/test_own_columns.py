@@ -90,3 +90,23 @@ def test_names_of_ones_own_are_left_alone() -> None:
         misspelt(["fid", "owner", "note", "name", "side", "height", "street", "id", "tilt", "lamp", "type"], KNOWN)
         is None
     )
+
+
+def test_a_misspelt_column_is_told_once_for_all_rows(mini: Path, tmp_path: Path, egvs) -> None:
+    (mini / "sites.csv").write_text("site,x_m,y_m,z_m,yaw\na,10,12,3,90\nb,30.5,-12,3,90\nc,20,12,3,0\n")
+    code, _, said = egvs("run", mini, "--out", tmp_path)
+    assert code == 2
+    assert said.count("unknown column 'yaw'; did you mean yaw_deg?") == 1
+    assert "row a and 2 more: " in said
+
+
+@pytest.mark.parametrize(("name", "meant"), [("heigth_m", "height_m"), ("height", "height_m"), ("bse_m", "base_m")])
+def test_a_misspelt_height_of_a_footprint_is_told(mini: Path, tmp_path: Path, egvs, name: str, meant: str) -> None:
+    heights = {"height_m": 6, "base_m": 3, "building:levels": 2, "owner": "x"}
+    house = {"type": "Polygon", "coordinates": [[[14, 5], [18, 5], [18, 8], [14, 5]]]}
+    for spelt in (False, True):
+        own = {name if spelt and key == meant else key: value for key, value in heights.items()}
+        (mini / "statics.geojson").write_text(collection(feature(house, **own)))
+        code, _, said = egvs("run", mini, "--out", tmp_path)
+        assert code == (2 if spelt else 0), said
+    assert f"unknown property '{name}'; did you mean {meant}?" in said
