@@ -362,7 +362,7 @@ def test_the_command_line_lists_prunes_and_clears(done: tuple[pipeline.Scenario,
     code, printed, _ = egvs("store")
     assert code == 0
     assert {line.split()[0] for line in printed.splitlines()} == {"stage", *STAGES, f"{store}:"}
-    assert "6 entries" in printed and "of at most 10 GB" in printed
+    assert "7 entries" in printed and "of at most 10 GB" in printed
     assert "removed 0 entries" in egvs("store", "--prune")[1]
     largest = max(entry.bytes for entry in Store(store).entries())
     assert egvs("store", "--prune", "--max", f"{largest / 1e3}K")[0] == 0
