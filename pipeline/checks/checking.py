@@ -6,8 +6,8 @@ is simulated, cast or written.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
 
 from pipeline.checks import region, sensing, sites, solids, traffic
 from pipeline.checks.subject import Subject, build_world, gather
@@ -60,11 +60,18 @@ def check(scenario: Scenario, world_of: Callable[[Scenario], World] = build_worl
     """
     subject, refused = gather(scenario, world_of)
     found = [*refused, *(finding for rule in RULES for finding in rule(subject))]
-    told = {(finding.place, finding.found): finding for finding in reversed(found)}  # the first of equals stays
-    once = [finding for finding in found if told[finding.place, finding.found] is finding]
     return Checked(
-        tuple(sorted(once, key=lambda finding: not finding.is_error)),
+        tuple(sorted(_folded(found), key=lambda finding: not finding.is_error)),
         len(subject.sites),
         0 if subject.world is None else len(subject.world.solids),
         0 if subject.carriageway is None else len(subject.carriageway.lanes),
     )
+
+
+def _folded(found: Iterable[Finding]) -> Iterator[Finding]:
+    """Each finding once; those that say the same of several places as one, which names the first."""
+    places: dict[tuple[str, str, bool], dict[str, Finding]] = {}
+    for finding in found:
+        places.setdefault((finding.found, finding.cure, finding.is_error), {}).setdefault(finding.place, finding)
+    for first, *others in (list(alike.values()) for alike in places.values()):
+        yield replace(first, place=f"{first.place} and {len(others)} more") if others else first

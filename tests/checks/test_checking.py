@@ -315,6 +315,12 @@ def test_all_wrong_rows_of_a_sites_file_are_told_at_once(street: Path) -> None:
     }
 
 
+def test_what_is_the_same_of_many_sites_is_told_once(street: Path) -> None:
+    """An aim needs the sensor, so each row is refused for it."""
+    told = found(street, 'sites.sensor="smal"', 'sites.aim="roi"')
+    assert told == {"sites": ["sites.csv: row pole_a: sensor and 1 more: unknown sensor 'smal'"]}
+
+
 def test_files_that_are_not_there_or_have_no_reader(street: Path) -> None:
     (street / "sites.csv").write_text("site,x_m,y_m,z_m,points\na,10,12,3,gone.pcd\nb,12,12,3,scan.xyz\nc,14,12,3,\n")
     (street / "scan.xyz").write_text("")
