@@ -148,13 +148,17 @@ EFFECTS = {
 }
 
 
-@pytest.mark.parametrize("sensor", ["AT128", "Livox Tele-15", "small"])
+WINDOW = "{range_m = 100, elevations_deg = [-25, 5], channels = 16, azimuth_deg = [-60, 60], azimuth_step_deg = 1}"
+
+
+@pytest.mark.parametrize("sensor", ["window", "Livox Tele-15", "small"])
 def test_effects_act_on_every_kind_of_sensor(mini: Path, tmp_path: Path, sensor: str) -> None:
     """A score with an effect is another, and not 0: the sensors look at the region from 6 m up."""
     rows = "\n".join(f"{el},{az}" for el in range(-40, 0, 2) for az in range(-60, 60, 2))
     with_table(mini, f"elevation_deg,azimuth_deg\n{rows}\n")
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m,aim\np,-12,0,6,roi\n")
     scenario = [f'sites.sensor="{sensor}"', "score.standard_error=false", "roi.voxel_m=1.0", "score.gamma=inf"]
+    scenario += [f"sensors.window={WINDOW}"]
     plain = score(mini, scenario, tmp_path / "plain")
     assert plain > 0
     for name, value in EFFECTS.items():
