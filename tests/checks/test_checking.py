@@ -12,6 +12,7 @@ from pipeline.checks import checking
 from pipeline.core.errors import InputError
 from pipeline.core.findings import FindingsError
 from pipeline.stages import check
+from pipeline.traffic import sumo_folder
 from tests.checks.conftest import LANES, net_xml
 from tests.conftest import collection, feature
 from tests.stages import inputs_of
@@ -369,3 +370,25 @@ def test_what_the_check_reads_makes_it_again(street: Path) -> None:
         before = now
     (street / "scan.csv").unlink()
     assert key() != before
+
+
+def test_a_map_is_converted_once_for_all_who_ask(street: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The check, the rule of sites and the traffic all need the network of a map."""
+    calls = []
+
+    def netconvert(name: str, arguments: list[str], folder: Path) -> str:
+        calls.append(name)
+        (folder / arguments[-1]).write_text((street / "net.net.xml").read_text())
+        return ""
+
+    monkeypatch.setattr(sumo_folder.sumo, "run", netconvert)
+    (street / "map.osm").write_text("<osm/>")
+    rule(street, "{ low_m=[6,-6], high_m=[26,9], spacing_m=5, heights_m=[3.0] }")
+    scenario = pipeline.load(street, ['traffic.network="map.osm"'])
+    assert checking.check(scenario).lanes == 2
+    pipeline.build_scene(scenario)
+    sumo_folder.convert_osm(street / "map.osm", street / "again.net.xml")
+    assert (street / "again.net.xml").read_text() == (street / "net.net.xml").read_text()
+    (street / "map.osm").write_text("<osm> </osm>")
+    sumo_folder.roads(scenario)
+    assert calls == ["netconvert", "netconvert"]
