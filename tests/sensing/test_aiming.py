@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 
 import pipeline
 from pipeline.core.errors import InputError
+from pipeline.scenario.loading import from_values
 from pipeline.sensing import aiming, sensors, sites
 from pipeline.sensing.sensors import CATALOGUE, Sensor, rotation
 from pipeline.studies import measuring
@@ -150,6 +152,14 @@ def test_rules_take_pitches_and_aims(mini: Path) -> None:
         'sensor = "small"\n', f'sensor = "small"\n{rule}heights_m = [4, 6]\n'))  # fmt: skip
     found = sites.of(pipeline.load(mini))
     assert [site.name for site in found] == ["g01@4m+aim", "g01@4m+0deg", "g01@6m+aim", "g01@6m+0deg"]
+
+
+def test_what_a_run_records_gives_the_same_candidates(mini: Path) -> None:
+    """As `verify` reads it: every key is there, those that nobody gave as well."""
+    (mini / "sites.csv").write_text("site,x_m,y_m\nc01,10,12\nc02,30.5,-12\n")
+    scenario = pipeline.load(mini, ["sites.heights_m=[3, 4.5]", 'sites.pitch_deg=["aim", 0]', "sites.aim_m=[1, 2]"])
+    recorded = json.loads(json.dumps(scenario.model_dump(mode="json")))
+    assert sites.of(from_values(recorded, mini, "run.json")) == sites.of(scenario)
 
 
 def test_rows_at_one_place_share_a_pole(mini: Path) -> None:

@@ -312,7 +312,7 @@ def test_thinned_beams_are_weighted_up_without_a_cap_too(mini: Path, tmp_path: P
     assert np.abs(thin / whole - 1).max() < 0.1
 
 
-@pytest.mark.parametrize("sensor", ["VLP-32C", "OS1-64"])
+@pytest.mark.parametrize("sensor", ["VLP-32C", "OS1-64", "RS-M1"])
 def test_a_thinned_catalogue_sensor_has_the_beams_of_the_whole_one(mini: Path, sensor: str) -> None:
     from pipeline.sensing.sensors import CATALOGUE, resolve
 
