@@ -91,6 +91,7 @@ def test_what_drove_past_is_counted_by_edge_and_by_turn(tmp_path):
         + vehicle("fleet.3", "c a", "150 199.5")
         + vehicle("truck.0", "a b", "150 160")
         + vehicle("fleet.4", "a b", "200 210")  # too late
+        + '<person id="fleet.5" depart="0"><walk edges="a b" exitTimes="150 160"/></person>'
         + "</routes>"
     )
     wanted = [

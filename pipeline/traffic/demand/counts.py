@@ -145,6 +145,8 @@ def met(traffic: TrafficModel, routes: Path, first_s: float, end_s: float) -> li
     """What drove past each counted place between two times, from SUMO's ``--vehroute-output`` with exit times."""
     passed = [0] * len(traffic.counts)
     for vehicle in safe_xml.children(routes, "routes"):
+        if vehicle.tag != "vehicle":
+            continue  # a person
         group = vehicle.get("id", "").rpartition(".")[0]
         left_s = _exits(vehicle)
         for number, count in enumerate(traffic.counts):
