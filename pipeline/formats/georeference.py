@@ -34,7 +34,10 @@ NEAR_M, FAR_M, COUNTRY_M = 1_000.0, 10_000.0, 100_000.0
 
 _CLOSE_M, _SMALL_M, _SPREAD_DEG, _NUMBER_M = 0.01, 1.0, 5.0, 1e9
 _DIGITS_M, _DIGITS_DEG = 6, 9  # a micrometre, 0.1 mm: last bits of a machine's sines do not travel on
-_DECLARE = '"crs" in the file: "urn:ogc:def:crs:OGC:1.3:CRS84" for degrees, null for metres of the world frame'
+_DECLARE = (
+    '"crs" in the file: "urn:ogc:def:crs:OGC:1.3:CRS84" for degrees, "urn:ogc:def:crs:EPSG::..." for a projection,'
+    " null for metres of the world frame"
+)
 
 
 @dataclass(frozen=True)
@@ -195,7 +198,8 @@ class Georeference:
                 yield "degrees", self.frame.from_degrees(xy)
             if (np.abs(xy) <= (90.0, 180.0)).all():
                 yield "latitude and longitude, in the wrong order", self.frame.from_degrees(xy[:, ::-1])
-            yield f"eastings and northings of {self.frame.projection}", xy + np.asarray(self.frame.offset_m)
+            name = self.frame.projection if self.frame.projection.startswith("EPSG") else "the network's projection"
+            yield f"eastings and northings of {name}", xy + np.asarray(self.frame.offset_m)
 
 
 def declared_by(document: Mapping[str, Any], place: str) -> str | None:

@@ -270,6 +270,7 @@ def _geojson(mapped: Sequence[MappedSolid], counts: ImportCounts) -> str:
         "type": "FeatureCollection",
         "attribution": ATTRIBUTION,
         "frame": f"metres, x and y of {NETWORK}; not longitude and latitude",
+        "crs": None,
         "summary": counts.to_json(),
     }
     opening = json.dumps(head, indent=1, ensure_ascii=False).removesuffix("\n}")
