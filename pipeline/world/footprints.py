@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from shapely import Polygon
     from shapely.geometry.base import BaseGeometry
 
+_SLIVERS = 0.01  # of an area
 _QUARTER_SIDES = 4  # a disc is a regular polygon of four times as many sides
 
 
@@ -139,7 +140,11 @@ def polygons_of(
         shape = shape.buffer(radius, quad_segs=_QUARTER_SIDES, cap_style=cap)
     elif "Polygon" not in shape.geom_type:
         raise InputError(shape_place, f"is a {shape.geom_type}", "a Polygon, LineString or Point, or their Multi forms")
-    parts = [p for p in shapely.get_parts(_sound(shape, shape_place, mended)) if "Polygon" in p.geom_type]
+    parts = [
+        p
+        for p in shapely.get_parts(_sound(shape, shape_place, mended, reading.convert is not None))
+        if "Polygon" in p.geom_type
+    ]
     if not parts:
         raise InputError(shape_place, "encloses no area", "a polygon with three corners that are not in line")
     return parts
@@ -158,16 +163,26 @@ def _areas_alone(collection: BaseGeometry, mended: Counter[str]) -> BaseGeometry
     return shapely.MultiPolygon([area for part in areas for area in shapely.get_parts(part)])
 
 
-def _sound(shape: BaseGeometry, place: str, mended: Counter[str]) -> BaseGeometry:
-    """Mend what has one meaning only (doubled points, rings that touch themselves); refuse what has two."""
+def _barely_crosses(shape: BaseGeometry) -> bool:
+    """Whether what the crossing rings of an area turn over is next to nothing: slivers as wide as a last digit."""
+    import shapely
+
+    whole_m2 = shapely.make_valid(shape).area
+    return bool(abs(whole_m2 - shape.area) <= _SLIVERS * whole_m2)
+
+
+def _sound(shape: BaseGeometry, place: str, mended: Counter[str], may_be_rounded: bool) -> BaseGeometry:
+    """Mend what has one meaning only (doubled points, rings that touch themselves, or that cross where degrees were
+    rounded); refuse what has two."""
     import shapely
 
     if not shapely.is_valid(shape):
         reason = shapely.is_valid_reason(shape)
-        if not reason.startswith("Ring Self-intersection"):
+        touches = reason.startswith("Ring Self-intersection")
+        if not touches and not (may_be_rounded and _barely_crosses(shape)):
             raise InputError(place, f"is not a sound polygon ({reason})", "rings that do not cross, holes inside")
         shape = shapely.make_valid(shape)
-        mended["rings that touched themselves"] += 1
+        mended["rings that touched themselves" if touches else "rings that rounded degrees made cross"] += 1
     clean = shapely.remove_repeated_points(shape)
     if doubled := len(shapely.get_coordinates(shape)) - len(shapely.get_coordinates(clean)):
         mended["doubled points"] += doubled

@@ -76,7 +76,7 @@ class _Reader:
             return
         self._polygons += 1
         if kind == _INNER:
-            self._inner += self._areas(place, self._points(element, place))
+            self._inner += self._areas(place, self._points(element, place), element)
             return
         if is_underground(tags):
             self._leave_out("underground polygons", kind)
@@ -90,9 +90,9 @@ class _Reader:
         points = self._points(element, place)
         closed = points[0] == points[-1] or _is_filled(element)
         if len(set(points)) > 2 and closed and (solid.half_width_m is None or _is_filled(element)):
-            areas = self._areas(place, points)
+            areas = self._areas(place, points, element)
         elif solid.half_width_m is not None:
-            areas = self._strips(place, points, solid.half_width_m)
+            areas = self._strips(place, points, element, solid.half_width_m)
         else:
             self._leave_out("open lines", kind)
             self._open[kind] += 1
@@ -108,12 +108,15 @@ class _Reader:
         if solid is None or radius_m is None or x is None or y is None:
             self._leave_out("points", kind.partition(".")[0])
             return
-        at = self._in_world(place, _numbers(f"{x},{y}", place), is_geo)[0]
-        disc = polygons_of({"type": "Point", "coordinates": at}, {"radius_m": radius_m}, place, self._file.mended)
+        spots = _numbers(f"{x},{y}", place)
+        at, reading = spots[0], self._reading(place, spots, is_geo)
+        disc = polygons_of(
+            {"type": "Point", "coordinates": at}, {"radius_m": radius_m}, place, self._file.mended, reading
+        )
         base_m = self._add(place, name, kind, solid, disc, element, tags)
         if solid.is_tree and base_m > 0:
             properties = {"radius_m": TRUNK_RADIUS_M}
-            trunk = polygons_of({"type": "Point", "coordinates": at}, properties, place, self._file.mended)
+            trunk = polygons_of({"type": "Point", "coordinates": at}, properties, place, self._file.mended, reading)
             self._file.footprints.append(Footprint(f"{name}/trunk", "tree_trunk", trunk[0], 0.0, base_m))
 
     def _points(self, element: Element, place: str) -> list[tuple[float, float]]:
@@ -121,20 +124,23 @@ class _Reader:
         if len(points) < 2:
             right = "three points for an area, two for a line"
             raise InputError(f"{place}: shape", f"{element.get('shape')!r}", right)
-        return self._in_world(place, points, _is_geo(element))
+        return points
 
-    def _in_world(self, place: str, points: list[tuple[float, float]], is_geo: bool) -> list[tuple[float, float]]:
+    def _reading(self, place: str, points: list[tuple[float, float]], is_geo: bool) -> Reading:
         if (reading := self._readings[is_geo]) is None:
             raise self._world.unknown(place, "is in longitude and latitude", np.array(points))
-        return points if reading.convert is None else [(x, y) for x, y in reading.to_world(np.array(points)).tolist()]
+        return reading
 
-    def _areas(self, place: str, points: list[tuple[float, float]]) -> list[Polygon]:
+    def _areas(self, place: str, points: list[tuple[float, float]], element: Element) -> list[Polygon]:
         ring = {"type": "Polygon", "coordinates": [points if points[0] == points[-1] else [*points, points[0]]]}
-        return polygons_of(ring, {}, place, self._file.mended)
+        return polygons_of(ring, {}, place, self._file.mended, self._reading(place, points, _is_geo(element)))
 
-    def _strips(self, place: str, points: list[tuple[float, float]], half_width_m: float) -> list[Polygon]:
+    def _strips(
+        self, place: str, points: list[tuple[float, float]], element: Element, half_width_m: float
+    ) -> list[Polygon]:
         line = {"type": "LineString", "coordinates": points}
-        return polygons_of(line, {"radius_m": half_width_m}, place, self._file.mended)
+        reading = self._reading(place, points, _is_geo(element))
+        return polygons_of(line, {"radius_m": half_width_m}, place, self._file.mended, reading)
 
     def _add(
         self, place: str, name: str, kind: str, solid: SolidType, areas: list[Polygon], element: Element,

@@ -444,6 +444,21 @@ def test_lines_that_rounding_has_left_beside_a_polygon_are_counted(tmp_path):
     assert counts.mended == {"lines and points beside polygons, left out": 1}
 
 
+def test_rings_that_rounded_degrees_make_cross_are_mended_and_others_are_not(tmp_path):
+    """A notch of 1 cm is turned over by 6 digits of a degree; a bow-tie crosses whatever the digits."""
+    notched = [[0, 0], [4, 0], [4, 4], [2.01, 4], [2.0, -0.02], [1.99, 4], [0, 4], [0, 0]]
+    (tmp_path / "s.geojson").write_text(collection(polygon(FRAME.to_degrees(np.array(notched)).tolist())))
+    world, counts = located(tmp_path, footprints=["s.geojson"])
+    assert counts.mended["rings that rounded degrees made cross"] == 1
+    assert volumes(world).sum() == pytest.approx(80, rel=0.01)
+    with pytest.raises(InputError, match="is not a sound polygon"):
+        built(tmp_path, polygon(notched))
+    tie = FRAME.to_degrees(np.array([[0, 0], [4, 4], [4, 0], [0, 4], [0, 0]], dtype=float)).tolist()
+    (tmp_path / "s.geojson").write_text(collection(polygon(tie)))
+    with pytest.raises(InputError, match="is not a sound polygon"):
+        located(tmp_path, footprints=["s.geojson"])
+
+
 @pytest.mark.parametrize("way", ["epsg", "epsg with offset", "origin"])
 def test_a_mesh_may_be_in_a_system_of_its_own(tmp_path, way):
     box = trimesh.creation.box((4, 6, 8))
