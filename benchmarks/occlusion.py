@@ -24,9 +24,8 @@ from pipeline.artefacts.readers import read_tpog
 from pipeline.effects.score.moving_occlusion import read_replay
 from pipeline.scenario.effects import EffectsModel
 from pipeline.scenario.models import Scenario
-from pipeline.scoring.scorer import Scorer
+from pipeline.scoring.scorer import Scorer, ranks
 from pipeline.stages.base import Workspace
-from pipeline.stages.score import ranks
 from pipeline.stages.shared.scans import scans
 from pipeline.stages.shared.scene import scene_of
 

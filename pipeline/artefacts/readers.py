@@ -16,6 +16,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from pipeline.artefacts import tables
+from pipeline.artefacts.periods import PeriodBlocks, periods_of, times_of_blocks
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Grid
 from pipeline.kernels.crossings import accumulate
@@ -48,29 +49,56 @@ class Tpog:
         return self.counts / self.frames
 
 
-def read_tpog(path: str | Path) -> Tpog:
-    """Read ``tpog.parquet``; InputError when it is corrupt or a row lies outside the grid."""
+def read_tpog(path: str | Path, period: str | None = None) -> Tpog:
+    """Read ``tpog.parquet``: the mix of its periods, or one of them alone.
+
+    InputError when it is corrupt, a row lies outside the grid, or it has no such period.
+    """
     path = Path(path)
     with tables.reader(path, "tpog") as (file, about):
-        grid, frames = Grid.from_json(about["grid"]), int(about["frames"])
+        grid, periods = Grid.from_json(about["grid"]), periods_of(about, path)
+        names = [its.name for its in periods]
+        if period is not None and period not in names:
+            raise InputError(path, f"no period {period!r}", f"one of {', '.join(names)}")
+        frames = int(about["frames"]) if period is None else periods[names.index(period)].frames
+        times = times_of_blocks(periods, period)
         counts = np.zeros(int(np.prod(grid.shape)), dtype=np.int64)
         for group in range(file.num_row_groups):  # one block each: memory does not grow with their number
-            table = tables.read_group(file, group, path, ["ix", "iy", "iz", "count"])
+            table = tables.read_group(file, group, path)
             index = [table.column(name).to_numpy() for name in ("ix", "iy", "iz")]
             for axis, (values, size) in enumerate(zip(index, grid.shape, strict=True)):
                 if len(values) and not (values.min() >= 0 and values.max() < size):
                     raise InputError(path, f"i{'xyz'[axis]} leaves the grid", f"0 to {size - 1}")
             if len(table):
-                flat = np.ravel_multi_index(index, grid.shape)
-                accumulate(flat, table.column("count").to_numpy().astype(np.int64), counts)
+                flat, block = np.ravel_multi_index(index, grid.shape), block_numbers(table, path, len(times))
+                accumulate(flat, table.column("count").to_numpy().astype(np.int64) * times[block], counts)
     if counts.max(initial=0) > frames:
         raise InputError(path, f"a voxel is occupied in {counts.max()} of {frames} frames", "counts up to the frames")
     return Tpog(grid, frames, counts.reshape(grid.shape))
 
 
+def block_numbers(table: pa.Table, path: Path, blocks: int) -> NDArray[np.uint16]:
+    """The blocks of rows of a TPOG; InputError where there is no such block."""
+    block: NDArray[np.uint16] = table.column("block").to_numpy()
+    if block.max(initial=0) >= blocks:
+        raise InputError(path, f"block {block.max()} of {blocks}", f"0 to {blocks - 1}")
+    return block
+
+
+def read_periods(path: str | Path) -> tuple[PeriodBlocks, ...]:
+    """The periods of ``tpog.parquet``; one without a name where it has none."""
+    path = Path(path)
+    return periods_of(tables.read_metadata(path, "tpog"), path)
+
+
 def read_scores(path: str | Path) -> pa.Table:
     """Read ``scores.parquet``."""
     return tables.read(Path(path), "scores")[0]
+
+
+def read_scores_by_period(path: str | Path) -> pa.Table:
+    """Read ``scores_by_period.parquet``, which a run leaves where its traffic has periods."""
+    return tables.read(Path(path), "scores_by_period")[0]
 
 
 def read_trajectories(path: str | Path) -> pa.Table:

@@ -16,7 +16,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipeline.artefacts import schemas
+from pipeline.artefacts import periods, schemas
 from pipeline.core import files
 from pipeline.core.errors import InputError
 from pipeline.core.grid import MAX_VOXELS, Grid
@@ -143,7 +143,10 @@ def _metadata(path: Path, artefact: str, raw: bytes) -> dict[str, Any]:
         raise InputError(path, f"its metadata is {metadata!r}", right)
     if metadata.get("schema") != schemas.VERSION:
         raise InputError(path, f"schema version {metadata.get('schema')}", f"version {schemas.VERSION}")
-    for key in _PROMISED.get(artefact, ()):
+    promised = _PROMISED.get(artefact, ())
+    if artefact == "tpog" and "periods" in metadata:  # each has blocks of its own
+        promised = ("grid", "frames", "periods")
+    for key in promised:
         if not _is_sound(key, metadata.get(key)):
             raise InputError(path, f"its metadata says {key} = {metadata.get(key)!r}", right)
     return metadata
@@ -158,6 +161,8 @@ def _is_sound(key: str, value: Any) -> bool:
         return grid.voxel_m > 0 and min(grid.shape) > 0 and math.prod(grid.shape) <= MAX_VOXELS
     if key == "sites":
         return isinstance(value, list) and all(isinstance(s, dict) and all(k in s for k in _SITE) for s in value)
+    if key == "periods":
+        return periods.are_sound(value)
     if key == "inputs":
         return isinstance(value, str)
     if key == "stages":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +12,7 @@ from rich.table import Table
 from pipeline.artefacts.readers import SEPARABLE, read_scores
 from pipeline.artefacts.run_record import RunRecord
 from pipeline.cli.terminal import NARROW, WIDE, console, in_words, table, value_in_words
+from pipeline.report.by_period import PeriodRanking
 from pipeline.report.ranking import ScoredSite, poles_of
 
 if TYPE_CHECKING:
@@ -118,6 +119,21 @@ def print_new_scenario(made: NewScenario) -> None:
     out.print(f"next: egvs run {made.folder}", markup=False)
 
 
+def period_table(by_period: PeriodRanking, top: int | None = None) -> Table:
+    """The ``top`` sites (all by default) by their rank in the mix, with rank and share of the best in each period."""
+    names = ["mix", "site", *by_period.periods]
+    ranking = table(names, left=("site",), whole=[name for name in names if name != "site"])
+    weights = zip(by_period.periods, by_period.shares, strict=True)
+    ranking.caption = f"rank and share of the best in each period; in the mix: {', '.join(_weights(weights))}"
+    for site, rank, periods in by_period.sites[:top]:
+        ranking.add_row(str(rank), site, *(f"{its.rank} ({its.of_best:.1%})" for its in periods))
+    return ranking
+
+
+def _weights(weights: Iterable[tuple[str, float]]) -> list[str]:
+    return [f"{name} {share:.1%}" for name, share in weights]
+
+
 def _print_scores(out: Console, folder: Path, record: RunRecord, top: int | None) -> None:
     """The ranking of the ``top`` sites, the best of each pole, and the audit's worst case where there was one."""
     sites = ScoredSite.all_of(read_scores(folder / "scores.parquet"))
@@ -126,6 +142,9 @@ def _print_scores(out: Console, folder: Path, record: RunRecord, top: int | None
         out.print(f"... and {len(sites) - top} more: without --top, in {folder / 'scores.parquet'} or in the report")
     if len({site.pole for site in sites}) < len(sites):
         out.print(poles_table(sites, top))
+    by_period = PeriodRanking.read(folder)
+    if by_period is not None:
+        out.print(period_table(by_period, top))
     audit = record.stages["score"].summary.get("audit")
     if audit:
         out.print(

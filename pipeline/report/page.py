@@ -21,6 +21,7 @@ from pipeline.core import files
 from pipeline.core.findings import WARNINGS, warnings_of
 from pipeline.core.version import __version__
 from pipeline.report import figures, maps, wording
+from pipeline.report.by_period import PERIOD_SCORES, PeriodRanking
 from pipeline.report.colours import STYLE_SHEET
 from pipeline.report.figures import Figures
 from pipeline.report.ranking import Ranking, ScoredSite
@@ -64,7 +65,7 @@ def inputs(work: Workspace) -> StageInputs:
     else:
         cast = scan_inputs(work)
         settings["scan"], hashes = cast.settings, dict(cast.files)
-    hashes |= work.digests(*(name for name in (*read, *ACCURACY) if work.path(name).is_file()))
+    hashes |= work.digests(*(name for name in (*read, PERIOD_SCORES, *ACCURACY) if work.path(name).is_file()))
     if (roads := network_file(work.folder)) is not None:
         hashes[roads.relative_to(work.folder).as_posix()] = files.sha256_of(roads)
     # what a stage sums up is the same in every run, but for the seconds of SUMO, which are not shown
@@ -119,7 +120,7 @@ def run(work: Workspace, inputs: StageInputs) -> Summary:
     first, last = _listed(ranking)
     drawn = figures.draw(work, ranking, (*first, *last), tpog)
     work.progress("figures drawn", 2, 3)
-    html = page(work.scenario, ranking, tpog, drawn, stages, StudySummary.read(out, stages))
+    html = page(work.scenario, ranking, tpog, drawn, stages, StudySummary.read(out, stages), PeriodRanking.read(out))
     files.write_text(work.path(ARTEFACTS[0]), html)
     work.progress("page written", 3, 3)
     kilobytes = round(len(html.encode("utf-8")) / 1000)
@@ -133,6 +134,7 @@ def page(
     drawn: Figures,
     stages: Mapping[str, StageRecord],
     study: StudySummary | None,
+    by_period: PeriodRanking | None = None,
 ) -> str:
     """The whole page, HTML text; ``stages`` are those that are known, in the order of ``STAGES``."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -152,6 +154,7 @@ def page(
     sites, effects, gamma = ranking.sites, list(scenario.effects.named), scenario.score.gamma
     (first, last), has_traffic = _listed(ranking), bool(tpog.counts.any())
     seconds = [stage.cost.seconds for stage in stages.values()]
+    frames = tpog.frames if by_period is None else by_period.frames
     return environment.get_template("report.html.j2").render(
         scenario=scenario,
         ranking=ranking,
@@ -179,7 +182,9 @@ def page(
         choose=Markup((TEMPLATES / "choose.js").read_text(encoding="utf-8")),
         gamma="∞" if math.isinf(gamma) else f"{gamma:g}",
         uncapped=math.isinf(gamma),
-        watched=wording.duration(tpog.frames * scenario.traffic.frame_period_s),
+        by_period=by_period,
+        frames=frames,
+        watched=wording.duration(frames * scenario.traffic.frame_period_s),
         effects=effects,
         left_out=[what for what, effect in _LEFT_OUT if effect not in effects],
         warnings=warnings_of(stage.summary for stage in stages.values()),

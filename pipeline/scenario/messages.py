@@ -25,6 +25,8 @@ def _lines(error: ValidationError, model: type[BaseModel], above: tuple[str, ...
     for item in error.errors():
         key = ".".join(str(part) for part in (*above, *item["loc"]))
         context = item.get("ctx", {})
+        if item["type"] == "default_factory_not_called":
+            continue  # follows from another key that is wrong, which is told
         if item["type"] == "extra_forbidden":
             yield key, "unknown key", nearest_key(item["loc"], model)
         elif item["type"] == "missing":

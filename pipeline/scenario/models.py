@@ -13,6 +13,7 @@ from math import inf
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from pipeline.core.errors import InputError
@@ -252,10 +253,30 @@ class Scenario(StrictModel):
 
     @model_validator(mode="after")
     def _across(self) -> Scenario:
-        frames, blocks = self.traffic.frames, self.tpog.blocks
-        if frames is not None and frames % blocks:
-            raise ValueError(f"tpog.blocks = {blocks} does not divide traffic.frames = {frames}")
+        blocks = self.tpog.blocks
+        for period, traffic in self._traffic_by_period():
+            if traffic.frames is not None and traffic.frames % blocks:
+                of = f" of the period {period!r}" if period else ""
+                raise ValueError(f"tpog.blocks = {blocks} does not divide traffic.frames = {traffic.frames}{of}")
         return self
+
+    def _traffic_by_period(self) -> list[tuple[str, TrafficModel]]:
+        """The traffic of each period under its name; that of ``[traffic]`` under no name where there are none."""
+        periods = self.traffic.periods
+        return [(period.name, period.over(self.traffic)) for period in periods] or [("", self.traffic)]
+
+    def by_period(self) -> dict[str, Scenario]:
+        """A scenario for the traffic of each period alone, with a seed of its own, under the period's name; this one
+        under no name where it has none."""
+        if not self.traffic.periods:
+            return {"": self}
+        scenarios = {}
+        for number, (name, traffic) in enumerate(self._traffic_by_period()):
+            drawn = int(np.random.SeedSequence((self.seed, number)).generate_state(1, np.uint64)[0])
+            alone = self.model_copy(update={"traffic": traffic, "seed": drawn >> 1})
+            alone._folders = self._folders
+            scenarios[name] = alone
+        return scenarios
 
     @property
     def folder(self) -> Path:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from pipeline.core.strict_model import StrictModel
 from pipeline.scenario.types import Name, Positive
@@ -48,6 +48,43 @@ class CountModel(StrictModel):
         return self.edge or f"{self.from_edge} to {self.to_edge}"
 
 
+class PeriodModel(StrictModel):
+    """A part of the day with traffic of its own; a key that is not given is that of ``[traffic]``."""
+
+    name: Name = Field(description="Shown in results: morning, midday, evening, night")
+    weight: Positive = Field(1.0, description="Share of the mix, relative to the other periods: its hours, for example")
+    sumocfg: str | None = Field(None, description="Its own .sumocfg")
+    fcd: str | None = Field(None, description="Its own finished FCD file")
+    routes: tuple[str, ...] = Field((), description="Its own route files for the network")
+    counts: tuple[CountModel, ...] = Field((), description="Its own counted vehicles")
+    vehicles: int | None = Field(None, ge=1, description="Its own number of vehicles at all times")
+    begin_s: float | None = Field(None, ge=0, description="As traffic.begin_s")
+    length_s: Positive | None = Field(None, description="Time recorded, instead of traffic.frames")
+
+    def over(self, traffic: TrafficModel) -> TrafficModel:
+        """The traffic of this period alone; ValueError where the keys do not go together."""
+        values = {key: getattr(traffic, key) for key in traffic.model_fields_set - {"periods"}}
+        if source := next((key for key in ("sumocfg", "fcd") if getattr(self, key) is not None), None):
+            for key in (*SOURCES, "routes", "counts"):
+                values.pop(key, None)
+            values[source] = getattr(self, source)
+        own = {key: getattr(self, key) for key in ("routes", "counts", "vehicles", "begin_s")}
+        values |= {key: value for key, value in own.items() if value is not None and value != ()}
+        for given, other in (("routes", "counts"), ("counts", "routes")):
+            if own[given] and not own[other]:
+                values.pop(other, None)
+        if self.length_s is not None:
+            exact = self.length_s / traffic.frame_period_s
+            if abs(exact - round(exact)) > 1e-9 * exact:
+                period = f"{traffic.frame_period_s:g} s"
+                raise ValueError(f"period {self.name!r}: length_s = {self.length_s:g} is no whole number of {period}")
+            values["frames"] = round(exact)
+        try:
+            return TrafficModel(**values)
+        except ValidationError as error:
+            raise ValueError(f"period {self.name!r}: {error.errors()[0]['msg']}") from None
+
+
 _FLEET = (
     VehicleKind(name="car", share=0.78, length_m=4.5, width_m=1.75, height_m=1.5),
     VehicleKind(name="van", vclass="delivery", share=0.12, length_m=4.9, width_m=1.9, height_m=2.1),
@@ -63,6 +100,15 @@ FRAMES, WARMUP_S = 5000, 300.0
 def _is_finished(given: dict[str, Any]) -> bool:
     """Whether the traffic of these keys comes from a finished file."""
     return given.get("fcd") is not None
+
+
+def _of_first_period(given: dict[str, Any], key: str) -> str | None:
+    """Where each period has its own source and ``[traffic]`` none, the first one's stands for what all share."""
+    periods = given.get("periods")
+    if not periods or any(given.get(source) is not None for source in ("network", "sumocfg")):
+        return None
+    source: str | None = getattr(periods[0], key)
+    return source
 
 
 SOURCES = ("network", "sumocfg", "fcd")
@@ -90,12 +136,19 @@ class TrafficModel(StrictModel):
     network: str | None = Field(
         None, description="A .net.xml(.gz) or an OpenStreetMap file; may start with $SUMO_HOME/"
     )
+    periods: tuple[PeriodModel, ...] = Field(
+        (), description="Parts of the day with traffic of their own, mixed by weight; scores are told for each, too"
+    )
     routes: tuple[str, ...] = Field(
         (), description="Route files for the network; none: trips are drawn between its fringe edges"
     )
-    sumocfg: str | None = Field(None, description="A .sumocfg that names network and demand")
+    sumocfg: str | None = Field(
+        default_factory=lambda given: _of_first_period(given, "sumocfg"),
+        description="A .sumocfg that names network and demand",
+    )
     fcd: str | None = Field(
-        None, description="A finished FCD file (XML, CSV or Parquet, may be gzipped); nothing is simulated"
+        default_factory=lambda given: _of_first_period(given, "fcd"),
+        description="A finished FCD file (XML, CSV or Parquet, may be gzipped); nothing is simulated",
     )
     vtypes: tuple[str, ...] = Field(
         (), description="SUMO files with <vType>s: the sizes in a finished FCD file; kinds come before them"
@@ -119,6 +172,12 @@ class TrafficModel(StrictModel):
         description=f"Frames to record; {FRAMES} if not given, of a finished file all",
     )
     frame_period_s: Positive = Field(1.0, description="Time between two frames; a whole number of steps")
+    begin_s: float | None = Field(
+        None,
+        ge=0,
+        description="The simulation's clock when it begins, warmup_s before the first frame; not given, that of the"
+        " sumocfg, or 0. Of a finished file: seconds of it that are left out before the warm-up",
+    )
     step_s: Positive = Field(0.25, description="SUMO's step length")
     warmup_s: float = Field(
         default_factory=lambda given: 0.0 if _is_finished(given) else WARMUP_S,
@@ -147,6 +206,15 @@ class TrafficModel(StrictModel):
     kinds: tuple[VehicleKind, ...] = Field(
         _FLEET, min_length=1, description="The fleet of drawn trips; the sizes in a finished FCD file"
     )
+
+    @model_validator(mode="after")
+    def _periods(self) -> TrafficModel:
+        names = [period.name for period in self.periods]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"two periods have the same name: {', '.join(twice)}")
+        for period in self.periods:
+            period.over(self)
+        return self
 
     @model_validator(mode="after")
     def _one_source(self) -> TrafficModel:

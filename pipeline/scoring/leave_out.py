@@ -14,16 +14,16 @@ the error is left out.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
 
 from pipeline.artefacts import tables
-from pipeline.artefacts.readers import Tpog
-from pipeline.core.errors import InputError
+from pipeline.artefacts.periods import PeriodBlocks
+from pipeline.artefacts.readers import Tpog, block_numbers, read_periods
 from pipeline.core.grid import Grid
 from pipeline.kernels import march
 from pipeline.kernels.crossings import accumulate
@@ -75,23 +75,54 @@ class LeaveOut:
     groups: tuple[Groups, ...]
 
     @classmethod
-    def of(cls, path: Path, tpog: Tpog) -> LeaveOut | None:
-        """From ``tpog.parquet``, which was read as ``tpog``; None when it has one block only, which tells nothing."""
+    def of(cls, path: Path, tpog: Tpog, period: str | None = None) -> LeaveOut | None:
+        """From ``tpog.parquet``, which was read as ``tpog``: the mix, or one period; None when a record has one block
+        only, which tells nothing."""
+        periods = [its for its in read_periods(path) if period in (None, its.name)]
         cells = np.flatnonzero(tpog.counts)
-        counts, groups = _grouped(path, cells, tpog.grid)
-        return cls.from_counts(counts, cells, groups, tpog.grid) if len(groups.frames) > 1 else None
+        groups = tuple(_groups(its) for its in periods)
+        if any(len(its.frames) < 2 for its in groups):
+            return None
+        counts = _grouped(path, cells, tpog.grid, groups, period)
+        if len(groups) == 1:
+            return cls.from_counts(counts, cells, groups[0], tpog.grid)
+        return cls.from_mix(counts, cells, groups, [its.times for its in periods], tpog.grid)
 
     @classmethod
     def from_counts(cls, counts: NDArray[np.uint32], cells: NDArray[np.int64], groups: Groups, grid: Grid) -> LeaveOut:
         """From the counts of two or more groups, (k, n), in the voxels ``cells``, (n,)."""
-        keys = np.random.default_rng(_KEYS).integers(1, 2**63, size=len(counts), dtype=np.uint64)
-        # Two classes that share a sum of keys: a chance of (classes**2 / 2) / 2**64, 1e-10 for 50,000.
-        sums = np.zeros(len(cells), dtype=np.uint64)
-        for group, key in zip(counts, keys, strict=True):
-            sums += group * key
-        _, first, classes = np.unique(sums, return_index=True, return_inverse=True)
+        first, classes = _classes(counts)
         entropies = _entropies(counts[:, first].astype(np.int64), groups.frames, grid)
-        return cls(cells, classes.astype(np.int64), entropies, (groups,))
+        return cls(cells, classes, entropies, (groups,))
+
+    @classmethod
+    def from_mix(
+        cls,
+        counts: NDArray[np.uint32],
+        cells: NDArray[np.int64],
+        groups: tuple[Groups, ...],
+        times: Sequence[int],
+        grid: Grid,
+    ) -> LeaveOut:
+        """From the counts of the groups of several records, (k, n), whose frames count ``times`` in the mix.
+
+        What is left of a record when a group is left out keeps the record's weight. These entropies are taken in
+        float64, since the frames that would hold them exactly have no end; that of all frames is exact.
+        """
+        first, classes = _classes(counts)
+        parts = np.split(counts[:, first].astype(np.int64), np.cumsum([len(its.frames) for its in groups])[:-1])
+        whole = np.array([part.sum(axis=0) for part in parts])
+        total = sum(number * its.total for number, its in zip(times, groups, strict=True))
+        shares = [number * its.total / total for number, its in zip(times, groups, strict=True)]
+        p = [share * sums / its.total for share, sums, its in zip(shares, whole, groups, strict=True)]
+        mixed = np.array(times, dtype=np.int64) @ whole
+        columns = [_exact(mixed, total, grid)]
+        for number, (part, its) in enumerate(zip(parts, groups, strict=True)):
+            others = sum((p[other] for other in range(len(p)) if other != number), np.zeros(len(first)))
+            for group, frames in zip(part, its.frames.tolist(), strict=True):
+                left = shares[number] * (whole[number] - group) / (its.total - frames)
+                columns.append(_binary_entropies(others + left))
+        return cls(cells, classes, np.ascontiguousarray(np.array(columns).T), groups)
 
     def scores(self, hits: NDArray[np.uint32] | NDArray[np.int64], gamma: float, unit: int = 1) -> NDArray[np.float64]:
         """One site's score of all frames, and with each group left out, (1 + k,) float64; ``hits`` as in
@@ -121,29 +152,54 @@ def group_sizes(blocks: int, block_frames: int = 1, memory: float = 0.0) -> list
     return [len(part) for part in np.array_split(np.arange(blocks), groups)]
 
 
-def _grouped(path: Path, cells: NDArray[np.int64], grid: Grid) -> tuple[NDArray[np.uint32], Groups]:
-    """Counts of each group of blocks in the voxels ``cells``, (k, n), and the groups."""
-    with tables.reader(path, "tpog") as (file, about):
-        frames, block_frames = int(about["frames"]), int(about["block_frames"])
-        if frames % block_frames:
-            raise InputError(path, f"{frames} frames in blocks of {block_frames}", "whole blocks; make it again")
-        memory = float(about["memory_frames"])
-        sizes = group_sizes(frames // block_frames, block_frames, memory)
-        group_of = np.repeat(np.arange(len(sizes)), sizes)
-        counts = np.zeros((len(sizes), len(cells)), dtype=np.uint32)
-        for number in range(file.num_row_groups):  # one block each: memory does not grow with their number
-            table = tables.read_group(file, number, path)
+def _groups(period: PeriodBlocks) -> Groups:
+    sizes = group_sizes(period.blocks, period.block_frames, period.memory_frames)
+    return Groups(period.block_frames * np.array(sizes, dtype=np.int64), period.memory_frames)
+
+
+def _grouped(
+    path: Path, cells: NDArray[np.int64], grid: Grid, groups: Sequence[Groups], only: str | None
+) -> NDArray[np.uint32]:
+    """Counts of each group of blocks in the voxels ``cells``, (k, n)."""
+    number, group_of = 0, []
+    wanted = iter(groups)
+    for period in read_periods(path):
+        if only not in (None, period.name):
+            group_of.append(np.full(period.blocks, -1))
+            continue
+        sizes = next(wanted).frames // period.block_frames
+        group_of.append(number + np.repeat(np.arange(len(sizes)), sizes))
+        number += len(sizes)
+    of_block = np.concatenate(group_of)
+    counts = np.zeros((number, len(cells)), dtype=np.uint32)
+    with tables.reader(path, "tpog") as (file, _):
+        for row_group in range(file.num_row_groups):  # one block each: memory does not grow with their number
+            table = tables.read_group(file, row_group, path)
+            group = of_block[block_numbers(table, path, len(of_block))]
             flat = np.ravel_multi_index([table.column(name).to_numpy() for name in ("ix", "iy", "iz")], grid.shape)
-            where = group_of[_block(table, path, len(group_of))] * len(cells) + np.searchsorted(cells, flat)
-            accumulate(where, table.column("count").to_numpy(), counts.reshape(-1))
-    return counts, Groups(block_frames * np.array(sizes, dtype=np.int64), memory)
+            kept = group >= 0
+            where = group[kept] * len(cells) + np.searchsorted(cells, flat[kept])
+            accumulate(where, table.column("count").to_numpy()[kept], counts.reshape(-1))
+    return counts
 
 
-def _block(table: pa.Table, path: Path, blocks: int) -> NDArray[np.uint16]:
-    block: NDArray[np.uint16] = table.column("block").to_numpy()
-    if block.max(initial=0) >= blocks:
-        raise InputError(path, f"block {block.max()} of {blocks}", f"0 to {blocks - 1}")
-    return block
+def _classes(counts: NDArray[np.uint32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """One voxel of each class, and the class of each voxel, (n,)."""
+    keys = np.random.default_rng(_KEYS).integers(1, 2**63, size=len(counts), dtype=np.uint64)
+    # Two classes that share a sum of keys: a chance of (classes**2 / 2) / 2**64, 1e-10 for 50,000.
+    sums = np.zeros(counts.shape[1], dtype=np.uint64)
+    for group, key in zip(counts, keys, strict=True):
+        sums += group * key
+    _, first, classes = np.unique(sums, return_index=True, return_inverse=True)
+    return first.astype(np.int64), classes.astype(np.int64)
+
+
+def _binary_entropies(p: NDArray[np.float64]) -> NDArray[np.float64]:
+    """H(p) in bits, float64."""
+    inside = (p > 0.0) & (p < 1.0)
+    q = np.where(inside, p, 0.5)
+    entropies: NDArray[np.float64] = np.where(inside, -(q * np.log(q) + (1.0 - q) * np.log1p(-q)) / math.log(2.0), 0.0)
+    return entropies
 
 
 def _entropies(counts: NDArray[np.int64], frames: NDArray[np.int64], grid: Grid) -> NDArray[np.float64]:
@@ -154,8 +210,13 @@ def _entropies(counts: NDArray[np.int64], frames: NDArray[np.int64], grid: Grid)
     entropies = np.zeros(left_out.shape)
     for size in np.unique(left):
         rows = np.flatnonzero(left == size)
-        field = EntropyField.of(left_out[rows], int(size), grid)
-        found = np.zeros(left_out[rows].size)
-        found[field.cells] = field.per_cell_bit
-        entropies[rows] = found.reshape(len(rows), -1)
+        entropies[rows] = _exact(left_out[rows], int(size), grid)
     return np.ascontiguousarray(entropies.T)
+
+
+def _exact(counts: NDArray[np.int64], frames: int, grid: Grid) -> NDArray[np.float64]:
+    """Entropies of counts of ``frames``, in the counts' shape."""
+    field = EntropyField.of(counts, frames, grid)
+    found = np.zeros(counts.size)
+    found[field.cells] = field.per_cell_bit
+    return found.reshape(counts.shape)

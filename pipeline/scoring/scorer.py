@@ -8,7 +8,7 @@ is that of :mod:`pipeline.scoring.egvs`, hits are those of :mod:`pipeline.scorin
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +41,17 @@ class SiteScore:
     egvs: float
     entropy_seen: float
     left_out: NDArray[np.float64] | None = None
+    by_period: tuple[SiteScore, ...] = ()
+    """The same for each period alone, where the TPOG is a mix of some and that was asked for."""
+
+
+@dataclass(frozen=True)
+class PeriodTpog:
+    """The TPOG of one period alone, and its groups of blocks for standard errors."""
+
+    name: str
+    tpog: Tpog
+    leave_out: LeaveOut | None = None
 
 
 class Scorer:
@@ -56,23 +67,39 @@ class Scorer:
         ``trajectories.parquet``, only for effects that replay traffic.
     leave_out
         Groups of blocks that are left out in turn, for standard errors.
+    periods
+        TPOGs of periods that each scan is also scored against, with the same hits.
     """
 
     def __init__(
-        self, scene: Scene, tpog: Tpog, trajectories: Path | None = None, leave_out: LeaveOut | None = None
+        self,
+        scene: Scene,
+        tpog: Tpog,
+        trajectories: Path | None = None,
+        leave_out: LeaveOut | None = None,
+        periods: tuple[PeriodTpog, ...] = (),
     ) -> None:
-        self._built_from = (scene, tpog, trajectories, leave_out)
+        self._built_from = (scene, tpog, trajectories, leave_out, periods)
+        fields = (EntropyField.of(its.tpog.counts, its.tpog.frames, its.tpog.grid) for its in periods)
+        self._periods = tuple(zip(fields, (its.leave_out for its in periods), strict=True))
         self._leave_out, self._gamma = leave_out, scene.scenario.score.gamma
         self.field = EntropyField.of(tpog.counts, tpog.frames, tpog.grid)
         self._visibility = Visibility(scene, tpog, trajectories)
 
-    def __reduce__(self) -> tuple[type[Scorer], tuple[Scene, Tpog, Path | None, LeaveOut | None]]:
+    def __reduce__(
+        self,
+    ) -> tuple[type[Scorer], tuple[Scene, Tpog, Path | None, LeaveOut | None, tuple[PeriodTpog, ...]]]:
         return Scorer, self._built_from
 
     @property
     def limit(self) -> float:
         """The most that any scan could reach: the same sum with gamma in every voxel."""
         return self.field.limit(self._gamma)
+
+    @property
+    def limits_by_period(self) -> list[float]:
+        """The same of each period."""
+        return [field.limit(self._gamma) for field, _ in self._periods]
 
     def score(self, scan: Scan | Beams) -> SiteScore:
         """The score of one scan."""
@@ -89,10 +116,19 @@ class Scorer:
         return (hits / self._visibility.unit).reshape(self.field.grid.shape)
 
     def _worth(self, hits: Hits) -> SiteScore:
+        apart = tuple(self._against(hits, field, leave_out) for field, leave_out in self._periods)
+        return replace(self._against(hits, self.field, self._leave_out), by_period=apart)
+
+    def _against(self, hits: Hits, field: EntropyField, leave_out: LeaveOut | None) -> SiteScore:
         unit = self._visibility.unit
-        found = self.field.score(hits, self._gamma, unit)
-        left_out = self._leave_out.scores(hits, self._gamma, unit) if self._leave_out is not None else None
+        found = field.score(hits, self._gamma, unit)
+        left_out = leave_out.scores(hits, self._gamma, unit) if leave_out is not None else None
         return SiteScore(found.egvs, found.entropy_seen, left_out)
+
+
+def ranks(scores: NDArray[np.float64]) -> NDArray[np.uint32]:
+    """1 for the highest score; equal scores share a rank, and the next one is left out for each that shares."""
+    return np.array([1 + np.sum(scores > score) for score in scores], dtype=np.uint32)
 
 
 def _beams(scan: Scan | Beams) -> Beams:

@@ -29,16 +29,17 @@ from pipeline.kernels import march
 from pipeline.scenario.models import FILE
 from pipeline.scoring import uncertainty
 from pipeline.scoring.leave_out import LeaveOut
-from pipeline.scoring.scorer import Scorer, SiteScore
+from pipeline.scoring.scorer import Scorer, SiteScore, ranks
 from pipeline.scoring.visibility import Beams, in_voxels
 from pipeline.sensing.sites import ScannedSite
 from pipeline.stages.base import StageInputs, Summary, Workspace
+from pipeline.stages.shared import period_scores
 from pipeline.stages.shared.scans import SiteBeams, scans
 from pipeline.stages.shared.scene import SCANS, scan_inputs, scene_of, sensor_digests
 from pipeline.world import world_frame
 
 NAME = "score"
-ARTEFACTS = ("scores.parquet", "visibility.parquet")
+ARTEFACTS = ("scores.parquet", "visibility.parquet", period_scores.PERIOD_SCORES)
 TRAJECTORIES = "trajectories.parquet"
 
 
@@ -86,7 +87,8 @@ def inputs(work: Workspace) -> StageInputs:
 def run(
     work: Workspace, inputs: StageInputs, audit: bool = False, observe: Callable[[ScoredSite], None] | None = None
 ) -> Summary:
-    """Score and rank all sites; write ``scores.parquet``, and ``visibility.parquet`` where sites are to be kept.
+    """Score and rank all sites; write ``scores.parquet``, ``visibility.parquet`` where sites are to be kept, and
+    ``scores_by_period.parquet`` where the traffic has periods.
 
     Parameters
     ----------
@@ -102,7 +104,8 @@ def run(
     """
     tpog, wanted = read_tpog(work.path("tpog.parquet")), work.scenario.score
     leave_out = LeaveOut.of(work.path("tpog.parquet"), tpog) if wanted.standard_error else None
-    scorer = Scorer(scene_of(work), tpog, work.path(TRAJECTORIES), leave_out)
+    periods = period_scores.period_tpogs(work.path("tpog.parquet"), standard_errors=wanted.standard_error)
+    scorer = Scorer(scene_of(work), tpog, work.path(TRAJECTORIES), leave_out, periods)
 
     def score(scan: SiteBeams) -> ScoredSite:
         checked = audit_beams(scan.beams, tpog.grid) if audit else None
@@ -126,6 +129,8 @@ def run(
     with tables.writer(work.path(ARTEFACTS[0]), "scores", tuple(more), foreign=own) as file:
         file.write(columns | own)
         file.describe(about)
+    names, worths = [d.site.name for d in done], [d.score for d in done]
+    period_scores.write(work.path(ARTEFACTS[2]), names, worths, periods, scorer.limits_by_period, about)
     best = [d.site.name for d, rank in zip(done, columns["rank"], strict=True) if rank == 1]
     summary: Summary = {"sites": len(done), "best": best, "egvs_limit": scorer.limit}
     if skipped := scene_of(work).skipped(NAME):
@@ -133,7 +138,9 @@ def run(
     if estimate is not None:
         summary |= uncertainty.in_words(estimate)
         place, period_s = f"{FILE}: traffic.frames", work.scenario.traffic.frame_period_s
-        if doubts := uncertainty.doubts(estimate, place, period_s):
+        doubts = uncertainty.doubts(estimate, place, period_s, [period.name for period in periods] or [""])
+        doubts += period_scores.disagreements(names, worths, periods)
+        if doubts:
             summary[WARNINGS] = [doubt.to_json() for doubt in doubts]
     if audit:
         summary["audit"] = _worst([d.audit for d in done if d.audit is not None])
@@ -191,11 +198,6 @@ def _error_columns(estimate: uncertainty.Estimate | None) -> dict[str, Any]:
     if estimate is None:
         return {}
     return {"egvs_se": estimate.se, "egvs_bias": estimate.bias, "beats_next": uncertainty.beats_next(estimate)}
-
-
-def ranks(scores: NDArray[np.float64]) -> NDArray[np.uint32]:
-    """1 for the highest score; equal scores share a rank, and the next one is left out for each that shares."""
-    return np.array([1 + np.sum(scores > score) for score in scores], dtype=np.uint32)
 
 
 def _worst(audits: list[BeamAudit]) -> dict[str, float]:

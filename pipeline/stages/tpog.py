@@ -8,16 +8,23 @@ that fill no block are left out and told.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.artefacts import tables
-from pipeline.artefacts.recorded_boxes import read_boxes
+from pipeline.artefacts.periods import PeriodBlocks, times
+from pipeline.artefacts.recorded_boxes import FrameBoxes, read_boxes
 from pipeline.checks import recorded
 from pipeline.core.errors import InputError
 from pipeline.core.findings import WARNINGS
+from pipeline.core.grid import Grid
+from pipeline.core.progress import Progress
+from pipeline.scenario.models import Scenario
 from pipeline.scoring.memory import memory_frames
 from pipeline.scoring.occupancy import count_blocks, static_voxels
 from pipeline.stages.base import StageInputs, Summary, Workspace
@@ -34,8 +41,13 @@ def inputs(work: Workspace) -> StageInputs:
         "name": scenario.name,
         "grid": scenario.roi.grid.to_json(),
         "tpog": scenario.tpog.model_dump(mode="json"),
+        **({"weights": weights} if (weights := _weights(scenario)) else {}),
     }
     return StageInputs(settings, work.digests("trajectories.parquet", "statics.ply"))
+
+
+def _weights(scenario: Scenario) -> dict[str, float]:
+    return {period.name: period.weight for period in scenario.traffic.periods}
 
 
 def run(work: Workspace, inputs: StageInputs) -> Summary:
@@ -48,47 +60,117 @@ def run(work: Workspace, inputs: StageInputs) -> Summary:
         finished file's frames are no whole number of blocks; warnings.
     """
     source, scenario = work.path("trajectories.parquet"), work.scenario
-    grid, blocks = scenario.roi.grid, scenario.tpog.blocks
-    frames = int(tables.read_metadata(source, "trajectories")["frames"])
-    left_over = frames % blocks
-    if left_over == frames or (left_over and scenario.traffic.frames is not None):
-        found = f"{blocks} does not divide the {frames} frames recorded"
-        raise InputError(f"{scenario.file}: tpog.blocks", found, f"a divisor, or at most {frames}")
-    frames -= left_over
-    filled = static_voxels(world_of(work), grid)
-    solid, seen = np.flatnonzero(filled), 0
-    hidden = np.zeros(len(solid), dtype=np.int64)
-    block_frames, ever = frames // blocks, np.zeros(grid.shape, dtype=np.bool_)
-    boxes: list[NDArray[np.int64]] = []
+    grid, filled = scenario.roi.grid, static_voxels(world_of(work), scenario.roi.grid)
+    counting = _Counting(np.flatnonzero(filled))
     with tables.writer(work.path(ARTEFACTS[0]), "tpog") as file:
-        counted = count_blocks(read_boxes(source, grid), grid, block_frames, blocks)
-        for block, (counts, boxes_near) in enumerate(counted):
-            hidden += counts.ravel()[solid]
-            counts[filled] = 0
-            rows = _sparse(block, counts)
-            file.write(rows)
-            seen += int(rows["count"].sum())
-            ever |= counts > 0
-            boxes.append(boxes_near)
-            work.progress("blocks", block + 1, blocks)
-        in_roi = np.concatenate(boxes)
-        memory = memory_frames(in_roi)
-        about: dict[str, Any] = {"frames": frames, "block_frames": block_frames, "memory_frames": memory}
-        file.describe(work.metadata(inputs, grid=grid.to_json(), **about))
+        periods, first_block, left_over = [], 0, 0
+        for name, frames, boxes in _recorded(source, grid):
+            over = _left_over(scenario, frames)
+            block_frames = (frames - over) // scenario.tpog.blocks
+            blocks = count_blocks(boxes, grid, block_frames, scenario.tpog.blocks)
+            in_roi = counting.write(file, blocks, first_block, work.progress)
+            periods.append(PeriodBlocks(name, 1.0, frames - over, block_frames, memory_frames(in_roi)))
+            first_block, left_over = first_block + scenario.tpog.blocks, left_over + over
+        periods = _weighted(periods, scenario)
+        file.describe(work.metadata(inputs, grid=grid.to_json(), **_described(periods)))
+    mean = counting.boxes / sum(period.frames for period in periods)
     doubts = [
-        *recorded.in_region(float(in_roi.mean()), source),
-        *recorded.through_solids(hidden, seen, solid, grid, world_of(work)),
+        *recorded.in_region(mean, source),
+        *recorded.through_solids(counting.hidden, counting.seen, counting.solid, grid, world_of(work)),
     ]
     summary: Summary = {
-        "occupied_voxels": int(ever.sum()),
-        "static_voxels": len(solid),
-        "boxes_in_roi": float(in_roi.mean()),
-        "memory_frames": memory,
+        "occupied_voxels": int(counting.ever.sum()) if counting.ever is not None else 0,
+        "static_voxels": len(counting.solid),
+        "boxes_in_roi": mean,
+        "memory_frames": ", ".join(f"{p.name} {p.memory_frames:g}" for p in periods)
+        if len(periods) > 1
+        else periods[0].memory_frames,
         WARNINGS: [finding.to_json() for finding in doubts],
     }
     if left_over:
-        summary["left_over"] = f"the last {left_over} of {frames + left_over} frames, so that {blocks} blocks are alike"
+        total = sum(period.frames for period in periods) + left_over
+        blocks_alike = f"so that {scenario.tpog.blocks} blocks are alike"
+        summary["left_over"] = f"the last {left_over} of {total} frames, {blocks_alike}"
     return summary
+
+
+@dataclass
+class _Counting:
+    """Writes blocks, and adds up what is said of them: rows hidden in solids, and seen, in all blocks."""
+
+    solid: NDArray[np.int64]
+    hidden: NDArray[np.int64] = field(init=False)
+    seen: int = 0
+    boxes: int = 0
+    ever: NDArray[np.bool_] | None = None
+
+    def __post_init__(self) -> None:
+        self.hidden = np.zeros(len(self.solid), dtype=np.int64)
+
+    def write(
+        self,
+        file: tables.TableWriter,
+        blocks: Iterator[tuple[NDArray[np.int32], NDArray[np.int64]]],
+        first_block: int,
+        progress: Progress,
+    ) -> NDArray[np.int64]:
+        """Write one period's blocks, numbered from ``first_block`` on; boxes near the region in each frame."""
+        boxes = []
+        for block, (counts, boxes_near) in enumerate(blocks, start=first_block):
+            self.hidden += counts.ravel()[self.solid]
+            counts.ravel()[self.solid] = 0
+            rows = _sparse(block, counts)
+            file.write(rows)
+            self.seen += int(rows["count"].sum())
+            self.ever = (counts > 0) | (False if self.ever is None else self.ever)
+            boxes.append(boxes_near)
+            progress("blocks", block + 1, 0)
+        in_roi = np.concatenate(boxes)
+        self.boxes += int(in_roi.sum())
+        return in_roi
+
+
+def _recorded(source: Path, grid: Grid) -> Iterator[tuple[str, int, Iterator[FrameBoxes]]]:
+    """Name, frames and boxes of each period, its frames counted from 0; without a name where there are no periods."""
+    about = tables.read_metadata(source, "trajectories")
+    if "periods" not in about:
+        yield "", int(about["frames"]), read_boxes(source, grid)
+        return
+    start = 0
+    for period in about["periods"]:
+        frames = int(period["frames"])
+        yield period["name"], frames, _from_zero(read_boxes(source, grid, np.arange(start, start + frames)), start)
+        start += frames
+
+
+def _from_zero(batches: Iterator[FrameBoxes], start: int) -> Iterator[FrameBoxes]:
+    return (FrameBoxes(batch.frame - start, batch.values) for batch in batches)
+
+
+def _left_over(scenario: Scenario, frames: int) -> int:
+    """Frames that make no whole number of blocks; InputError unless a finished file was taken as it is."""
+    blocks, over = scenario.tpog.blocks, frames % scenario.tpog.blocks
+    if over == frames or (over and scenario.traffic.frames is not None):
+        found = f"{blocks} does not divide the {frames} frames recorded"
+        raise InputError(f"{scenario.file}: tpog.blocks", found, f"a divisor, or at most {frames}")
+    return over
+
+
+def _weighted(periods: list[PeriodBlocks], scenario: Scenario) -> list[PeriodBlocks]:
+    """The periods with their weights."""
+    named = _weights(scenario)
+    weights = [named.get(period.name, 1.0) for period in periods]
+    often = times(weights, [period.frames for period in periods], f"{scenario.file}: traffic")
+    return [replace(p, weight=weight, times=number) for p, weight, number in zip(periods, weights, often, strict=True)]
+
+
+def _described(periods: list[PeriodBlocks]) -> dict[str, Any]:
+    """What metadata says of frames and blocks."""
+    if not periods[0].name:
+        one = periods[0]
+        return {"frames": one.frames, "block_frames": one.block_frames, "memory_frames": one.memory_frames}
+    frames = sum(period.frames * period.times for period in periods)
+    return {"frames": frames, "periods": [period.to_json() for period in periods]}
 
 
 def _sparse(block: int, counts: NDArray[np.int32]) -> dict[str, Any]:

@@ -16,9 +16,11 @@ from __future__ import annotations
 import os
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from pipeline.artefacts import tables
 from pipeline.core import files
+from pipeline.core.errors import InputError
 from pipeline.core.findings import WARNINGS
 from pipeline.core.sumo_home import sumo_home
 from pipeline.effects import on_traffic, registry
@@ -26,6 +28,7 @@ from pipeline.scenario.models import Scenario
 from pipeline.stages.base import StageInputs, Summary, Workspace
 from pipeline.traffic import recording, sumo, sumo_folder, trajectories
 from pipeline.traffic.finished import sizes
+from pipeline.traffic.frames import Window
 from pipeline.world import world_frame
 
 NAME = "traffic"
@@ -34,16 +37,14 @@ COMPANIONS = ("sumo",)
 
 
 def inputs(work: Workspace) -> StageInputs:
-    """Everything that the trajectories depend on."""
+    """Everything that the trajectories depend on; which weights periods have, is no part of it."""
     scenario, traffic = work.scenario, work.scenario.traffic
-    if traffic.fcd is not None:
-        sources = [scenario.find(traffic.fcd, "traffic.fcd"), *sizes.files(scenario)]
-    else:
-        sources = sumo_folder.sources(scenario).all()
-        if traffic.sumocfg is not None:
-            sources.insert(0, scenario.find(traffic.sumocfg, "traffic.sumocfg"))
+    sources = dict.fromkeys(path for alone in scenario.by_period().values() for path in _sources(alone))
     effects, _ = on_traffic.live(scenario)
-    settings = {"seed": scenario.seed, "name": scenario.name, "traffic": traffic.model_dump(mode="json")}
+    shown = traffic.model_dump(mode="json")
+    for period in shown["periods"]:
+        del period["weight"]
+    settings = {"seed": scenario.seed, "name": scenario.name, "traffic": shown}
     if traffic.fcd is not None:
         settings |= world_frame.key(scenario)
     # one that acts by itself depends on the network alone
@@ -52,6 +53,15 @@ def inputs(work: Workspace) -> StageInputs:
     hashes = {_label(path, scenario): files.sha256_of(path) for path in sources}
     version = None if traffic.fcd is not None and not traffic.vtypes else sumo.version()
     return StageInputs(settings, hashes, {"sumo": version}, registry.modules(effects))
+
+
+def _sources(scenario: Scenario) -> list[Path]:
+    """The files that one period's traffic comes from."""
+    traffic = scenario.traffic
+    if traffic.fcd is not None:
+        return [scenario.find(traffic.fcd, "traffic.fcd"), *sizes.files(scenario)]
+    own = [scenario.find(traffic.sumocfg, "traffic.sumocfg")] if traffic.sumocfg is not None else []
+    return [*own, *sumo_folder.sources(scenario).all()]
 
 
 def _label(path: Path, scenario: Scenario) -> str:
@@ -81,18 +91,64 @@ def run(work: Workspace, inputs: StageInputs, traci: tuple[str, int] | None = No
     RunError
         When SUMO fails, N vehicles are not held, or a vehicle stands without end.
     """
-    scenario = work.scenario
+    periods = work.scenario.by_period()
+    if traci is not None and work.scenario.traffic.periods:
+        raise InputError("--traci", "the scenario has periods", "a scenario without [[traffic.periods]]")
+    summaries, first_frame, described = {}, 0, []
+    with tables.writer(work.path(ARTEFACTS[0]), "trajectories") as file:
+        for name, scenario in periods.items():
+            window, summaries[name] = _record(work, scenario, name, file, first_frame, traci)
+            first_frame += window.count
+            described.append({"name": name, "frames": window.count})
+        about: dict[str, Any] = {"frames": first_frame, "frame_period_s": window.period_ms / 1000.0}
+        if work.scenario.traffic.periods:
+            about["periods"] = described
+        file.describe(work.metadata(inputs, **about, sumo=inputs.more["sumo"]))
+    return _together(summaries, first_frame) if work.scenario.traffic.periods else summaries[""]
+
+
+def _record(
+    work: Workspace,
+    scenario: Scenario,
+    period: str,
+    file: tables.TableWriter,
+    first_frame: int,
+    traci: tuple[str, int] | None,
+) -> tuple[Window, Summary]:
+    """Write the frames of one period."""
     effects, notes = on_traffic.live(scenario)
-    world = world_frame.of(scenario)
-    source = recording.record(scenario, work.path(COMPANIONS[0]), effects, work.progress, traci, world)
-    with source as recorded, tables.writer(work.path(ARTEFACTS[0]), "trajectories") as file:
-        tally, reports = trajectories.write(scenario, recorded, effects, file, work.progress)
-        period_s, frames = recorded.window.period_ms / 1000.0, recorded.window.count
-        file.describe(work.metadata(inputs, frames=frames, frame_period_s=period_s, sumo=inputs.more["sumo"]))
+    folder = work.path(COMPANIONS[0]) / period
+    with recording.record(scenario, folder, effects, work.progress, traci, world_frame.of(scenario)) as recorded:
+        tally, reports = trajectories.write(scenario, recorded, effects, file, work.progress, first_frame)
         summary = recorded.summary()
         doubts = trajectories.doubts(tally, recorded, scenario.roi.box)
-    result = tally.to_json(period_s) | ({} if summary is None else asdict(summary))
+    result = tally.to_json(recorded.window.period_ms / 1000.0) | ({} if summary is None else asdict(summary))
     result[WARNINGS] = [*result.get(WARNINGS, []), *(finding.to_json() for finding in doubts)]
     if notes:
         result["notes"] = [*result.get("notes", []), *notes]
-    return result | reports
+    return recorded.window, result | reports
+
+
+def _together(summaries: dict[str, Summary], frames: int) -> Summary:
+    """The summaries of periods as one; what is of SUMO stands where it does without periods."""
+    together: Summary = {"frames": frames, "periods": summaries}
+    if flags := {name: summary.pop("flags", None) for name, summary in summaries.items()}:
+        together["flags"] = flags
+    if seconds := [summary.pop("sumo_seconds", None) or 0.0 for summary in summaries.values()]:
+        together["sumo_seconds"] = round(sum(seconds), 3)
+    versions = {summary.pop("sumo", None) for summary in summaries.values()} - {None}
+    if versions:
+        together["sumo"] = versions.pop()
+    counts = [
+        {**count, "place": f"{count['place']} ({name})"}
+        for name, summary in summaries.items()
+        for count in summary.pop("counts", None) or ()
+    ]
+    if counts:
+        together["counts"] = counts
+    warnings = [
+        {**warning, "place": f"{warning['place']} ({name})"}
+        for name, summary in summaries.items()
+        for warning in summary.pop(WARNINGS, ())
+    ]
+    return together | ({WARNINGS: warnings} if warnings else {})

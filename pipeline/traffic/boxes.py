@@ -77,11 +77,11 @@ class VehicleBoxes:
         """Some of the rows."""
         return replace(self, **self.rows(np.flatnonzero(kept)))
 
-    def columns(self) -> dict[str, Any]:
-        """As the artefact ``trajectories`` has them."""
+    def columns(self, first_frame: int = 0) -> dict[str, Any]:
+        """As the artefact ``trajectories`` has them, counted from ``first_frame`` on."""
         n = self.frame.size
         return {
-            "frame": self.frame.astype(np.uint32),
+            "frame": (self.frame + first_frame).astype(np.uint32),
             "part": np.zeros(n, np.uint8) if self.part is None else self.part.astype(np.uint8),
             "vehicle": _strings(self.names, self.code),
             "kind": _strings(self.kinds, self.kind),

@@ -115,7 +115,10 @@ def milliseconds(value_s: float, place: str) -> int:
 
 
 def timing(traffic: TrafficModel, begin_s: float, place: str) -> Timing:
-    """The times; period and warm-up are whole numbers of steps (SUMO itself only warns, and records wrong times)."""
+    """The times; period and warm-up are whole numbers of steps (SUMO itself only warns, and records wrong times).
+
+    ``begin_s`` is the configuration's, for a scenario without its own.
+    """
     step = milliseconds(traffic.step_s, f"{place}.step_s")
     if step < 1:
         raise InputError(f"{place}.step_s = {traffic.step_s:g}", "is below a millisecond", "at least 0.001")
@@ -127,7 +130,7 @@ def timing(traffic: TrafficModel, begin_s: float, place: str) -> Timing:
             what, right = f"is no whole number of steps of {step / 1000:g} s", f"for example {near}, or another step_s"
             raise InputError(f"{place}.{key} = {value / 1000:g}", what, right)
         values.append(value)
-    begin = milliseconds(begin_s, f"{place}: begin")
+    begin = milliseconds(begin_s if traffic.begin_s is None else traffic.begin_s, f"{place}: begin")
     assert traffic.frames is not None, "what is simulated has an end"
     return Timing(begin, begin + values[1], values[0], step, traffic.frames)
 
@@ -327,7 +330,7 @@ def _draw(
     traffic, place = scenario.traffic, place_of(scenario)
     pairs = [demand.pairs(roads, kind, traffic, rng, place) for kind in traffic.kinds]
     count = int(np.ceil((when.end_ms - when.begin_ms) / 1000.0 * traffic.trips_per_s))
-    departs_s = np.arange(count) / traffic.trips_per_s
+    departs_s = when.begin_ms / 1000.0 + np.arange(count) / traffic.trips_per_s
     trips = demand.draw(roads, traffic.kinds, pairs, departs_s, rng)
     files.write_text(folder / TRIPS, demand.trips_xml(trips, departs_s))
     return [

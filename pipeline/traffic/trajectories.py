@@ -37,8 +37,10 @@ def write(
     extensions: Sequence[TrafficExtension],
     file: TableWriter,
     progress: Progress,
+    first_frame: int = 0,
 ) -> tuple[TrafficTally, dict[str, Any]]:
-    """Write a recording's boxes, changed by the extensions that act; what they add up to, and what extensions report.
+    """Write a recording's boxes, changed by the extensions that act, as frames from ``first_frame`` on; what they
+    add up to, and what extensions report.
 
     InputError when a vehicle's size is unknown, or the file has too few frames; RunError when N vehicles are not held,
     or a vehicle stands without end.
@@ -55,7 +57,7 @@ def write(
         for change in changes:
             made = change.change(made)
         if made.frame.size:
-            file.write(made.columns())
+            file.write(made.columns(first_frame))
         tally.add(made)
         progress("frames written", group.first_frame + group.frames, tally.frames)
     _check(scenario.traffic, tally, recording)

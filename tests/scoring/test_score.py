@@ -15,6 +15,7 @@ from pipeline.artefacts.readers import read_scores, read_tpog, read_visibility
 from pipeline.core.errors import InputError
 from pipeline.scenario import loading
 from pipeline.scoring.egvs import binary_entropy
+from pipeline.scoring.scorer import ranks
 from pipeline.stages import scan, score, statics, tpog, traffic
 from tests.stages import run_stage
 
@@ -93,9 +94,9 @@ def test_equal_sites_share_a_rank(mini, tmp_path):
 
 
 def test_ranks():
-    assert score.ranks(np.array([2.0, 5.0, 2.0, 0.0, 5.0])).tolist() == [3, 1, 3, 5, 1]
-    assert score.ranks(np.zeros(3)).tolist() == [1, 1, 1]
-    assert score.ranks(np.array([np.nextafter(1.0, 2.0), 1.0])).tolist() == [1, 2]
+    assert ranks(np.array([2.0, 5.0, 2.0, 0.0, 5.0])).tolist() == [3, 1, 3, 5, 1]
+    assert ranks(np.zeros(3)).tolist() == [1, 1, 1]
+    assert ranks(np.array([np.nextafter(1.0, 2.0), 1.0])).tolist() == [1, 2]
 
 
 def test_a_site_that_sees_nothing_scores_zero_and_comes_last(mini, tmp_path):

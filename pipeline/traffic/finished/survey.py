@@ -60,7 +60,7 @@ def window(scenario: Scenario) -> tuple[Window, FcdSurvey]:
     assert traffic.fcd is not None
     path = scenario.find(traffic.fcd, "traffic.fcd")
     period_ms = max(1, sumo_folder.milliseconds(traffic.frame_period_s, f"{place}.frame_period_s"))
-    skip_ms = sumo_folder.milliseconds(traffic.warmup_s, f"{place}.warmup_s")
+    skip_ms = sumo_folder.milliseconds(traffic.warmup_s + (traffic.begin_s or 0.0), f"{place}.warmup_s")
     until_ms = None if traffic.frames is None else skip_ms + (traffic.frames - 1) * period_ms
     found = _remembered(path, path.stat().st_mtime_ns, until_ms)
     frames = traffic.frames or (found.lasts_ms - skip_ms) // period_ms + 1

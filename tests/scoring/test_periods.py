@@ -1,0 +1,225 @@
+"""Are periods of the day mixed by weight, exactly, and told apart?
+
+Evidence: rational arithmetic from the definition; each period run alone, without the others; slow twins for leaving
+groups out; and each wrong use with its message."""
+
+from __future__ import annotations
+
+import re
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import pipeline
+from pipeline.artefacts import periods, tables
+from pipeline.artefacts.readers import read_periods, read_scores_by_period, read_tpog
+from pipeline.core.errors import InputError
+from pipeline.core.findings import warnings_of
+from pipeline.core.grid import Grid
+from pipeline.report.by_period import PeriodRanking
+from pipeline.scoring.egvs import EntropyField, binary_entropy
+from pipeline.scoring.leave_out import Groups, LeaveOut
+from pipeline.scoring.scorer import SiteScore
+from pipeline.scoring.uncertainty import Estimate
+from pipeline.stages.shared import period_scores
+
+PERIODS = """
+[[traffic.periods]]
+name = "day"
+weight = 2.5
+length_s = 12
+
+[[traffic.periods]]
+name = "night"
+begin_s = 12
+length_s = 8
+"""
+
+
+@pytest.fixture
+def split(mini: Path) -> Path:
+    """The small scenario, its first 24 frames by day and its last 16 by night."""
+    file = mini / "scenario.toml"
+    file.write_text(file.read_text().replace("[[traffic.kinds]]", f"{PERIODS}\n[[traffic.kinds]]", 1))
+    return mini
+
+
+def of(table: object) -> list[dict[str, object]]:
+    return table.to_pylist()  # type: ignore[attr-defined, no-any-return]
+
+
+def test_the_mix_is_exact(split: Path, tmp_path: Path) -> None:
+    pipeline.run(pipeline.load(split), tmp_path)
+    path = tmp_path / "tpog.parquet"
+    day, night, mix = read_tpog(path, "day"), read_tpog(path, "night"), read_tpog(path)
+    assert (day.frames, night.frames) == (24, 16)
+    assert [(p.name, p.weight, p.blocks, p.times) for p in read_periods(path)] == [
+        ("day", 2.5, 4, 5),
+        ("night", 1.0, 4, 3),
+    ]
+    assert mix.frames == 5 * 24 + 3 * 16
+    wanted = {}
+    for cell in zip(*np.nonzero(day.counts + night.counts), strict=True):
+        shares = Fraction(int(day.counts[cell]), 24), Fraction(int(night.counts[cell]), 16)
+        wanted[cell] = (Fraction("2.5") * shares[0] + shares[1]) / Fraction("3.5")
+    found = {cell: Fraction(int(mix.counts[cell]), mix.frames) for cell in zip(*np.nonzero(mix.counts), strict=True)}
+    assert found == wanted
+
+
+def test_each_period_is_scored_as_if_it_were_alone(split: Path, tmp_path: Path) -> None:
+    pipeline.run(pipeline.load(split), tmp_path / "both")
+    by_period = of(read_scores_by_period(tmp_path / "both" / "scores_by_period.parquet"))
+    text = (split / "scenario.toml").read_text().replace(PERIODS, "")
+    for name, begin_s, frames in (("day", 0, 24), ("night", 12, 16)):
+        (split / "scenario.toml").write_text(text)
+        alone = tmp_path / name
+        pipeline.run(pipeline.load(split, [f"traffic.frames={frames}", f"traffic.begin_s={begin_s}"]), alone)
+        rows = of(pipeline.read_scores(alone / "scores.parquet"))
+        for row, its in zip(rows, (row for row in by_period if row["period"] == name), strict=True):
+            assert all(row[key] == its[key] for key in its if key != "period")
+        assert not (alone / "scores_by_period.parquet").exists()
+        theirs, own = read_tpog(tmp_path / "both" / "tpog.parquet", name), read_tpog(alone / "tpog.parquet")
+        assert (theirs.counts == own.counts).all()
+
+
+def test_frames_stand_one_after_another_and_weights_need_no_new_traffic(split: Path, tmp_path: Path) -> None:
+    pipeline.run(pipeline.load(split), tmp_path)
+    table, about = tables.read(tmp_path / "trajectories.parquet", "trajectories")
+    assert (about["frames"], about["periods"]) == (40, [{"name": "day", "frames": 24}, {"name": "night", "frames": 16}])
+    assert np.unique(table.column("frame")).tolist() == list(range(40))
+    file = split / "scenario.toml"
+    file.write_text(file.read_text().replace("weight = 2.5", "weight = 1"))
+    states: dict[str, str] = {}
+    pipeline.run(pipeline.load(split), tmp_path, listener=lambda stage, state, _: states.update({stage: state}))
+    assert states["traffic"] == "skipped"
+    assert (states["tpog"], states["score"]) == ("done", "done")
+    assert read_tpog(tmp_path / "tpog.parquet").frames == 2 * 24 + 3 * 16
+
+
+def test_a_run_with_periods_is_the_same_again_and_shows_them(split: Path, tmp_path: Path, egvs) -> None:  # type: ignore[no-untyped-def]
+    code, printed, _ = egvs("run", split, "--out", tmp_path / "out")
+    assert code == 0
+    assert "rank and share of the best in each period; in the mix: day 71.4%, night 28.6%" in printed
+    assert "scores_by_period.parquet" in printed
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "By period" in page
+    assert "night<br>(28.6%)" in page
+    assert ">40 frames" in page
+    ranking = PeriodRanking.read(tmp_path / "out")
+    assert ranking is not None
+    assert (ranking.periods, ranking.frames) == (("day", "night"), 40)
+    assert egvs("verify", tmp_path / "out")[0] == 0
+
+
+@given(
+    st.lists(st.tuples(st.integers(1, 999), st.integers(1, 5000)), min_size=1, max_size=4),
+    st.sampled_from([1.0, 0.1, 0.01]),
+)
+def test_frames_count_in_the_ratio_of_the_weights(rows: list[tuple[int, int]], unit: float) -> None:
+    weights, frames = [round(n * unit, 2) for n, _ in rows], [t for _, t in rows]
+    try:
+        found = periods.times(weights, frames, "scenario.toml: traffic")
+    except InputError:
+        return  # too many frames for this mix
+    total = sum(m * t for m, t in zip(found, frames, strict=True))
+    whole = sum(Fraction(str(w)) for w in weights)
+    for weight, count, number in zip(weights, frames, found, strict=True):
+        assert Fraction(number * count, total) == Fraction(str(weight)) / whole
+    assert np.gcd.reduce(found) == 1
+
+
+def test_of_a_mix_each_group_is_left_out_of_its_own_record() -> None:
+    rng, grid = np.random.default_rng(2), Grid.from_json({"origin_m": [0.0] * 3, "voxel_m": 1.0, "shape": [5, 4, 1]})
+    records = (Groups(np.array([10, 20]), 0.0), Groups(np.array([8, 8, 8]), 0.0))
+    counts = [rng.integers(0, 8, size=(k, 20)).astype(np.uint32) for k in (2, 3)]
+    hits, times = rng.integers(0, 9, size=20).astype(np.uint32), (4, 3)
+    leave_out = LeaveOut.from_mix(np.vstack(counts), np.arange(20), records, times, grid)
+    found = leave_out.scores(hits, 5.0)
+    weight = [m * its.total for m, its in zip(times, records, strict=True)]
+    columns = [(None, None), *((q, g) for q in (0, 1) for g in range(len(counts[q])))]
+    for column, (record, group) in enumerate(columns):
+        total = 0.0
+        for cell in range(20):
+            p = 0.0
+            for q in (0, 1):
+                kept = [g for g in range(len(counts[q])) if (q, g) != (record, group)]
+                there, frames = sum(int(counts[q][g, cell]) for g in kept), sum(int(records[q].frames[g]) for g in kept)
+                p += weight[q] / sum(weight) * there / frames
+            total += min(5, int(hits[cell])) * (-(p * np.log2(p) + (1 - p) * np.log2(1 - p)) if 0 < p < 1 else 0.0)
+        assert found[column] == pytest.approx(total, rel=1e-12)
+    mixed = (4 * counts[0].sum(axis=0) + 3 * counts[1].sum(axis=0)).astype(np.int64)
+    assert found[0] == pytest.approx(EntropyField.of(mixed, sum(weight), grid).score(hits, 5.0).egvs, rel=1e-13)
+    assert len(Estimate.of(found[None], leave_out.groups).strata) == 2
+
+
+def test_errors_of_a_mix_and_of_its_periods_are_told(split: Path, tmp_path: Path) -> None:
+    record = pipeline.run(pipeline.load(split), tmp_path)
+    rows = of(pipeline.read_scores(tmp_path / "scores.parquet"))
+    assert all(row["egvs_se"] > 0 for row in rows)  # type: ignore[operator]
+    assert all(row["egvs_se"] > 0 for row in of(read_scores_by_period(tmp_path / "scores_by_period.parquet")))  # type: ignore[operator]
+    summary = record.stages["score"].summary
+    assert " and " in summary["standard_errors_from"]
+    places = [finding.place for finding in warnings_of([summary]) if finding.rule == "traffic's memory"]
+    assert places
+    assert set(places) <= {"scenario.toml: traffic.frames (day)", "scenario.toml: traffic.frames (night)"}
+
+
+def test_a_period_whose_best_site_is_another_is_told() -> None:
+    tpog = pipeline.Tpog(
+        Grid.from_json({"origin_m": [0.0] * 3, "voxel_m": 1.0, "shape": [1, 1, 1]}), 1, np.zeros((1, 1, 1), np.int64)
+    )
+    named = [period_scores.PeriodTpog(name, tpog) for name in ("morning", "night")]
+    worth = lambda *values: SiteScore(values[0], 1.0, None, tuple(SiteScore(v, 1.0) for v in values[1:]))  # noqa: E731
+    (found,) = period_scores.disagreements(["a", "b"], [worth(9.0, 9.0, 3.0), worth(7.0, 6.0, 4.0)], named)
+    assert found.place == "scenario.toml: traffic.periods (night)"
+    assert found.found == "b is the best site, not a of the mix, which is rank 2 there and scores 25.0% less"
+    assert period_scores.disagreements(["a", "b"], [worth(9.0, 9.0, 4.0), worth(7.0, 6.0, 4.0)], named) == []
+    assert period_scores.disagreements(["a"], [worth(9.0, 0.0, 0.0)], named) == []
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('name = "night"', 'name = "day"', "two periods have the same name: day"),
+        ("length_s = 8", "length_s = 8.1", "period 'night': length_s = 8.1 is no whole number of 0.5 s"),
+        ("length_s = 8", "length_s = 9", "tpog.blocks = 4 does not divide traffic.frames = 18 of the period 'night'"),
+        ("weight = 2.5", "weight = 0", r"traffic\.periods\.0\.weight: 0; input should be greater than 0\n$"),
+        ("weight = 2.5", "weight = 2.123456789", "make a mix of .* frames; weights with fewer digits"),
+        ("begin_s = 12", "begin = 12", "begin"),
+        ("length_s = 8", "length_s = 80", "frames"),
+    ],
+)
+def test_periods_that_cannot_be_are_refused(
+    split: Path,
+    tmp_path: Path,
+    old: str,
+    new: str,
+    message: str,
+    egvs,  # type: ignore[no-untyped-def]
+) -> None:
+    file = split / "scenario.toml"
+    file.write_text(file.read_text().replace(old, new))
+    code, _, complaint = egvs("run", split, "--out", tmp_path / "out")
+    assert code == 2
+    assert re.search(message, complaint)
+
+
+def test_a_period_that_is_not_there_is_refused(split: Path, tmp_path: Path) -> None:
+    pipeline.run(pipeline.load(split), tmp_path)
+    with pytest.raises(InputError, match="no period 'noon'; one of day, night"):
+        read_tpog(tmp_path / "tpog.parquet", "noon")
+    path = tmp_path / "tpog.parquet"
+    table, about = tables.read(path, "tpog")
+    columns = {name: table.column(name).to_numpy() for name in table.column_names}
+    for broken in ([], [{}], [about["periods"][0] | {"times": 0}], "day"):
+        tables.write(path, "tpog", columns, about | {"periods": broken})
+        with pytest.raises(InputError, match="its metadata says periods"):
+            read_tpog(path)
+
+
+def test_entropy_of_a_mix_is_that_of_its_share() -> None:
+    assert binary_entropy(3, 8) == binary_entropy(15, 40)
