@@ -32,6 +32,11 @@ def named(scenario: Scenario) -> Iterator[tuple[str, str]]:
     ):  # fmt: skip
         if name is not None:
             yield key, name
+    for period in traffic.periods:
+        given = (("routes", name) for name in period.routes)
+        for key, name in (*given, ("sumocfg", period.sumocfg), ("fcd", period.fcd)):
+            if name is not None:
+                yield f"traffic.periods ({period.name}).{key}", name
     for sensor, model in scenario.sensors.items():
         if model.beams is not None:
             yield f"sensors.{sensor}.beams", model.beams
@@ -69,13 +74,18 @@ def digests(scenario: Scenario, candidates: Iterable[Site]) -> dict[str, str]:
     """
     found = {f"{key} = {name}": _digest(scenario, key, name) for key, name in named(scenario)}
     found |= {f"{key} = {name}": _presence(scenario, key, name) for key, name in measured(candidates)}
-    if scenario.traffic.sumocfg is not None:
-        try:
-            paths = sumo_folder.sources(scenario).all()
-        except InputError:
-            paths = []
-        found |= {f"{number}: {path.name}": files.sha256_of(path) for number, path in enumerate(paths)}
-    return found
+    paths = [path for alone in scenario.by_period().values() for path in _configured(alone)]
+    return found | {f"{number}: {path.name}": files.sha256_of(path) for number, path in enumerate(paths)}
+
+
+def _configured(scenario: Scenario) -> list[Path]:
+    """What a configuration of SUMO names; nothing where it is wrong, which is told elsewhere."""
+    if scenario.traffic.sumocfg is None:
+        return []
+    try:
+        return sumo_folder.sources(scenario).all()
+    except InputError:
+        return []
 
 
 def _digest(scenario: Scenario, key: str, name: str) -> str:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import wraps
 
 from pipeline.checks.subject import Refusals, Subject
 from pipeline.core.errors import InputError
@@ -12,7 +14,21 @@ from pipeline.traffic.demand import trips
 from pipeline.traffic.finished import sizes, survey
 from pipeline.world import world_frame
 
+Rule = Callable[[Subject], Iterator[Finding]]
 
+
+def _of_each_period(rule: Rule) -> Rule:
+    """The rule for the traffic of every period, each finding once."""
+
+    @wraps(rule)
+    def of_all(subject: Subject) -> Iterator[Finding]:
+        alone = (replace(subject, scenario=scenario) for scenario in subject.scenario.by_period().values())
+        yield from dict.fromkeys(finding for one in alone for finding in rule(one))
+
+    return of_all
+
+
+@_of_each_period
 def times(subject: Subject) -> Iterator[Finding]:
     """An error where times do not fit SUMO's step, or its configuration is wrong."""
     scenario, refusals = subject.scenario, Refusals()
@@ -24,6 +40,7 @@ def times(subject: Subject) -> Iterator[Finding]:
     yield from refusals.found
 
 
+@_of_each_period
 def recorded_places(subject: Subject) -> Iterator[Finding]:
     """An error where a finished file is in other coordinates than the scenario, or cannot be read from its start."""
     scenario, refusals = subject.scenario, Refusals()
@@ -34,6 +51,7 @@ def recorded_places(subject: Subject) -> Iterator[Finding]:
     yield from refusals.found
 
 
+@_of_each_period
 def finished(subject: Subject) -> Iterator[Finding]:
     """An error where a finished file does not hold the frames that are asked for, or vehicles of unknown size."""
     scenario, refusals = subject.scenario, Refusals()
@@ -67,6 +85,7 @@ def kinds(subject: Subject) -> Iterator[Finding]:
             yield Finding("traffic", f"{place}.kinds", found, "a kind that the network admits", is_error=True)
 
 
+@_of_each_period
 def counts(subject: Subject) -> Iterator[Finding]:
     """An error for each count at an edge, or of a kind, that is not there."""
     traffic, place = subject.scenario.traffic, sumo_folder.place_of(subject.scenario)

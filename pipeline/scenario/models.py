@@ -258,6 +258,12 @@ class Scenario(StrictModel):
             if traffic.frames is not None and traffic.frames % blocks:
                 of = f" of the period {period!r}" if period else ""
                 raise ValueError(f"tpog.blocks = {blocks} does not divide traffic.frames = {traffic.frames}{of}")
+        replay = self.effects.named.get("moving_occlusion")
+        if self.traffic.periods and getattr(replay, "method", "") == "frames":
+            raise ValueError(
+                'effects.moving_occlusion: method = "frames" replays all periods alike, whatever their weights;'
+                ' method = "independent" takes the mix'
+            )
         return self
 
     def _traffic_by_period(self) -> list[tuple[str, TrafficModel]]:

@@ -21,6 +21,7 @@ class Seeds:
     sites: list[str]
     seeds: int
     frames: int
+    truth: list[float]
     between: list[float]
     within: list[float]
     bias: list[float]
@@ -59,6 +60,7 @@ def between_seeds(runner: SettingRunner, scenario: Scenario, count: int, listene
         sites=runs[0].sites,
         seeds=len(runs),
         frames=tpog.frames,
+        truth=truth.tolist(),
         between=scores.std(axis=0, ddof=1).tolist(),
         within=np.sqrt((ses**2).mean(axis=0)).tolist(),
         bias=(scores.mean(axis=0) - truth).tolist(),

@@ -191,6 +191,7 @@ def test_a_period_whose_best_site_is_another_is_told() -> None:
         ("weight = 2.5", "weight = 2.123456789", "make a mix of .* frames; weights with fewer digits"),
         ("begin_s = 12", "begin = 12", "begin"),
         ("length_s = 8", "length_s = 80", "frames"),
+        ("[score]", "[effects.moving_occlusion]\n[score]", 'method = "frames" replays all periods alike'),
     ],
 )
 def test_periods_that_cannot_be_are_refused(
@@ -223,3 +224,12 @@ def test_a_period_that_is_not_there_is_refused(split: Path, tmp_path: Path) -> N
 
 def test_entropy_of_a_mix_is_that_of_its_share() -> None:
     assert binary_entropy(3, 8) == binary_entropy(15, 40)
+
+
+def test_a_file_that_a_period_lacks_is_told_before_the_first_stage(split: Path, tmp_path: Path, egvs) -> None:  # type: ignore[no-untyped-def]
+    file = split / "scenario.toml"
+    file.write_text(file.read_text().replace("begin_s = 12", 'fcd = "nacht.csv"'))
+    code, _, complaint = egvs("run", split, "--out", tmp_path / "out")
+    assert code == 2
+    assert "scenario.toml: traffic.periods (night).fcd = 'nacht.csv': no such file" in complaint
+    assert not (tmp_path / "out" / "statics.ply").exists()

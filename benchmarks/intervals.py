@@ -1,0 +1,51 @@
+"""Do the intervals of single runs hold the truth as often as they say, on a scenario of yours?
+
+``python -m benchmarks.intervals SCENARIO [SEEDS] [KEY=VALUE...]`` runs the scenario with as many seeds (32) and prints
+how far scores scatter between them, what the standard errors of single runs say, and in what share of cases the 90 %
+intervals hold the score of all runs taken together. The same as ``egvs accuracy --seeds``, without its other settings.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.core.progress import silent
+from pipeline.scenario.loading import load
+from pipeline.studies.measuring import SettingRunner
+from pipeline.studies.seeds import between_seeds
+
+SEEDS = 32
+
+
+def told(name: str, state: str, about: dict[str, Any]) -> None:
+    """A line for each seed."""
+    print(f"{name}: {state} {about.get('why', '')}", file=sys.stderr)
+
+
+def main() -> None:
+    """Run, and print."""
+    scenario, *more = sys.argv[1:]
+    count = int(more.pop(0)) if more and more[0].isdigit() else SEEDS
+    with tempfile.TemporaryDirectory() as folder:
+        runner = SettingRunner(Path(scenario), tuple(more), Path(folder), 1, silent)
+        found = between_seeds(runner, load(scenario, more), count, told)
+    if found is None:
+        print("fewer than two seeds went through")
+        return
+    truth = np.array(found.truth)
+    print(f"{found.seeds} seeds of {found.frames} frames, {len(found.sites)} sites")
+    for what, values in (("scatter between runs", found.between), ("standard errors", found.within)):
+        shares = 100 * np.array(values) / truth
+        print(f"{what}: {shares.min():.1f} to {shares.max():.1f} % of the score")
+    for what, values in (("bias", found.bias), ("bias expected", found.expected_bias)):
+        print(f"{what}: {100 * (np.array(values) / truth).mean():+.1f} % on average")
+    print(f"90 % intervals hold in {found.covered:.1%} of cases")
+
+
+if __name__ == "__main__":
+    main()
