@@ -117,8 +117,8 @@ class Grid:
         o = np.array([self._in_voxels(p, z) for p, z in zip(position_world_m, self.origin_m, strict=True)])
         with np.errstate(over="ignore"):
             d = ends_m / self.voxel_m
-        for axis in np.flatnonzero(o == np.rint(o)):
-            d[np.abs(ends_m[:, axis]) <= ON_PLANE_M, axis] = 0.0
+        flat = (ends_m <= ON_PLANE_M) & (ends_m >= -ON_PLANE_M)
+        np.copyto(d, 0.0, where=flat & (o == np.rint(o)))
         return o, d
 
     def _in_voxels(self, at_m: float, origin_m: float) -> float:
