@@ -44,11 +44,11 @@ def named(scenario: Scenario) -> Iterator[tuple[str, str]]:
 
 def missing(scenario: Scenario) -> Iterator[Finding]:
     """An error for each file that is not there, and for each measured scan that nothing can read."""
-    scans = list(measured(sound_sites(scenario)))
+    scans = [scan for scan in measured(sound_sites(scenario)) if scan[1] != scenario.sites.points]
     for key, name in (*named(scenario), *scans):
         try:
             scenario.find(name, key)
-            if (key, name) in scans:
+            if (key, name) in scans or key == "sites.points":
                 point_clouds.reader_of(Path(name), key)
         except InputError as error:
             yield Finding.of("files", error)
