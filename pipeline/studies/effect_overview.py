@@ -157,7 +157,9 @@ def _advised(kind: type[Effect[Any]], scene: Scene, trials: Trials | None) -> Ca
         values = ", ".join(f"{key} = {value:g}" for key, value in kind.TRIAL.items())
         tried = f"; tried with {values}" if trials is not None and not isinstance(effect, Traffic) else ""
         return call("your choice", "; ".join(filter(None, (f"{kind.UNTOLD} decides", seen))) + tried, change)
-    return call("little" if small else "called for", seen or "it can act here", change)
+    unknown = trials is None and isinstance(effect, Articulated)  # which vehicles come
+    state = "little" if small else "your choice" if unknown else "called for"
+    return call(state, seen or "it can act here", change)
 
 
 def _tried(effect: Effect[Any], trials: Trials) -> tuple[bool, str]:

@@ -81,6 +81,7 @@ def test_trees_and_long_trucks_in_the_scene_are_seen(mini: Path, tmp_path: Path)
     text = (mini / "scenario.toml").read_text()
     kind = text[text.index("[[traffic.kinds]]") : text.index("[statics]")]
     (mini / "scenario.toml").write_text(text.replace(kind, "").replace('fcd.csv"', "fcd.csv\"\nvtypes = ['truck.xml']"))
+    assert states(mini)["articulated"] == ("your choice", "the vtypes may name kinds of 16 m and more, which bend")
     pipeline.run(pipeline.load(mini), tmp_path / "out")
     found = advice(mini, tmp_path / "out")
     assert (found["foliage"].state, found["foliage"].why) == (

@@ -42,6 +42,7 @@ from pipeline.core.errors import InputError
 from pipeline.effects.base import Traffic
 from pipeline.scenario.effects import ArticulatedParameters, EffectParameters, VehicleParts
 from pipeline.scenario.models import Scenario
+from pipeline.sensing.scene import Scene
 from pipeline.traffic.boxes import Size, VehicleBoxes, tidy_m, tidy_rad
 from pipeline.traffic.finished.sizes import kind_sizes
 
@@ -81,8 +82,16 @@ class Articulated(Traffic[ArticulatedParameters]):
         """
         own = scenario.traffic.sumocfg is not None or scenario.traffic.routes or scenario.traffic.vtypes
         if not own and not self.geometries(kind_sizes(scenario.traffic.kinds), self.place(scenario)):
-            return False, "no kind of vehicle has more than one part"
+            longest_m = max(kind.length_m for kind in scenario.traffic.kinds)
+            return False, f"no kind of vehicle has more than one part (the longest is {longest_m:g} m)"
         return True, "named"
+
+    def seen(self, scene: Scene) -> str:
+        """Which vehicles may get parts."""
+        own = scene.scenario.traffic
+        given = next((key for key in ("sumocfg", "routes", "vtypes") if getattr(own, key)), None)
+        which = "the fleet has kinds" if given is None else f"the {given} may name kinds"
+        return f"{which} of {_LONG_M:g} m and more, which bend"
 
     def box_change(self, scenario: Scenario, sizes: Mapping[str, Size]) -> Follower:
         """Each box of several parts becomes one box a part."""
