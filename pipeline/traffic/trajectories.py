@@ -24,6 +24,9 @@ from pipeline.traffic.frames import FrameGroup
 from pipeline.traffic.recording import Recording
 from pipeline.traffic.tally import SQUARE_M, TrafficTally
 
+LONG_STAND_S = 120.0
+"""A common signal comes round within 90 to 120 s."""
+
 MOST_OVERLAPS = 0.05
 """Share of frames with an overlap that SUMO's sublane model makes by itself: 0 to 5 % were measured."""
 
@@ -88,9 +91,9 @@ def _check(traffic: TrafficModel, tally: TrafficTally, recording: Recording) -> 
 def doubts(tally: TrafficTally, recording: Recording, roi: Roi) -> list[Finding]:
     """What does not look like traffic: who stood too long, boxes that overlap too often; each with its place."""
     found, period_s = [], recording.window.period_ms / 1000.0
-    stand, patience_s = tally.longest_jam, recording.patience_s
-    if stand is not None and patience_s is not None and (stood_s := stand.frames * period_s) > patience_s:
-        what = f"vehicle {stand.vehicle!r} stood there for {stood_s:g} s, longer than two turns of any signal"
+    stand = tally.longest_jam
+    if stand is not None and recording.patience_s is not None and (stood_s := stand.frames * period_s) > LONG_STAND_S:
+        what = f"vehicle {stand.vehicle!r} stood there for {stood_s:g} s, longer than any signal should keep it"
         cure = "look at the signals and connections of the network there, or let fewer vehicles in"
         found.append(Finding("standing", f"{recording.place}: {where(stand.at_m, roi)}", what, cure))
     share = tally.frames_with_overlap / tally.frames

@@ -26,7 +26,7 @@ def counted(rows, frames=300, on_purpose=frozenset()):
     return tally
 
 
-def test_who_stands_longer_than_two_signal_cycles_is_told_with_the_place():
+def test_who_stands_longer_than_a_signal_keeps_it_is_told_with_the_place():
     rows = [(f, "stuck", "car", 100, 62, 0, 0.0 if 10 <= f < 210 else 5.0) for f in range(300)]
     rows += [(f, "parked", "car", 0, 20 if f < 299 else 30, 0, 0.0) for f in range(300)]
     tally = counted(rows, on_purpose={"parked"})
@@ -35,7 +35,10 @@ def test_who_stands_longer_than_two_signal_cycles_is_told_with_the_place():
     assert found.place == "s.toml: traffic: x 100 m, y 60 m (76 m from the region of interest)"  # the box's centre
     assert found.found.startswith("vehicle 'stuck' stood there for 199 s")
     assert tally.to_json(1.0)["longest_standing_s"] == 299
-    assert trajectories.doubts(tally, recorded(patience_s=200.0), ROI) == []
+    short = counted([row for row in rows if row[0] < 130])
+    assert [d.rule for d in trajectories.doubts(short, recorded(patience_s=180.0), ROI)] == ["standing"]
+    brief = counted([row for row in rows if row[0] < 100])
+    assert trajectories.doubts(brief, recorded(patience_s=180.0), ROI) == []
     assert trajectories.doubts(tally, recorded(), ROI) == []  # of a finished file nothing is promised
 
 
