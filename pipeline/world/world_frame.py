@@ -51,8 +51,7 @@ def key(scenario: Scenario) -> dict[str, Any]:
     found: dict[str, Any] = {}
     if scenario.crs.epsg is not None:
         found["crs"] = [scenario.crs.epsg, *scenario.crs.offset_m]
-    path = sumo_folder.network_path(scenario)
-    if path is not None and path.is_file():
+    if (path := _network_path(scenario)) is not None:
         if network.is_osm(path):
             found |= {"map": files.sha256_of(path), "sumo": sumo.version()}
         elif (location := network.location_of(path)) is not None and location.projection not in _NONE:
@@ -78,9 +77,17 @@ def _stated(scenario: Scenario) -> WorldFrame | None:
     return WorldFrame.of(f"EPSG:{crs.epsg}", crs.offset_m, f"{scenario.file}: crs.epsg")
 
 
+def _network_path(scenario: Scenario) -> Path | None:
+    """The network's file, where it is there: a scan needs none, and who reads traffic tells that it is missing."""
+    try:
+        path = sumo_folder.network_path(scenario)
+    except InputError:
+        return None
+    return path if path is not None and path.is_file() else None
+
+
 def _of_network(scenario: Scenario) -> WorldFrame | None:
-    path = sumo_folder.network_path(scenario)
-    if path is None or not path.is_file():
+    if (path := _network_path(scenario)) is None:
         return None
     if network.is_osm(path):
         status = path.stat()

@@ -90,6 +90,14 @@ def test_a_network_that_was_drawn_lies_nowhere(tmp_path: Path) -> None:
         assert ("world_frame" in world_frame.key(scene)) == (projection in ("-", "."))
 
 
+def test_a_network_that_is_missing_is_told_by_who_needs_it(tmp_path: Path) -> None:
+    """Statics, scans and scores can be made again where only they are kept."""
+    for traffic in ({"network": "gone.net.xml"}, {"sumocfg": "gone.sumocfg"}):
+        scene = load(tmp_path, traffic)
+        assert world_frame.of(scene).frame is None
+        assert world_frame.key(scene) == {}
+
+
 def test_a_scenario_may_say_it_itself(tmp_path: Path) -> None:
     crs = {"epsg": 32632, "offset_m": [-550000, -5634000]}
     scene = load(tmp_path, {"fcd": "f.csv"}, (700, 1200), crs=crs)
