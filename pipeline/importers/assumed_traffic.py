@@ -40,7 +40,8 @@ For a street with a lane each way twice as much in both directions together; Ger
 _OTHER_H = 40.0
 _CAR = "passenger"
 _LEAST_M2 = 10.0
-_ROUNDS = 200
+_ROUNDS = 3
+"""Where what comes in cannot all leave by lanes of the same class, more rounds would leave whole turns empty."""
 
 
 def flows(streets: Streets, roi: Region) -> list[CountModel]:
