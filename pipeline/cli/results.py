@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.table import Table
 
+from pipeline.artefacts.period_ranking import PeriodRanking
 from pipeline.artefacts.readers import SEPARABLE, read_scores
 from pipeline.artefacts.run_record import RunRecord
 from pipeline.cli.terminal import NARROW, WIDE, console, in_words, table, value_in_words
-from pipeline.report.by_period import PeriodRanking
 from pipeline.report.ranking import ScoredSite, poles_of
 
 if TYPE_CHECKING:

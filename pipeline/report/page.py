@@ -15,13 +15,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from pipeline.artefacts.period_ranking import PERIOD_SCORES, PeriodRanking
 from pipeline.artefacts.readers import SEPARABLE, Tpog, read_tpog
 from pipeline.artefacts.run_record import RECORD, RunRecord, StageRecord
 from pipeline.core import files
 from pipeline.core.findings import WARNINGS, warnings_of
 from pipeline.core.version import __version__
 from pipeline.report import figures, maps, wording
-from pipeline.report.by_period import PERIOD_SCORES, PeriodRanking
 from pipeline.report.colours import STYLE_SHEET
 from pipeline.report.figures import Figures
 from pipeline.report.ranking import Ranking, ScoredSite

@@ -16,11 +16,11 @@ from hypothesis import strategies as st
 
 import pipeline
 from pipeline.artefacts import periods, tables
+from pipeline.artefacts.period_ranking import PeriodRanking
 from pipeline.artefacts.readers import read_periods, read_scores_by_period, read_tpog
 from pipeline.core.errors import InputError
 from pipeline.core.findings import warnings_of
 from pipeline.core.grid import Grid
-from pipeline.report.by_period import PeriodRanking
 from pipeline.scoring.egvs import EntropyField, binary_entropy
 from pipeline.scoring.leave_out import Groups, LeaveOut
 from pipeline.scoring.scorer import SiteScore
