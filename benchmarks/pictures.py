@@ -20,11 +20,11 @@ import pipeline
 from pipeline.artefacts.readers import read_scores, read_tpog, read_trajectories
 from pipeline.effects import registry
 from pipeline.effects.on_traffic import SELF_ACTING
-from pipeline.report.map_frame import extent, standalone
-from pipeline.report.maps import Backdrop, SiteView, site_view
-from pipeline.report.outlines import outlines_of
+from pipeline.report.drawing.map_frame import extent, standalone
+from pipeline.report.drawing.maps import Backdrop, SiteView, site_view
+from pipeline.report.drawing.outlines import outlines_of
+from pipeline.report.drawing.roads import network_file, roads_within
 from pipeline.report.ranking import ScoredSite
-from pipeline.report.roads import network_file, roads_within
 from pipeline.runs import workflow
 from pipeline.scenario.effects import EffectsModel
 from pipeline.scenario.models import Scenario

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.artefacts.readers import Tpog
-from pipeline.report import maps
-from pipeline.report.map_frame import extent
-from pipeline.report.maps import Backdrop
-from pipeline.report.outlines import outlines_of
+from pipeline.report.drawing import maps
+from pipeline.report.drawing.map_frame import extent
+from pipeline.report.drawing.maps import Backdrop
+from pipeline.report.drawing.outlines import outlines_of
+from pipeline.report.drawing.raster import ColumnValues
+from pipeline.report.drawing.roads import network_file, roads_within
 from pipeline.report.ranking import Ranking, ScoredSite
-from pipeline.report.raster import ColumnValues
-from pipeline.report.roads import network_file, roads_within
 from pipeline.report.site_views import SiteViews, site_views
 from pipeline.scoring.scorer import Scorer
 from pipeline.stages.base import Workspace

@@ -21,11 +21,12 @@ from pipeline.artefacts.run_record import RECORD, RunRecord, StageRecord
 from pipeline.core import files
 from pipeline.core.findings import WARNINGS, warnings_of
 from pipeline.core.version import __version__
-from pipeline.report import figures, maps, wording
-from pipeline.report.colours import STYLE_SHEET
+from pipeline.report import figures, wording
+from pipeline.report.drawing import maps
+from pipeline.report.drawing.colours import STYLE_SHEET
+from pipeline.report.drawing.roads import network_file
 from pipeline.report.figures import Figures
 from pipeline.report.ranking import Ranking, ScoredSite
-from pipeline.report.roads import network_file
 from pipeline.report.study import ACCURACY, StudySummary
 from pipeline.scenario.models import Scenario
 from pipeline.stages.base import StageInputs, Summary, Workspace

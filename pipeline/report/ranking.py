@@ -12,7 +12,7 @@ import pyarrow as pa
 
 from pipeline.artefacts.readers import SEPARABLE, read_scores
 from pipeline.core.errors import InputError
-from pipeline.report.map_frame import MapSite
+from pipeline.report.drawing.map_frame import MapSite
 
 CLOSE = 0.01
 """Sites within this share of the best score are named beside it."""

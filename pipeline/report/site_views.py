@@ -17,11 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core.grid import Grid
-from pipeline.report import maps, raster, wording
-from pipeline.report.map_frame import Box, extent, shared_scale
-from pipeline.report.maps import Backdrop, SiteView
+from pipeline.report import wording
+from pipeline.report.drawing import maps, raster
+from pipeline.report.drawing.map_frame import Box, extent, shared_scale
+from pipeline.report.drawing.maps import Backdrop, SiteView
+from pipeline.report.drawing.raster import ColumnValues, IndexedImage
 from pipeline.report.ranking import Ranking, ScoredSite
-from pipeline.report.raster import ColumnValues, IndexedImage
 from pipeline.scoring.egvs import EntropyField
 from pipeline.scoring.scorer import Scorer
 from pipeline.scoring.visibility import Beams

@@ -20,14 +20,14 @@ import pytest
 from pipeline.artefacts import tables
 from pipeline.artefacts.readers import read_scores, read_tpog
 from pipeline.core.grid import Grid
-from pipeline.report import map_frame, maps, raster
 from pipeline.report import page as report
+from pipeline.report.drawing import map_frame, maps, raster
+from pipeline.report.drawing.map_frame import MapSite
+from pipeline.report.drawing.maps import Backdrop
+from pipeline.report.drawing.outlines import outlines_of
+from pipeline.report.drawing.roads import Roads
 from pipeline.report.figures import Figures
-from pipeline.report.map_frame import MapSite
-from pipeline.report.maps import Backdrop
-from pipeline.report.outlines import outlines_of
 from pipeline.report.ranking import Ranking
-from pipeline.report.roads import Roads
 from pipeline.scenario.effects import EffectsModel
 from pipeline.scenario.loading import from_values
 from pipeline.scoring.egvs import EntropyField

@@ -3,7 +3,7 @@
 - :func:`occupancy`: a field over the region, summed along z, with the static outlines and the sites;
 - :func:`site_map`: the sites, coloured by score, numbered by rank;
 - :func:`site_view`: what one site sees or misses; such figures share the colour scale
-  :func:`pipeline.report.map_frame.shared_scale`;
+  :func:`pipeline.report.drawing.map_frame.shared_scale`;
 - :func:`scan_view`: where the beams of its empty scan end.
 
 Roads lie under all of them but the last.
@@ -22,11 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core.grid import Grid
-from pipeline.report import colours, raster
-from pipeline.report.map_frame import Box, ColourBar, MapSite, Plan, extent
-from pipeline.report.outlines import Outlines
-from pipeline.report.raster import ColumnValues, IndexedImage
-from pipeline.report.roads import Roads, StreetName
+from pipeline.report.drawing import colours, raster
+from pipeline.report.drawing.map_frame import Box, ColourBar, MapSite, Plan, extent
+from pipeline.report.drawing.outlines import Outlines
+from pipeline.report.drawing.raster import ColumnValues, IndexedImage
+from pipeline.report.drawing.roads import Roads, StreetName
 
 Place = list[MapSite]
 """Sites that stand above one another, the best first."""

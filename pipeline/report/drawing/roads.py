@@ -17,7 +17,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from pipeline.report.map_frame import Box
+from pipeline.report.drawing.map_frame import Box
 from pipeline.traffic import network, sumo_folder
 from pipeline.traffic.network import Edge, Lane, Network
 

@@ -2,8 +2,8 @@
 region of interest, colour bar.
 
 A figure is SVG text. It is written here, not by a plotting library: colours then follow the page (light, dark, print)
-through the classes in :data:`pipeline.report.colours.STYLE_SHEET`, lettering stays text, and the bytes depend on no
-installed font.
+through the classes in :data:`pipeline.report.drawing.colours.STYLE_SHEET`, lettering stays text, and the bytes depend
+on no installed font.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core.grid import Grid
-from pipeline.report.colours import STEPS, STYLE_SHEET, opacity
+from pipeline.report.drawing.colours import STEPS, STYLE_SHEET, opacity
 
 Box = tuple[float, float, float, float]
 """x0, y0, x1, y1: in the world frame, metres, or in a figure's units."""

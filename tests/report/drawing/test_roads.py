@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.core.grid import Grid
-from pipeline.report import maps
-from pipeline.report.map_frame import MapSite
-from pipeline.report.maps import Backdrop
-from pipeline.report.roads import Roads, network_file, roads_within
+from pipeline.report.drawing import maps
+from pipeline.report.drawing.map_frame import MapSite
+from pipeline.report.drawing.maps import Backdrop
+from pipeline.report.drawing.roads import Roads, network_file, roads_within
 
 NETWORK = """<net version="1.20">
     <edge id=":b_0" function="internal"><lane id=":b_0_0" index="0" length="8" shape="46,-1.6 54,-1.6"/></edge>

@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from pipeline.report.colours import ON_DARK, ON_LIGHT, SHADE, mixed, opacity
+from pipeline.report.drawing.colours import ON_DARK, ON_LIGHT, SHADE, mixed, opacity
 
 ColumnValues = NDArray[np.float64]
 """One value a column of voxels, (nx, ny) float64."""

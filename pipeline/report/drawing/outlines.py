@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.report.map_frame import Box
+from pipeline.report.drawing.map_frame import Box
 from pipeline.world.mesh import World
 
 _SMALL_M2 = 4.0
