@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from pipeline.cli.terminal import NARROW, console, table
@@ -75,7 +76,7 @@ def _site_table(found: Comparison, runs: Sequence[ComparedRun], sites: Sequence[
             cells |= {"longitude": f"{site.longitude_deg:.6f}", "latitude": f"{site.latitude_deg:.6f}"}
         for run in runs:
             cells |= _cells(run.label, run.sites.get(site.site))
-        rows.add_row(*(cells[name] for name in (*names, *of_runs)))
+        rows.add_row(*(escape(cells[name]) for name in (*names, *of_runs)))
     return rows
 
 
@@ -99,7 +100,7 @@ def _agreement_table(found: Comparison) -> Table:
         best = same + _few(pair.best_a) if same else f"{_few(pair.best_a)} / {_few(pair.best_b)}"
         tau, rho = ("-" if value is None else f"{value:.2f}" for value in (pair.tau, pair.rho))
         lost = "-" if pair.regret_a is None else f"{pair.regret_a:.2%}"
-        rows.add_row(f"{pair.a}, {pair.b}", str(pair.shared), tau, rho, best if pair.shared else "-", lost)
+        rows.add_row(f"{pair.a}, {pair.b}", str(pair.shared), tau, rho, escape(best) if pair.shared else "-", lost)
     return rows
 
 
@@ -111,7 +112,7 @@ def _difference_table(found: Comparison) -> Table:
     labels = [run.label for run in found.runs]
     rows = table(["what differs", *labels], left=["what differs", *labels])
     for difference in found.differences:
-        rows.add_row(difference.what, *map(_value, difference.values))
+        rows.add_row(escape(difference.what), *(escape(_value(value)) for value in difference.values))
     return rows
 
 

@@ -122,7 +122,7 @@ def _read(folder: Path, label: str) -> ComparedRun:
     read = {
         name: digest
         for key, stage in record.stages.items()
-        if key != "report"
+        if key not in ("check", "report")
         for name, digest in stage.files.items()
         if name not in made
     }
@@ -175,7 +175,16 @@ def _agreement(a: ComparedRun, b: ComparedRun) -> Agreement:
 
 
 def _differences(runs: Sequence[ComparedRun]) -> Iterator[Difference]:
+    whole_rows: dict[str, None] = {}
     for key in dict.fromkeys(key for run in runs for key in run.settings):
+        row = key[: key.rindex("]") + 1] if "]" in key else ""
+        have = [any(other.startswith(row) for other in run.settings) for run in runs] if row else []
+        if row in whole_rows:
+            continue
+        if not all(have):  # a row of a table that some runs lack: once, not key by key
+            whole_rows[row] = None
+            yield Difference(row, tuple("there" if has else None for has in have))
+            continue
         values = tuple(run.settings.get(key) for run in runs)
         if any(value != values[0] for value in values):
             yield Difference(key, values)

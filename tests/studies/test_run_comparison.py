@@ -121,6 +121,24 @@ def test_tables_fit_the_terminal(width: int, runs: int, monkeypatch: pytest.Monk
     assert any("longitude" in line for line in header) == (width == 190)
 
 
+def test_a_row_that_a_run_lacks_is_told_once_and_by_its_name(
+    mini: Path,
+    tmp_path: Path,
+    egvs,  # type: ignore[no-untyped-def]
+) -> None:
+    pipeline.run(pipeline.load(mini), tmp_path / "first")
+    file = mini / "scenario.toml"
+    van = '[[traffic.kinds]]\nname = "van"\nlength_m = 5\nwidth_m = 2\nheight_m = 2\n'
+    file.write_text(
+        file.read_text().replace("[statics]", f"{van}\n[statics]").replace("length_m = 4.5", "length_m = 4.4")
+    )
+    pipeline.run(pipeline.load(mini), tmp_path / "second")
+    found = {d.what: d.values for d in compare([tmp_path / "first", tmp_path / "second"]).differences}
+    assert found == {"traffic.kinds[car].length_m": (4.5, 4.4), "traffic.kinds[van]": (None, "there")}
+    _, printed, _ = egvs("compare", tmp_path / "first", tmp_path / "second")
+    assert "traffic.kinds[car].length_m" in printed
+
+
 def test_letters_go_on_after_z() -> None:
     assert [run_comparison._letter(n) for n in (0, 25, 26, 27, 52)] == ["A", "Z", "AA", "AB", "BA"]
 
