@@ -6,8 +6,10 @@ leaves its warnings in its summary under :data:`WARNINGS`, as :meth:`Finding.to_
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 from pipeline.core.errors import InputError
@@ -56,6 +58,14 @@ class Finding:
 def warnings_of(summaries: Iterable[Mapping[str, Any]]) -> list[Finding]:
     """The warnings that stages have left in their summaries, in their order."""
     return [Finding(**value) for summary in summaries for value in summary.get(WARNINGS, ())]
+
+
+def seen_from(folder: Path, summary: dict[str, Any]) -> dict[str, Any]:
+    """A stage's summary whose warnings name files as seen from the scenario's folder: a report, and what the store
+    holds for other folders, must not depend on where that is.
+    """
+    warnings = [w | {"place": w["place"].removeprefix(f"{folder}{os.sep}")} for w in summary.get(WARNINGS, ())]
+    return summary | ({WARNINGS: warnings} if warnings else {})
 
 
 class FindingsError(InputError):

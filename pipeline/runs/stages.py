@@ -10,6 +10,7 @@ from typing import Any
 from pipeline.artefacts.run_record import STAGES
 from pipeline.core import files
 from pipeline.core.cost import Cost, measured
+from pipeline.core.findings import seen_from
 from pipeline.stages.base import StageInputs, Summary, Workspace
 
 RANKING = STAGES[1:-1]
@@ -75,7 +76,7 @@ def make(stage: str, work: Workspace, inputs: StageInputs, **options: Any) -> Ma
     before = _companions(module, out)
     work.forget(*module.ARTEFACTS)
     with measured() as cost:
-        summary = module.run(work, inputs, **options)
+        summary = seen_from(work.scenario.folder, module.run(work, inputs, **options))
     artefacts = work.digests(*(name for name in module.ARTEFACTS if (out / name).exists()))
     written = sorted(name for name, stamp in _companions(module, out).items() if before.get(name) != stamp)
     return Made(artefacts, {name: files.sha256_of(out / name) for name in written}, summary, cost)

@@ -265,7 +265,7 @@ def doubts(estimate: Estimate, place: str, frame_period_s: float, names: Sequenc
 
 def _doubt(part: Stratum, place: str, frame_period_s: float) -> Finding:
     frames, lasts = part.groups.total, part.groups.memory
-    wide = f", though widened by {part.widening - 1.0:.0%}" if part.widening >= 1.005 else ""
+    wide = f", though widened by {part.widening - 1.0:.0%}," if part.widening >= 1.005 else ""
     found = (
         f"{frames} frames ({frames * frame_period_s:g} s) are short beside the traffic's memory of"
         f" {lasts * frame_period_s:.3g} s: standard errors{wide} may be too small"

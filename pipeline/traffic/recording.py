@@ -238,7 +238,8 @@ def _crashed(crashes: dict[tuple[str, str], str], scenario: Scenario) -> list[Fi
         for lane in crashes.values()
     )
     shown = ", ".join(f"{n} at {place}" for place, n in places.most_common(3))
-    found = f"{len(crashes)} pairs of vehicles collided, and drove on through each other: {shown}"
+    pairs = f"{len(crashes)} pairs" if len(crashes) > 1 else "a pair"
+    found = f"{pairs} of vehicles collided, and drove on through each other: {shown}"
     cure = "look at these places in sumo-gui: right of way, signals, how long the waiting room on a junction is"
     return [Finding("collisions", sumo_folder.place_of(scenario), found, cure)]
 
