@@ -32,6 +32,7 @@ from pipeline.sensing.beam_effects import BeamCutter, BeamExpander
 from pipeline.traffic.extensions import TrafficExtension
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
     from pipeline.artefacts.readers import Tpog
     from pipeline.core.grid import Grid
     from pipeline.scenario.models import Scenario
-    from pipeline.sensing.crossings import Crossings
+    from pipeline.sensing.crossings import Crossings, Falls
     from pipeline.sensing.scene import Scene
     from pipeline.sensing.sensors import Sensor
 
@@ -140,6 +141,12 @@ class TransmitScore(Effect[P]):
         """Share (k,), 0 to 1, of its beam that gets as far as each crossing of ``crossings``; called from several
         threads."""
         raise NotImplementedError
+
+    def falls(self, ends_m: NDArray[np.float64]) -> Iterator[Falls] | None:
+        """Where the shares of all beams (n, 3; their ends seen from the sensor) fall, some beams at a time; None where
+        that is not known without crossings. Tells the same as :meth:`share`, which needs crossings to be listed."""
+        del ends_m
+        return None
 
 
 class Detect(Effect[P]):

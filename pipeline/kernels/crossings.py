@@ -31,7 +31,7 @@ def crossings(o, d, shape, voxel_m, first, cells, enter_m, leave_m):  # type: ig
     unused, total = np.empty(0, np.uint32), 0
     first[0] = 0
     for n in range(d.shape[0]):
-        count, _, _ = _walk(o, d[n], shape, voxel_m, unused, np.uint32(0), cells[total:], t_cells, times)
+        count, _, _ = _walk(o, d[n], shape, voxel_m, unused, np.uint32(0), None, cells[total:], t_cells, times)
         size = np.sqrt(d[n, 0] ** 2 + d[n, 1] ** 2 + d[n, 2] ** 2) * voxel_m
         for i in range(count):
             enter_m[total + i] = t_cells[i, 0] * size
@@ -62,3 +62,38 @@ def add_shares(first, cells, weights, share, unit, hits):  # type: ignore[no-unt
         weight = weights[n]
         for i in range(first[n], first[n + 1]):
             hits[cells[i]] += np.int64(np.rint(weight * share[i] * unit))
+
+
+@_kernel
+def add_falling(o, d, shape, voxel_m, rows, first, range_m, share, weights, unit, hits):  # type: ignore[no-untyped-def]
+    """As :func:`add_shares` of the :func:`crossings` of some beams whose shares fall step by step; lists nothing.
+
+    Parameters
+    ----------
+    o, d, shape, voxel_m
+        As in :func:`crossings`.
+    rows
+        Which beams, (n,) int64.
+    first, range_m, share
+        Falls first[i] to first[i + 1] belong to beam rows[i], (n + 1,) int64: their ranges, ascending, and the share
+        that gets as far as voxels that are entered further away, (k,) float64 each.
+    weights, unit, hits
+        As in :func:`add_shares`.
+    """
+    times, most = _scratch(shape), np.int64(0)
+    for i in range(rows.shape[0]):
+        most = max(most, first[i + 1] - first[i])
+    t_falls, amounts = np.empty(most + 1), np.empty(most + 1, np.int64)
+    for i in range(rows.shape[0]):
+        beam, count = rows[i], first[i + 1] - first[i]
+        weight = weights[beam]
+        amounts[0] = np.int64(np.rint(weight * unit))
+        if count == 0:
+            _walk(o, d[beam], shape, voxel_m, hits, amounts[0], None, None, None, times)
+            continue
+        size = np.sqrt(d[beam, 0] ** 2 + d[beam, 1] ** 2 + d[beam, 2] ** 2) * voxel_m
+        for k in range(count):
+            t_falls[k] = range_m[first[i] + k] / size
+            amounts[k + 1] = np.int64(np.rint(weight * share[first[i] + k] * unit))
+        t_falls[count] = np.inf
+        _walk(o, d[beam], shape, voxel_m, hits, amounts[0], (t_falls, amounts), None, None, times)

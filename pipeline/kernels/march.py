@@ -135,11 +135,41 @@ def _count(hits, amount, times_x, times_y, times_z, cell, step_x, step_y, step_z
     hits[cell] += amount * (t_last - t > shortest)
 
 
+@_inlined
+def _count_falling(hits, falls, times_x, times_y, times_z, cell, step_x, step_y, step_z, t, t_last, shortest):  # type: ignore[no-untyped-def]
+    """As :func:`_count`, with an amount that changes: ``falls`` are two arrays: where, as shares of the segment,
+    ascending, infinity last; and the amounts of voxels entered before each."""
+    t_falls, amounts = falls
+    one = np.uint64(1)
+    ix, iy, iz, at = np.uint64(0), np.uint64(0), np.uint64(0), np.uint64(0)
+    tx, ty, tz, following, on = times_x[ix], times_y[iy], times_z[iz], cell, True
+    while on:
+        if tx < ty and tx < tz:
+            t_next, following = tx, cell + step_x
+            ix += one
+            tx = times_x[ix]
+        elif ty < tz:
+            t_next, following = ty, cell + step_y
+            iy += one
+            ty = times_y[iy]
+        elif tz < np.inf:
+            t_next, following = tz, cell + step_z
+            iz += one
+            tz = times_z[iz]
+        else:
+            t_next, on = t_last, False
+        while t_falls[at] < t:
+            at += one
+        hits[cell] += amounts[at] * (t_next - t > shortest)
+        t, cell = t_next, following
+
+
 @_kernel
-def _walk(o, d, shape, voxel_m, hits, amount, cells, t_cells, times):  # type: ignore[no-untyped-def]
+def _walk(o, d, shape, voxel_m, hits, amount, falls, cells, t_cells, times):  # type: ignore[no-untyped-def]
     """:func:`walk` with what a crossed voxel gets, and room for the crossings, from :func:`_scratch`.
 
-    Whether voxels are counted or listed is settled when it is compiled: ``cells`` is None or an array.
+    Whether voxels get one amount, get amounts that fall (:func:`_count_falling`), or are listed is settled when it is
+    compiled: ``falls`` and ``cells`` are None or not.
     """
     ox, oy, oz = o[0], o[1], o[2]
     dx, dy, dz = d[0], d[1], d[2]
@@ -170,7 +200,10 @@ def _walk(o, d, shape, voxel_m, hits, amount, cells, t_cells, times):  # type: i
     tx, ty, tz = times_x[ix], times_y[iy], times_z[iz]
     t_first, count = t, 0
     if cells is None:
-        _count(hits, amount, times_x, times_y, times_z, cell, step_x, step_y, step_z, t, t_last, shortest)
+        if falls is None:
+            _count(hits, amount, times_x, times_y, times_z, cell, step_x, step_y, step_z, t, t_last, shortest)
+        else:
+            _count_falling(hits, falls, times_x, times_y, times_z, cell, step_x, step_y, step_z, t, t_last, shortest)
         return 0, t_first, t_last
     following, on = cell, True
     while on:
@@ -221,7 +254,7 @@ def walk(o, d, shape, voxel_m, hits, cells, t_cells):  # type: ignore[no-untyped
         Number of voxels listed (0 where they are counted); the part of the segment inside the grid (none when
         ``t_last <= t_first``).
     """
-    return _walk(o, d, shape, voxel_m, hits, np.uint32(1), cells, t_cells, _scratch(shape))
+    return _walk(o, d, shape, voxel_m, hits, np.uint32(1), None, cells, t_cells, _scratch(shape))
 
 
 @_kernel
@@ -241,7 +274,7 @@ def count_hits(o, d, shape, voxel_m, hits):  # type: ignore[no-untyped-def]
     """
     times = _scratch(shape)
     for beam in range(d.shape[0]):
-        _walk(o, d[beam], shape, voxel_m, hits, np.uint32(1), None, None, times)
+        _walk(o, d[beam], shape, voxel_m, hits, np.uint32(1), None, None, None, times)
 
 
 @_kernel
@@ -249,7 +282,7 @@ def add_hits(o, d, shape, voxel_m, weights, hits):  # type: ignore[no-untyped-de
     """As :func:`count_hits`, for beams that weigh ``weights`` (n,) int64; ``hits`` are int64."""
     times = _scratch(shape)
     for beam in range(d.shape[0]):
-        _walk(o, d[beam], shape, voxel_m, hits, weights[beam], None, None, times)
+        _walk(o, d[beam], shape, voxel_m, hits, weights[beam], None, None, None, times)
 
 
 @_kernel
@@ -302,7 +335,7 @@ def audit(o, d, shape, voxel_m, last_beam):  # type: ignore[no-untyped-def]
     worst_sum, longest_gap, misplaced, doubled = 0.0, 0.0, 0, 0
     slack = 1e-9 * max(shape[0], shape[1], shape[2])
     for beam in range(d.shape[0]):
-        count, t_first, t_last = _walk(o, d[beam], shape, voxel_m, last_beam, np.uint32(1), cells, t_cells, times)
+        count, t_first, t_last = _walk(o, d[beam], shape, voxel_m, last_beam, np.uint32(1), None, cells, t_cells, times)
         if not t_first < t_last:
             continue
         size = CHORD_M / _shortest(d[beam, 0], d[beam, 1], d[beam, 2], voxel_m)

@@ -1,4 +1,4 @@
-r"""Counts how often moving boxes stop the beams of one sensor before each voxel.
+r"""Finds where moving boxes stop the beams of one sensor, and in how many frames.
 
 Frame: the grid's own, in metres (the world's axes, zero at the grid's origin). A box stops a beam when the beam and the
 box, made ``SHRINK_M`` (0.1 mm) smaller on each of its six sides, share a chord. So a box is here exactly as deep as
@@ -10,12 +10,14 @@ where it enters the shrunk box:
 with the sensor :math:`o` and the unit direction :math:`d` along the box's own axes (slabs: Kay and Kajiya 1986, "Ray
 Tracing Complex Scenes"). A box that holds the sensor stops nothing.
 
-Steps: :func:`face` turns each box that can stand before the grid into what a beam asks of it: its axes and half sizes,
-where the sensor is along them, and the azimuths and slopes within which it lies. Those bounds are taken round the
-*unshrunk* box, so rounding loses no beam. :func:`gather` sorts the boxes into cells of azimuth, frame by frame.
-:func:`count_blocked` then takes beam after beam: the boxes in its cell of azimuth and at its slope, the nearest of each
-frame, and one is added at the first crossing that lies behind it. Sums along the beam give the frames in which a
-crossing was not reached. All that a beam needs lies together, and memory does not grow with beams times frames.
+Steps: :func:`face` turns each box that can stand before the grid into what a beam asks of it, and into the upright
+block round it. :func:`gather` sorts the boxes into cells of azimuth. :func:`stops` takes beams in the order of their
+azimuths, those of (nearly) one azimuth together, as the channels of an upright sensor are: where their vertical plane
+cuts each block is computed once for all of them and gives the slopes between which a beam can meet it. What is left is
+put to the slabs; blocks are *unshrunk* for that, so rounding loses no beam. Where all of them have one azimuth and a
+box is flat, the slabs are computed once too: the plane cuts the shrunk box, and a beam enters it at that cut's near
+side, or through its top or bottom. A box that stands through many frames is tested once: along a beam, nearest box
+first, each box stops it in those of its frames in which nothing nearer did.
 """
 
 from __future__ import annotations
@@ -29,6 +31,15 @@ from pipeline.kernels.boxes import SHRINK_M, axes_of
 
 _kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
 _inlined = numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+
+TOGETHER_RAD = 1e-3
+"""Beams whose azimuths differ by less are taken together."""
+
+_ALONE_RAD = 1e-14
+"""Azimuths that differ by less differ by rounding alone."""
+
+_TINY = 1e-300
+"""Added to what may be 0 before it divides; all else stays what it is."""
 
 
 @_kernel
@@ -74,27 +85,20 @@ def _slab(o, d, half, first, last):  # type: ignore[no-untyped-def]
 
 
 @_kernel
-def _directions(box, low, high, o):  # type: ignore[no-untyped-def]
-    """First and last azimuth, and lowest and highest slope (rise over run), of all that can lie in a box, seen from the
-    sensor.
-
-    Taken round the upright block with the box's yaw that holds the (perhaps pitched) box; azimuths may leave [-pi, pi].
-    """
+def _fill_block(box, low, high, o, block):  # type: ignore[no-untyped-def]
+    """Fill the upright block with the box's yaw that holds the (perhaps pitched) box, as :func:`face` says; returns the
+    first and last azimuth of all that can lie in it, seen from the sensor. They may leave [-pi, pi]."""
     cy, sy = math.cos(box[3]), math.sin(box[3])
     half_u = 0.5 * (box[5] * abs(math.cos(box[4])) + box[7] * abs(math.sin(box[4])))
     half_v = 0.5 * box[6]
     x, y = box[0] - o[0], box[1] - o[1]
-    u, v = x * cy + y * sy, y * cy - x * sy  # the block's centre seen from the sensor, along the block's axes
-    away_u, away_v = max(abs(u) - half_u, 0.0), max(abs(v) - half_v, 0.0)
-    near = math.sqrt(away_u * away_u + away_v * away_v)
-    far = math.sqrt((abs(u) + half_u) ** 2 + (abs(v) + half_v) ** 2)
-    down, up = low[2] - o[2], high[2] - o[2]
-    if near == 0.0:  # the sensor stands above, below or in it
-        slope_low = -np.inf if down < 0.0 else down / far
-        slope_high = np.inf if up > 0.0 else up / far
-        return -math.pi, math.pi, slope_low, slope_high
-    slope_low = down / near if down < 0.0 else down / far
-    slope_high = up / near if up > 0.0 else up / far
+    u, v = x * cy + y * sy, y * cy - x * sy
+    block[0], block[1], block[2], block[3], block[4], block[5] = cy, sy, u, half_u, v, half_v
+    block[6], block[7] = low[2] - o[2], high[2] - o[2]
+    is_box = box[4] == 0.0 and min(box[5], box[6], box[7]) > 2.0 * SHRINK_M
+    block[8] = SHRINK_M if is_box else 0.0
+    if abs(u) <= half_u and abs(v) <= half_v:  # the sensor stands above, below or in it
+        return -math.pi, math.pi
     least, most = 0.0, 0.0
     for corner in range(4):
         cu = u + (half_u if corner < 2 else -half_u)
@@ -102,37 +106,41 @@ def _directions(box, low, high, o):  # type: ignore[no-untyped-def]
         turn = math.atan2(u * cv - v * cu, u * cu + v * cv)
         least, most = min(least, turn), max(most, turn)
     middle = math.atan2(y, x)
-    return middle + least, middle + most, slope_low, slope_high
+    return middle + least, middle + most
 
 
 @_kernel
-def face(o, frames, boxes, low, high, size_m, facing, frame, span):  # type: ignore[no-untyped-def]
+def face(o, order, boxes, low, high, size_m, facing, block, span, box):  # type: ignore[no-untyped-def]
     """Turn boxes towards the sensor; leave out those that cannot stand between it and the grid, or hold it.
 
     Parameters
     ----------
     o
         The sensor, (3,) float64.
-    frames, boxes
-        Frame of each box, ascending, (m,) int64; the boxes as in :func:`bounds`, (m, 8).
-    low, high
-        As :func:`bounds` fills them, (m, 3) each.
+    order
+        The order in which boxes are taken, (m,) int64; the nearest first makes :func:`stops` fast.
+    boxes, low, high
+        As :func:`bounds` takes and fills them, (m, 8), (m, 3), (m, 3).
     size_m
         The grid is the box from 0 to ``size_m`` (3,).
     facing
         Filled, (m, 15) float64: for each axis of the box the axis (3), where the sensor is along it, the half size.
-    frame
-        Filled, (m,) int64.
+    block
+        Filled, (m, 9) float64: cosine and sine of the yaw; where the middle is along the block, and its half length;
+        across it, and its half width; its bottom and top; all seen from the sensor; by how much it is to be shrunk to
+        be the very box that stops beams, 0 where it never is.
     span
-        Filled, (m, 4) float64: first and last azimuth, lowest and highest slope, see :func:`_directions`.
+        Filled, (m, 2) float64: first and last azimuth, see :func:`_fill_block`.
+    box
+        Filled, (m,) int64: which box it is.
 
     Returns
     -------
     int
-        How many boxes are left, in order.
+        How many boxes are left.
     """
     axes, count = np.empty((3, 3)), 0
-    for b in range(frames.shape[0]):
+    for b in order:
         apart = False
         for a in range(3):
             apart |= low[b, a] > max(o[a], size_m[a]) or high[b, a] < min(o[a], 0.0)
@@ -145,9 +153,8 @@ def face(o, frames, boxes, low, high, size_m, facing, frame, span):  # type: ign
             row[:3] = axes[a]
             row[3] = axes[a, 0] * x + axes[a, 1] * y + axes[a, 2] * z
             row[4] = 0.5 * boxes[b, 5 + a] - SHRINK_M
-        first, last, slope_low, slope_high = _directions(boxes[b], low[b], high[b], o)
-        span[count, 0], span[count, 1], span[count, 2], span[count, 3] = first, last, slope_low, slope_high
-        frame[count] = frames[b]
+        span[count, 0], span[count, 1] = _fill_block(boxes[b], low[b], high[b], o, block[count])
+        box[count] = b
         count += 1
     return count
 
@@ -165,7 +172,7 @@ def gather(span, cells):  # type: ignore[no-untyped-def]
     Parameters
     ----------
     span
-        As :func:`face` fills it, (m, 4).
+        As :func:`face` fills it, (m, 2).
     cells
         How many cells the circle has.
 
@@ -201,69 +208,151 @@ def _entered(facing, m, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @_inlined
-def _behind(enter_m, begin, last, range_m):  # type: ignore[no-untyped-def]
-    """The first of the crossings ``begin`` to ``last`` that is entered behind a range below the last one's.
-
-    Guessed, since planes lie evenly, then settled."""
-    at = begin
-    if last > begin:
-        share = (range_m - enter_m[begin]) / (enter_m[last] - enter_m[begin])
-        at = begin + min(max(np.int64(share * (last - begin)), 0), last - begin)
-    while at > begin and enter_m[at - 1] > range_m:
-        at -= 1
-    while enter_m[at] <= range_m:
-        at += 1
-    return at - begin
+def _between(along, off, middle, half):  # type: ignore[no-untyped-def]
+    """Bounds of the horizontal ranges at which rays are between two sides of a block; each ray's direction across these
+    sides is ``along`` or differs from it by up to ``off``, which is not 0."""
+    if along < 0.0:
+        along, middle = -along, -middle
+    far = (middle + half) / (along - off) if along > off else np.inf
+    return max(abs(middle) - half, 0.0) / (along + off), far
 
 
 @_kernel
-def count_blocked(d, azimuth, slope, first, enter_m, frame, facing, slopes, starts, members, levels, share):  # type: ignore[no-untyped-def]
-    """Count the frames in which a box stops a beam before it gets as far as each of its crossings.
+def _list_cuts(azimuth, off, block, members, cuts, near, ranges, unsorted):  # type: ignore[no-untyped-def]
+    """List how beams of an azimuth, give or take ``off``, cut the blocks; the nearest first.
+
+    Filled: ``near`` (m,) int64, which block; ``cuts`` (m, 5), lowest and highest slope with which a beam can meet it,
+    the horizontal range of its near side, the height of what bounds it towards the sensor (0 for none), and whether a
+    beam between these slopes meets the very box. ``ranges`` (m,) is scratch. Returns how many.
+    """
+    x, y, count, alone = math.cos(azimuth), math.sin(azimuth), 0, off < _ALONE_RAD
+    for m in members:
+        cy, sy, sunk = block[m, 0], block[m, 1], block[m, 8] if alone else 0.0
+        u_near, u_far = _between(x * cy + y * sy, off, block[m, 2], block[m, 3] - sunk)
+        v_near, v_far = _between(y * cy - x * sy, off, block[m, 4], block[m, 5] - sunk)
+        first, last = max(u_near, v_near), min(u_far, v_far)
+        if first < last:
+            down, up = block[m, 6] + sunk, block[m, 7] - sunk
+            unsorted[m, 0] = down / (first if down < 0.0 else last)
+            unsorted[m, 1] = up / (first if up > 0.0 else last)
+            unsorted[m, 2], unsorted[m, 3], unsorted[m, 4] = first, max(down, 0.0) + min(up, 0.0), sunk
+            _put(first, m, count, ranges, near)
+            count += 1
+    for k in range(count):
+        for column in range(5):
+            cuts[k, column] = unsorted[near[k], column]
+    return count
+
+
+@_inlined
+def _put(t, m, at, ranges, which):  # type: ignore[no-untyped-def]
+    """Put a box into a list by range that is ``at`` long. Boxes come nearly in order, so few move."""
+    while at > 0 and ranges[at - 1] > t:
+        ranges[at], which[at] = ranges[at - 1], which[at - 1]
+        at -= 1
+    ranges[at], which[at] = t, m
+
+
+@_kernel
+def stops(begin, rows, azimuth, beams, boxes, frames, levels, met, first, range_m, share):  # type: ignore[no-untyped-def]
+    """List where beams are stopped, as many beams as there is room for.
 
     Parameters
     ----------
-    d, azimuth, slope
-        Unit directions (n, 3), their azimuths in [-pi, pi], and their rise over run, (n,) each.
+    begin
+        Where in ``rows`` to begin.
+    rows, azimuth
+        Beams in the order of their azimuths in [-pi, pi], (n,) int64; these azimuths, ascending, (n,) float64.
+    beams
+        Of each beam, by row: rise over run, horizontal length, length over run, unit direction (n, 3), length.
+    boxes
+        ``facing``, ``block`` and ``box`` as :func:`face` fills them, ``starts`` and ``members`` as :func:`gather`
+        returns them.
+    frames
+        ``first_frame`` and ``frame``: frame[first_frame[b]] to frame[first_frame[b + 1]] are those of box b, int64.
+    levels
+        What is said of a stop with so many frames in which the beam is stopped there or before, from 0 on.
+    met
+        Scratch, int64, one for each frame, -1 at first.
+    first
+        (n + 1,) int64, filled: stops first[i] to first[i + 1] belong to the beam of rows[begin + i].
+    range_m, share
+        Filled: the range of each stop, ascending along a beam, and what ``levels`` says of it. At least as long as
+        there are frames.
+
+    Returns
+    -------
+    int
+        How many beams are done.
+    """
+    slope, run_m, stretch, d, length_m = beams
+    facing, block, box, starts, members = boxes
+    first_frame, frame = frames
+    cells, total = starts.shape[0] - 1, 0
+    near, cuts, unsorted = np.empty(len(box), np.int64), np.empty((len(box), 5)), np.empty((len(box), 5))
+    ranges, which = np.empty(len(box)), np.empty(len(box), np.int64)
+    first[0], count, end = 0, 0, begin
+    for i in range(begin, rows.shape[0]):
+        if total + met.shape[0] > range_m.shape[0]:
+            return i - begin
+        if i == end:
+            cell = _cell(azimuth[i], cells)
+            last = azimuth[i] + TOGETHER_RAD
+            while end < rows.shape[0] and azimuth[end] < last and _cell(azimuth[end], cells) == cell:
+                end += 1
+            off = max(0.5 * (azimuth[end - 1] - azimuth[i]), _TINY)
+            there = members[starts[cell % cells] : starts[cell % cells + 1]]
+            count = _list_cuts(0.5 * (azimuth[i] + azimuth[end - 1]), off, block, there, cuts, near, ranges, unsorted)
+        row, entered = rows[i], 0
+        for k in range(count):
+            low, high, side_m, deck_m, alone = cuts[k, 0], cuts[k, 1], cuts[k, 2], cuts[k, 3], cuts[k, 4]
+            if side_m > run_m[row]:
+                break
+            if slope[row] < low or slope[row] > high:
+                continue
+            if alone > 0.0:
+                t = side_m * stretch[row] if side_m > 0.0 else 0.0
+                if deck_m != 0.0:
+                    t = max(t, deck_m / d[row, 2])
+            else:
+                t = _entered(facing, near[k], d[row, 0], d[row, 1], d[row, 2])
+            if t < length_m[row]:
+                _put(t, box[near[k]], entered, ranges, which)
+                entered += 1
+        stopped = 0
+        for k in range(entered):
+            before = stopped
+            for at in range(first_frame[which[k]], first_frame[which[k] + 1]):
+                stopped += met[frame[at]] != row
+                met[frame[at]] = row
+            if stopped > before:
+                range_m[total], share[total] = ranges[k], levels[stopped]
+                total += 1
+        first[i - begin + 1] = total
+    return rows.shape[0] - begin
+
+
+@_kernel
+def reach(first, enter_m, rows, stop_first, range_m, share, reached):  # type: ignore[no-untyped-def]
+    """Say of each crossing what is said of the last stop before it.
+
+    Parameters
+    ----------
     first, enter_m
         Crossings first[i] to first[i + 1] belong to beam i, (n + 1,) int64; range at which each is entered, ascending
         along a beam, (k,) float64.
-    frame, facing, slopes
-        Of each box, as :func:`face` fills them; slopes are the last two columns of ``span``.
-    starts, members
-        As :func:`gather` returns them.
-    levels
-        What is said of a crossing that is not reached in so many frames, from 0 on.
-    share
-        Filled, (k,), ``levels`` of each crossing.
+    rows, stop_first, range_m, share
+        Which beams are asked about, (m,) int64, and their stops as :func:`stops` fills them.
+    reached
+        (k,), filled where those beams have stops.
     """
-    cells, most = starts.shape[0] - 1, 0
-    for i in range(d.shape[0]):
-        most = max(most, first[i + 1] - first[i])
-    blocked = np.zeros(most, np.int64)
-    for i in range(d.shape[0]):
-        begin, last = first[i], first[i + 1] - 1
-        if last < begin:
-            continue
-        limit, rise = enter_m[last], slope[i]
-        nearest, now, cell = np.inf, np.int64(-1), _cell(azimuth[i], cells) % cells
-        for k in range(starts[cell], starts[cell + 1]):
-            m = members[k]
-            if rise < slopes[m, 0] or rise > slopes[m, 1]:
-                continue
-            t = _entered(facing, m, d[i, 0], d[i, 1], d[i, 2])
-            if t < limit:
-                if frame[m] != now:
-                    if nearest < np.inf:
-                        blocked[_behind(enter_m, begin, last, nearest)] += 1
-                    nearest, now = np.inf, frame[m]
-                nearest = min(nearest, t)
-        if nearest < np.inf:
-            blocked[_behind(enter_m, begin, last, nearest)] += 1
-        total = 0
-        for k in range(begin, last + 1):
-            total += blocked[k - begin]
-            blocked[k - begin] = 0
-            share[k] = levels[total]
+    for i in range(rows.shape[0]):
+        at = stop_first[i]
+        for k in range(first[rows[i]], first[rows[i] + 1]):
+            while at < stop_first[i + 1] and range_m[at] < enter_m[k]:
+                at += 1
+            if at > stop_first[i]:
+                reached[k] = share[at - 1]
 
 
 @_kernel

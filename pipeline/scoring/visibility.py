@@ -4,7 +4,8 @@ Steps: move the scan into the grid's frame in float64, march every beam, count. 
 they need to:
 
 - where the scan's rows are shares of beams, each beam adds its share, in whole multiples of 2**-32;
-- where an effect says what gets as far as a voxel, crossings are listed, and each adds what gets there;
+- where an effect says what gets as far as a voxel, crossings are listed, and each adds what gets there; where it says
+  at which ranges a beam's share falls, each beam adds what is left of it;
 - what effects detect of a voxel depends on its range alone, so hits are added up first, then thinned.
 """
 
@@ -25,7 +26,7 @@ from pipeline.core.errors import InputError, RunError
 from pipeline.core.grid import Grid
 from pipeline.effects.base import Detect, Effect, TransmitScore
 from pipeline.kernels import march
-from pipeline.kernels.crossings import add_shares
+from pipeline.kernels.crossings import add_falling, add_shares
 from pipeline.scoring.thinning import Hits, RangeTable
 from pipeline.sensing import crossings
 from pipeline.sensing.scanner import Scan
@@ -142,11 +143,19 @@ class Visibility:
     def _add_shares(self, beams: Beams, o: NDArray[np.float64], d: NDArray[np.float64], hits: Hits) -> None:
         """Add what each beam is worth in each voxel, in ``UNIT``, before detection."""
         weights = np.ones(len(d)) if beams.weight is None else beams.weight
+        shape = np.asarray(self._grid.shape, dtype=np.int64)
         if not self._transmit:
-            shape = np.asarray(self._grid.shape, dtype=np.int64)
             march.add_hits(o, d, shape, self._grid.voxel_m, np.rint(weights * UNIT).astype(np.int64), hits)
             return
         effects = [effect.seen_from(o * self._grid.voxel_m, self._grid) for effect in self._transmit]
+        falls = effects[0].falls(beams.ends_m) if len(effects) == 1 else None
+        if falls is not None:
+            for part in falls:
+                share = _shares(effects[0], part.share, len(part.range_m), "falls")
+                add_falling(
+                    o, d, shape, self._grid.voxel_m, part.rows, part.first, part.range_m, share, weights, UNIT, hits
+                )
+            return
         for piece in crossings.listed(beams.pose.position_m, beams.ends_m, self._grid):
             shares = [_shares(effect, effect.share(piece), len(piece.cells), "crossings") for effect in effects]
             add_shares(piece.first, piece.cells, weights[piece.rows], math.prod(shares), UNIT, hits)

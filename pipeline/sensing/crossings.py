@@ -55,6 +55,27 @@ class Crossings:
         return np.repeat(np.arange(len(self.first) - 1), np.diff(self.first))
 
 
+@dataclass(frozen=True)
+class Falls:
+    """Where the shares of some beam pieces fall: 1 at the sensor, less behind each fall.
+
+    Attributes
+    ----------
+    rows
+        Which pieces of the scan these are, (n,) int64.
+    first
+        Falls first[i] to first[i + 1] belong to piece rows[i], (n + 1,) int64.
+    range_m, share
+        Range from the sensor of each fall, ascending along a piece; the share that gets as far as voxels that are
+        entered further away. (k,) float64 each.
+    """
+
+    rows: NDArray[np.int64]
+    first: NDArray[np.int64]
+    range_m: NDArray[np.float64]
+    share: NDArray[np.float64]
+
+
 def listed(position_m: tuple[float, float, float], ends_m: NDArray[np.float64], grid: Grid) -> Iterator[Crossings]:
     """All crossings of the beams of a sensor at ``position_m`` (world frame), a few thousand beams at a time."""
     sensor_m = grid.to_grid_m(np.array(position_m))

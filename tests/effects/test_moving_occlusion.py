@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
+from scipy.spatial.transform import Rotation
+from scipy.special import cosdg, sindg
 
 import pipeline
 from benchmarks import occlusion as benchmark
@@ -116,7 +118,7 @@ class Replayed:
         return self.boxes.seen_from(found.sensor_m, found.grid).share(found)
 
     def blocked(self, found: crossings.Crossings) -> np.ndarray:
-        return self.boxes.seen_from(found.sensor_m, found.grid).blocked(found)
+        return np.rint((1 - self.share(found)) * self.boxes.frames).astype(np.int64)
 
 
 def replay(frames: dict[int, list[list[float]]], count: int, grid: Grid = GRID) -> Replayed:
@@ -154,6 +156,7 @@ def random_scene(seed: int) -> tuple[np.ndarray, crossings.Crossings, dict[int, 
     ends[40:60] = [0, 0, -8]
     ends[60:62] = [[0, 0, 9], [-7, -0.0, 0]]
     ends[~ends.any(axis=1)] = [1, 0, 0]
+    ends *= 30 / np.abs(ends).max(axis=1, keepdims=True)  # beyond all crossings
     counts = draw.integers(0, 9, len(ends))
     first = np.append(0, np.cumsum(counts)).astype(np.int64)
     enter = np.concatenate([np.sort(draw.uniform(0, 25, n)) for n in counts])
@@ -280,6 +283,61 @@ def test_random_boxes_and_rays_give_the_twins_numbers(seed: int) -> None:
     found = replay_of(frames).blocked(rays)
     assert found.tolist() == expected.tolist()
     assert expected.any()
+
+
+def fan(tilt: float, step: float, draw: np.random.Generator) -> np.ndarray:
+    """Beams of a sensor with 12 channels a column, straight down and along axes among them, tilted about an oblique
+    axis; 30 m or longer, in any order."""
+    azimuth = np.append(np.arange(24) * step, [0.0, 90, 180, 270])[:, None]
+    elevation = np.array([-90.0, -80, -50, -30, -20, -12, -8, -5, -2, 0, 3, 20])
+    level, up = np.broadcast_arrays(cosdg(elevation), sindg(elevation) + 0 * azimuth)
+    beams = np.stack([level * cosdg(azimuth), level * sindg(azimuth), up], axis=-1).reshape(-1, 3)
+    turn = Rotation.from_rotvec(tilt * np.array([0.6, 0.8, 0.0]), degrees=True)
+    return draw.permutation(turn.apply(beams) if tilt else beams) * 30
+
+
+@pytest.mark.parametrize("step", [15.0, 0.02])
+@pytest.mark.parametrize("tilt", [0.0, 1e-11, 7.0])
+@pytest.mark.parametrize("seed", range(4))
+def test_columns_of_channels_give_the_twins_numbers(seed: int, tilt: float, step: float) -> None:
+    draw = np.random.default_rng(seed)
+    o, _, frames = random_scene(seed)
+    standing = [
+        np.column_stack([o[0], o[1] + 0.3, o[2] - 2, 0.2, 0.0, 3, 2, 1.5]),
+        *frames.values(),
+    ]  # the sensor above
+    frames = {f: np.vstack([*standing[: f + 1], standing[-1]]) for f in range(len(standing))}  # each in many frames
+    ends = fan(tilt, step, draw)
+    first = 8 * np.arange(len(ends) + 1)
+    enter = np.sort(draw.uniform(0, 25, (len(ends), 8)), axis=1).ravel()
+    none = np.zeros(len(enter), dtype=np.int64)
+    rays = crossings.Crossings(o, WIDE, slice(0, len(ends)), first, ends, none, enter, enter)
+    expected = twin_blocked(o, ends, first, enter, frames)
+    assert replay_of(frames, 40).blocked(rays).tolist() == expected.tolist()
+    assert len(set(expected.tolist())) > 3
+
+
+def test_beams_of_any_weight_add_as_many_hits_as_their_listed_crossings(
+    ran: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, out = ran
+    scene = pipeline.build_scene(pipeline.load(folder, [ON, ALL]))
+    draw = np.random.default_rng(5)
+    ends = np.column_stack([draw.uniform(-12, 28, 400), draw.uniform(-22, 20, 400), draw.uniform(-3, 1, 400)])
+    ends[:5], weight = [0.0, 0.0, 0.0], draw.uniform(0, 1, 400)
+    ends[5:9] = [[0, 0, -3], [9, 0, -2.9], [0, 9, -2.9], [-0.0, -9, -2.9]]
+    beams = Beams(Pose(10, -9, 3), scene.sensor("small"), ends, weight)
+    visibility = Visibility(scene, pipeline.read_tpog(out / "tpog.parquet"), out / "trajectories.parquet")
+    walked = visibility.borrowed_hits(beams).copy()
+    monkeypatch.setattr(effect, "_ROOM", 1)  # a few beams at a time
+    assert walked.tolist() == visibility.borrowed_hits(beams).tolist()
+    monkeypatch.setattr(effect.MovingOcclusion, "falls", lambda *_: None)
+    assert walked.tolist() == visibility.borrowed_hits(beams).tolist()
+    plain = Visibility(
+        pipeline.build_scene(pipeline.load(folder, ["effects.dropout.share=1e-9"])),
+        pipeline.read_tpog(out / "tpog.parquet"),
+    )
+    assert 0 < walked.sum() < 0.995 * plain.borrowed_hits(beams).sum()
 
 
 def test_a_whole_run_gives_the_twins_hits(ran: tuple[Path, Path]) -> None:

@@ -36,6 +36,7 @@ recording is unlucky in both.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -52,10 +53,11 @@ from pipeline.core.grid import Grid
 from pipeline.effects.base import TransmitScore
 from pipeline.kernels import occlusion as kernels
 from pipeline.scenario.effects import EffectParameters, MovingOcclusionParameters
-from pipeline.sensing.crossings import Crossings
+from pipeline.sensing.crossings import Crossings, Falls
 from pipeline.sensing.scene import Scene
 
 _AZIMUTHS = 1024  # cells of azimuth, 0.35 degrees each: next to a car at 100 m
+_ROOM = 2**16  # stops that are listed at once: bounds the memory
 
 Count = Annotated[int, Field(ge=0, strict=True), BeforeValidator(lambda given: 0 if given == "all" else given)]
 
@@ -68,13 +70,17 @@ class Replay:
     ----------
     frames
         How many frames are replayed, with or without boxes.
-    frame, values
-        Frame of each box, (n,) int64, ascending; its centre in the grid's frame, yaw, pitch and sizes, (n, 8) float64.
+    first_frame, frame
+        frame[first_frame[b]] to frame[first_frame[b + 1]] are the frames in which box b stands, int64: one box, when a
+        vehicle stands still.
+    values
+        Centre of each box in the grid's frame, yaw, pitch and sizes, (n, 8) float64.
     low, high
         Corners of the upright box round each, (n, 3) float64.
     """
 
     frames: int
+    first_frame: NDArray[np.int64]
     frame: NDArray[np.int64]
     values: NDArray[np.float64]
     low: NDArray[np.float64]
@@ -82,56 +88,60 @@ class Replay:
 
     @classmethod
     def of(cls, frames: int, frame: NDArray[np.int64], values: NDArray[np.float64]) -> Replay:
-        """From boxes, sorted by frame."""
-        low, high = np.empty((len(values), 3)), np.empty((len(values), 3))
-        kernels.bounds(values, low, high)
-        return cls(frames, frame, values, low, high)
+        """From boxes (n, 8) and the number of the frame of each (n,)."""
+        distinct, box = np.unique(values, axis=0, return_inverse=True)
+        numbers = np.unique(frame, return_inverse=True)[1]
+        low, high = np.empty((len(distinct), 3)), np.empty((len(distinct), 3))
+        kernels.bounds(distinct, low, high)
+        first = np.append(0, np.cumsum(np.bincount(box, minlength=len(distinct))))
+        return cls(frames, first, numbers[np.argsort(box, kind="stable")], distinct, low, high)
 
     def holding(self, sensor_m: NDArray[np.float64]) -> int:
         """How many boxes (one a frame each) hold a sensor, given in the grid's frame (3,); they are ignored for it."""
         near = np.flatnonzero(((self.low < sensor_m) & (sensor_m < self.high)).all(axis=1))
-        return sum(bool(kernels.holds(self.values[b], sensor_m)) for b in near)
+        times = np.diff(self.first_frame)
+        return int(sum(times[b] for b in near if kernels.holds(self.values[b], sensor_m)))
 
     def seen_from(self, sensor_m: NDArray[np.float64], grid: Grid) -> FacingBoxes:
         """The boxes that can stand between a sensor, given in the grid's frame (3,), and a voxel."""
-        most, size_m = len(self.frame), np.asarray(grid.roi.size_m)
-        facing, frame, span = np.empty((most, 15)), np.empty(most, dtype=np.int64), np.empty((most, 4))
-        kept = kernels.face(sensor_m, self.frame, self.values, self.low, self.high, size_m, facing, frame, span)
+        most, size_m = len(self.values), np.asarray(grid.roi.size_m)
+        facing, block, span = np.empty((most, 15)), np.empty((most, 9)), np.empty((most, 2))
+        box = np.empty(most, dtype=np.int64)
+        order = np.argsort(np.hypot(*(self.values[:, :2] - sensor_m[:2]).T))
+        kept = kernels.face(sensor_m, order, self.values, self.low, self.high, size_m, facing, block, span, box)
         starts, members = kernels.gather(span[:kept], _AZIMUTHS)
-        return FacingBoxes(self.frames, frame[:kept], facing[:kept], span[:kept, 2:].copy(), starts, members)
+        return FacingBoxes(self, (facing[:kept], block[:kept], box[:kept], starts, members))
 
 
 @dataclass(frozen=True, eq=False)
 class FacingBoxes:
-    """Replayed boxes as one sensor sees them; the fields are those of :mod:`pipeline.kernels.occlusion`."""
+    """Replayed boxes as one sensor sees them; the arrays are those of :func:`pipeline.kernels.occlusion.stops`."""
 
-    frames: int
-    frame: NDArray[np.int64]
-    facing: NDArray[np.float64]
-    slopes: NDArray[np.float64]
-    starts: NDArray[np.int64]
-    members: NDArray[np.int64]
+    replay: Replay
+    boxes: tuple[NDArray[Any], ...]
 
     def share(self, crossings: Crossings) -> NDArray[np.float64]:
         """Share of the frames in which the beam gets as far as each crossing, (k,) float64."""
-        return self._levels(crossings, (self.frames - np.arange(self.frames + 1)) / self.frames)
+        reached = np.ones(len(crossings.cells))
+        for part in self.falls(crossings.ends_m):
+            kernels.reach(crossings.first, crossings.enter_m, part.rows, part.first, part.range_m, part.share, reached)
+        return reached
 
-    def blocked(self, crossings: Crossings) -> NDArray[np.int64]:
-        """Frames in which the beam does not get as far as each crossing, (k,) int64."""
-        return self._levels(crossings, np.arange(self.frames + 1))
-
-    def _levels(self, crossings: Crossings, levels: NDArray[Any]) -> NDArray[Any]:
-        """What ``levels`` says for the frames in which each crossing is not reached."""
-        ends = crossings.ends_m
-        run = np.hypot(ends[:, 0], ends[:, 1])
-        with np.errstate(divide="ignore", invalid="ignore"):  # a beam without length crosses nothing
-            directions, slope = ends / np.hypot(run, ends[:, 2])[:, None], ends[:, 2] / run
-        share = np.empty(len(crossings.cells), dtype=levels.dtype)
-        kernels.count_blocked(
-            directions, np.arctan2(ends[:, 1], ends[:, 0]), slope, crossings.first, crossings.enter_m,
-            self.frame, self.facing, self.slopes, self.starts, self.members, levels, share,
-        )  # fmt: skip
-        return share
+    def falls(self, ends_m: NDArray[np.float64]) -> Iterator[Falls]:
+        """Where the shares of beams that end at ``ends_m`` (n, 3), seen from the sensor, fall."""
+        run_m, most = np.hypot(ends_m[:, 0], ends_m[:, 1]), self.replay.frames
+        length_m, azimuth = np.hypot(run_m, ends_m[:, 2]), np.arctan2(ends_m[:, 1], ends_m[:, 0])
+        with np.errstate(divide="ignore", invalid="ignore"):  # beams that are vertical, or have no length
+            beams = ends_m[:, 2] / run_m, run_m, length_m / run_m, ends_m / length_m[:, None], length_m
+        rows, frames = np.argsort(azimuth), (self.replay.first_frame, self.replay.frame)
+        azimuth, levels = azimuth[rows], (most - np.arange(most + 1)) / most
+        done, met, room = 0, np.full(most, -1, dtype=np.int64), max(_ROOM, most)
+        while done < len(rows):
+            first, range_m, share = np.empty(len(rows) - done + 1, dtype=np.int64), np.empty(room), np.empty(room)
+            count = kernels.stops(done, rows, azimuth, beams, self.boxes, frames, levels, met, first, range_m, share)
+            total = first[count]
+            yield Falls(rows[done : done + count], first[: count + 1], range_m[:total], share[:total])
+            done += count
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,6 +197,10 @@ class MovingOcclusion(TransmitScore[MovingOcclusionParameters]):
         if not isinstance(self.ready, FacingBoxes | Independent):
             raise RuntimeError("moving_occlusion: prepare() and seen_from() return the effect that can share()")
         return self.ready.share(crossings)
+
+    def falls(self, ends_m: NDArray[np.float64]) -> Iterator[Falls] | None:
+        """Where the share of each beam falls, where boxes are replayed."""
+        return self.ready.falls(ends_m) if isinstance(self.ready, FacingBoxes) else None
 
 
 def replayed(recorded: int, wanted: int) -> NDArray[np.int64]:
