@@ -1,0 +1,1 @@
+"""How well a score and detection agree over sites, and how sure that is."""
