@@ -57,5 +57,5 @@ def test_frames_are_spread_over_the_record(mini):
     assert unseen_traffic.scenario_of(scenario, 10) is scenario
     np.testing.assert_array_equal(unseen_traffic.numbers(scenario, 40, 10), np.arange(0, 40, 4))
     np.testing.assert_array_equal(unseen_traffic.numbers(scenario, 40, 3), [0, 12, 24])
-    with pytest.raises(InputError, match="--frames: 11, of traffic with 40 frames every 0.5 s; at most 10"):
+    with pytest.raises(InputError, match=r"--frames: 11, of traffic with 40 frames every 0.5 s; at most 10"):
         unseen_traffic.numbers(scenario, 40, 11)
