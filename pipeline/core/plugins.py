@@ -24,6 +24,10 @@ _RIGHT = {
         ("NAME", "SOURCE", "STAGE", "KIND", "Model.of"),
         "a subclass of Detect or another kind in pipeline.effects.base, with NAME, SOURCE and Model",
     ),
+    "egvs.detectors": (
+        ("NAME", "SOURCE", "settings", "at"),
+        "a class with NAME, SOURCE, settings and at, see pipeline.validation.detectors.base",
+    ),
     "egvs.point_clouds": (("read",), "a module or an object with a function read"),
 }
 """What an object of a group must have, and what would be right, in words."""
