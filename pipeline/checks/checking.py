@@ -6,10 +6,10 @@ is simulated, cast or written.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from pipeline.checks import region, sensing, sites, solids, traffic
+from pipeline.checks import files, region, sensing, sites, solids, traffic
 from pipeline.checks.subject import Subject, build_world, gather
 from pipeline.core.findings import Finding
 from pipeline.scenario.models import Scenario
@@ -61,11 +61,17 @@ def check(scenario: Scenario, world_of: Callable[[Scenario], World] = build_worl
     subject, refused = gather(scenario, world_of)
     found = [*refused, *(finding for rule in RULES for finding in rule(subject))]
     return Checked(
-        tuple(sorted(_folded(found), key=lambda finding: not finding.is_error)),
+        tuple(sorted(_folded(_missing_once(found)), key=lambda finding: not finding.is_error)),
         len(subject.sites),
         0 if subject.world is None else len(subject.world.solids),
         0 if subject.carriageway is None else len(subject.carriageway.lanes),
     )
+
+
+def _missing_once(found: Sequence[Finding]) -> Iterator[Finding]:
+    """Without what rules say of files that are not there: that is told already, where the scenario names them."""
+    absent = {finding.found for finding in found if finding.rule == files.RULE}
+    return (finding for finding in found if finding.rule == files.RULE or finding.found not in absent)
 
 
 def _folded(found: Iterable[Finding]) -> Iterator[Finding]:

@@ -14,6 +14,8 @@ from pipeline.sensing import sites
 from pipeline.sensing.sites import Site
 from pipeline.traffic import sumo_folder
 
+RULE = "files"
+"""Under which a file that is not there is found."""
 UNOPENED = "sites.points"
 ABSENT = "absent"
 
@@ -51,7 +53,7 @@ def missing(scenario: Scenario) -> Iterator[Finding]:
             if (key, name) in scans or key == "sites.points":
                 point_clouds.reader_of(Path(name), key)
         except InputError as error:
-            yield Finding.of("files", error)
+            yield Finding.of(RULE, error)
 
 
 def sound_sites(scenario: Scenario) -> tuple[Site, ...]:

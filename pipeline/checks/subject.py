@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TypeVar
 
 from pipeline.checks import files
@@ -100,8 +101,7 @@ def _of_each_file(scenario: Scenario) -> Iterator[Finding]:
     nothing = model.model_copy(update={"footprints": (), "polygons": (), "meshes": ()})
     for key in ("footprints", "polygons", "meshes"):
         for file in getattr(model, key):
-            alone = nothing.model_copy(update={key: (file,)})
-            try:
-                static_world.build(scenario.model_copy(update={"statics": alone}))
-            except InputError as error:
-                yield Finding.of("statics", error)
+            alone = scenario.model_copy(update={"statics": nothing.model_copy(update={key: (file,)})})
+            refusals = Refusals()
+            refusals.unless_refused("statics", partial(static_world.build, alone))
+            yield from refusals.found

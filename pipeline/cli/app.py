@@ -14,6 +14,7 @@ import typer
 from pipeline.cli import arguments, interrupts
 from pipeline.cli.arguments import Audit, Jobs, Out, ScenarioPath, Set, Top
 from pipeline.core.errors import EgvsError, InputError
+from pipeline.core.findings import FindingsError
 from pipeline.core.version import __version__
 
 if TYPE_CHECKING:
@@ -37,6 +38,8 @@ def main() -> None:
         with interrupts.after_imports():
             app()
     except EgvsError as error:
+        for warning in error.warnings if isinstance(error, FindingsError) else ():
+            print(f"warning: {warning}", file=sys.stderr)
         _fail(str(error), error.exit_code)
     except OSError as error:
         _fail(f"{error.filename or 'system'}: {error.strerror or error}", 1)
@@ -343,7 +346,9 @@ def new(
     walk: Annotated[bool, typer.Option("--walk", help="Sidewalks and crossings, for people on foot.")] = False,
     surroundings: Annotated[
         str | None,
-        typer.Option(metavar="METRES", help="How far from the junction streets are simulated: 300, or all there are."),
+        typer.Option(
+            metavar="METRES", help="How far from the junction streets are simulated: 300 by default; 'all' for no cut."
+        ),
     ] = None,
 ) -> None:
     """Make a scenario from an OpenStreetMap extract."""

@@ -69,8 +69,12 @@ def seen_from(folder: Path, summary: dict[str, Any]) -> dict[str, Any]:
 
 
 class FindingsError(InputError):
-    """What was found forbids the run; all errors at once. There is at least one."""
+    """What was found forbids the run; all errors at once. There is at least one.
 
-    def __init__(self, findings: Iterable[Finding]) -> None:
+    ``warnings`` are what else was found, for those who tell of it.
+    """
+
+    def __init__(self, findings: Iterable[Finding], warnings: Iterable[Finding] = ()) -> None:
         self.findings = first, *others = tuple(findings)
+        self.warnings = tuple(warnings)
         super().__init__(first.place, first.found, "\n".join([first.cure, *map(str, others)]))

@@ -207,6 +207,8 @@ def _network(extract: Extract, osm: Path, flags: Sequence[str]) -> tuple[str, St
         except (RunError, InputError) as error:
             if re.search(r"No (nodes|edges) loaded|has no road", str(error)):
                 raise missing from None
+            if isinstance(error, sumo.RefusedError):
+                raise InputError(osm, f"holds streets that cannot be used: {error}", "another extract") from None
             raise
         return _without_header((work / NETWORK).read_text(encoding="utf-8")), streets
 

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ValidationError
 
 from pipeline.core.errors import InputError
 from pipeline.scenario.models import Scenario
+from pipeline.scenario.types import NAME_IN_WORDS
 
 
 def explain(error: ValidationError, place: str) -> InputError:
@@ -31,6 +32,8 @@ def _lines(error: ValidationError, model: type[BaseModel], above: tuple[str, ...
             yield key, "unknown key", nearest_key(item["loc"], model)
         elif item["type"] == "missing":
             yield key, "missing", "this key is needed"
+        elif item["type"] == "string_pattern_mismatch":
+            yield key, f"{item['input']!r}", NAME_IN_WORDS
         elif item["type"] == "value_error":
             yield key or "scenario", str(context["error"]), ""
         elif item["type"] == "unknown_effect":

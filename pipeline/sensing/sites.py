@@ -159,9 +159,9 @@ def of(scenario: Scenario) -> tuple[Site, ...]:
 
 def _alike(refused: list[InputError]) -> Iterator[Finding]:
     """One finding for each thing that is wrong; a misspelt column is so in every row."""
-    places: dict[tuple[str, str], list[str]] = {}
+    places: dict[tuple[str, str], dict[str, None]] = {}
     for error in refused:
-        places.setdefault((error.found, error.right), []).append(error.place)
+        places.setdefault((error.found, error.right), {})[error.place] = None
     for (found, right), (first, *others) in places.items():
         place = f"{first} and {len(others)} more" if others else first
         yield Finding.of("sites", InputError(place, found, right))

@@ -51,11 +51,11 @@ def run(work: Workspace, inputs: StageInputs) -> Summary:
     Raises
     ------
     FindingsError
-        With all errors.
+        With all errors, and the warnings beside them.
     """
     del inputs
     checked = checking.check(work.scenario, lambda _: built(work)[0])
     if checked.errors:
-        raise FindingsError(checked.errors)
+        raise FindingsError(checked.errors, checked.warnings)
     counts = {"sites": checked.sites, "solids": checked.solids, "lanes": checked.lanes}
     return {**counts, WARNINGS: [finding.to_json() for finding in checked.warnings]}

@@ -36,6 +36,10 @@ _ENDS_WITHIN_S = 10.0
 _SHOWN_ERRORS = 12
 
 
+class RefusedError(RunError):
+    """A program of SUMO refused what it was given: it ended by itself, with an error."""
+
+
 def binary(name: str) -> Path:
     """A program of SUMO in the environment, SUMO_HOME, wheel or PATH; MissingBackendError when it is in none."""
     import shutil
@@ -107,8 +111,8 @@ def run(
 
     Raises
     ------
-    RunError
-        When it ends with an error: its own error text and exit code.
+    RefusedError
+        When it ends with an error: its own error text and exit code. RunError when it is killed.
     MissingBackendError
         When it, or a system library that it needs, is not installed.
     """
@@ -171,7 +175,8 @@ def failure(name: str, code: int, text: str) -> RunError:
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     errors = [line for line in lines if not line.startswith(("Warning", "Quitting", "pj_obj_create"))] or lines[-1:]
     how = f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
-    return RunError("\n".join([f"{name} {how}:", *(f"  {line}" for line in errors[:_SHOWN_ERRORS])]))
+    kind = RunError if code < 0 else RefusedError
+    return kind("\n".join([f"{name} {how}:", *(f"  {line}" for line in errors[:_SHOWN_ERRORS])]))
 
 
 @contextmanager

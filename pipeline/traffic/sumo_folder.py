@@ -378,7 +378,12 @@ def _converted(path: Path, _content: str) -> bytes:
         if osm.is_pbf(path):  # netconvert reads XML only
             osm.write_xml(path, folder / MAP)
             source = MAP
-        sumo.run("netconvert", ["--osm-files", source, *_OSM_FLAGS, "-o", NETWORK], folder)
+        try:
+            sumo.run("netconvert", ["--osm-files", source, *_OSM_FLAGS, "-o", NETWORK], folder)
+        except sumo.RefusedError as error:
+            raise InputError(
+                path, f"is no map that streets can be made of: {error}", "a whole map; fetch it again"
+            ) from None
         return (folder / NETWORK).read_bytes()
 
 

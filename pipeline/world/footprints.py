@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.core.errors import InputError
-from pipeline.core.findings import Finding
+from pipeline.core.findings import Finding, FindingsError
 from pipeline.formats.georeference import IN_WORLD, Georeference, Reading, coordinates_of, declared_by
 from pipeline.scenario.near_names import misspelt
 from pipeline.scenario.types import FARTHEST_M
@@ -34,6 +35,10 @@ _QUARTER_SIDES = 4  # a disc is a regular polygon of four times as many sides
 
 _SPELT = ("height_m", "base_m")
 """Properties that count: what is nearly one of them must not be taken for a stranger."""
+_NOTES = ("height_from",)
+"""What ``egvs new`` notes beside them."""
+_MOST_TOLD = 20
+"""So many wrong features of a file are told; of more, how many they are."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +65,7 @@ class FootprintFile:
 def read_geojson(path: Path, world: Georeference) -> FootprintFile:
     """Footprints of a GeoJSON FeatureCollection in world-frame metres, degrees, or the system that it declares.
 
-    InputError names the feature that cannot be understood, has no height, or is no sound polygon.
+    InputError names the features that cannot be understood, have no height, or are no sound polygons, all at once.
     """
     file = FootprintFile()
     try:
@@ -73,22 +78,41 @@ def read_geojson(path: Path, world: Georeference) -> FootprintFile:
     reading = world.reading(coordinates_of(document["features"]), str(path), declared)
     if reading.convert is not None:
         file.mended[f"features in {reading.words}, brought into the world frame"] += len(document["features"])
+    refused: list[InputError] = []
     for number, feature in enumerate(document["features"]):
-        place = f"{path}: feature {number}"
-        if not isinstance(feature, dict) or not isinstance(feature.get("properties") or {}, dict):
-            raise InputError(place, "is not a GeoJSON feature", "an object with geometry and properties")
-        properties = feature.get("properties") or {}
-        name = str(_named(properties, "name", f"{path.stem}_{number}"))
-        place = f"{place} ({name})"
-        if (odd := misspelt(properties, _SPELT)) is not None:
-            raise InputError(place, f"unknown property {odd[0]!r}", f"did you mean {odd[1]}?")
-        height, base = _metres(properties, "height_m", place), _metres(properties, "base_m", place, 0.0)
-        if not height > base:
-            raise InputError(place, f"height_m = {height:g} with base_m = {base:g}", "a top above the underside")
-        kind = str(_named(properties, "kind", "footprint"))
-        for part in polygons_of(feature.get("geometry"), properties, place, file.mended, reading):
-            file.footprints.append(Footprint(name, kind, part, base, height))
+        try:
+            file.footprints.extend(_of_feature(feature, number, path, file.mended, reading))
+        except InputError as error:
+            refused.append(error)
+    if refused:
+        raise FindingsError(_told(refused, path))
     return file
+
+
+def _of_feature(feature: Any, number: int, path: Path, mended: Counter[str], reading: Reading) -> list[Footprint]:
+    """The footprints of one feature, counting in ``mended``."""
+    place = f"{path}: feature {number}"
+    if not isinstance(feature, dict) or not isinstance(feature.get("properties") or {}, dict):
+        raise InputError(place, "is not a GeoJSON feature", "an object with geometry and properties")
+    properties = feature.get("properties") or {}
+    name = str(_named(properties, "name", f"{path.stem}_{number}"))
+    place = f"{place} ({name})"
+    if (odd := misspelt((key for key in properties if key not in _NOTES), _SPELT)) is not None:
+        raise InputError(place, f"unknown property {odd[0]!r}", f"did you mean {odd[1]}?")
+    height, base = _metres(properties, "height_m", place), _metres(properties, "base_m", place, 0.0)
+    if not height > base:
+        raise InputError(place, f"height_m = {height:g} with base_m = {base:g}", "a top above the underside")
+    kind = str(_named(properties, "kind", "footprint"))
+    parts = polygons_of(feature.get("geometry"), properties, place, mended, reading)
+    return [Footprint(name, kind, part, base, height) for part in parts]
+
+
+def _told(refused: list[InputError], path: Path) -> Iterator[Finding]:
+    """The first of a file's wrong features, and how many more there are."""
+    for error in refused[:_MOST_TOLD]:
+        yield Finding.of("statics", error)
+    if (more := len(refused) - _MOST_TOLD) > 0:
+        yield Finding("statics", str(path), f"{more} more features are wrong", "those above first", is_error=True)
 
 
 def _named(properties: dict[str, Any], key: str, default: str) -> Any:

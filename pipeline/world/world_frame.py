@@ -101,7 +101,7 @@ def _converted(path: Path, changed_ns: int, size: int) -> Location | None:
     del changed_ns, size
     with tempfile.TemporaryDirectory() as folder:
         made = Path(folder) / sumo_folder.NETWORK
-        sumo_folder.convert_osm(path.resolve(), made)
+        sumo_folder.convert_osm(path, made)
         return network.location_of(made)
 
 

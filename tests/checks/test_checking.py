@@ -335,6 +335,36 @@ def test_files_that_are_not_there_or_have_no_reader(street: Path) -> None:
     assert len(told["files"]) == 4
 
 
+def test_a_periods_missing_file_is_told_once_where_it_is_named(street: Path) -> None:
+    """The rules that would read it find it missing too."""
+    told = found(street, 'traffic.periods=[{name="a",sumocfg="gone.sumocfg"},{name="b",vehicles=3}]')
+    (line,) = (line for lines in told.values() for line in lines)
+    assert line.startswith("scenario.toml: traffic.periods (a).sumocfg = 'gone.sumocfg': no such file")
+
+
+def test_warnings_are_told_beside_the_errors_that_stop_a_run(street: Path, egvs) -> None:
+    sites(street, "amid,10,1.6,3")
+    code, _, err = egvs("run", street, "--set", "traffic.edge_weights={north=2}")
+    assert code == 2
+    warning, error = err.splitlines()
+    assert warning.startswith("warning: sites.csv: site amid: (10, 1.6, 3) stands in lane west_1")
+    assert error.startswith("egvs: ") and "the network has no edge 'north'" in error
+
+
+@pytest.mark.system
+def test_a_map_that_netconvert_refuses_is_wrong_input_and_told_once(
+    street: Path, monkeypatch: pytest.MonkeyPatch, egvs
+) -> None:
+    (street / "map.osm").write_text("<osm><node")
+    monkeypatch.chdir(street.parent)
+    code, _, err = egvs("check", street.name, "--set", 'traffic.network="map.osm"')
+    assert (code, err) == (2, "")
+    code, _, err = egvs("run", street.name, "--set", 'traffic.network="map.osm"', "--out", "out")
+    assert code == 2
+    assert err.startswith(f"egvs: {street.name}/map.osm: is no map that streets can be made of: netconvert ended with")
+    assert not list((street.parent / "out").glob("*.p*"))
+
+
 def test_counts_at_edges_and_of_kinds_that_are_not_there(street: Path) -> None:
     counts = (
         '[{edge="east",per_hour=100},{edge="north",per_hour=9},{from_edge="east",to_edge="up",per_hour=9,kind="ox"}]'

@@ -141,6 +141,10 @@ BAD: dict[str, tuple[Change, str]] = {
         ),
         r"frame_period_s.*0.35.*0.1|0.35",
     ),
+    "period whose name is none": (
+        put("x", "", edit("warmup_s = 0", 'warmup_s = 0\nperiods = [{ name = "rush hour" }]')),
+        r"periods.0.name: 'rush hour'; a name without spaces",
+    ),
     # statics
     "statics missing": (remove("statics.geojson"), r"statics.footprints = 'statics.geojson': no such file"),
     "statics no JSON": (put("statics.geojson", "{"), r"statics.geojson: is not valid JSON"),

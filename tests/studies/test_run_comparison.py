@@ -139,6 +139,15 @@ def test_a_row_that_a_run_lacks_is_told_once_and_by_its_name(
     assert "traffic.kinds[car].length_m" in printed
 
 
+def test_an_effect_that_a_run_lacks_is_told_by_its_parameters_alone(mini: Path, tmp_path: Path) -> None:
+    folders = tmp_path / "plain", tmp_path / "rain"
+    for folder, named in zip(folders, ([], ["effects.rain.rate_mm_h=30"]), strict=True):
+        pipeline.run(pipeline.load(mini, named), folder)
+    assert [(one.what, one.values) for one in compare(folders).differences] == [
+        ("effects.rain.rate_mm_h", (None, 30.0))
+    ]
+
+
 def test_letters_go_on_after_z() -> None:
     assert [run_comparison._letter(n) for n in (0, 25, 26, 27, 52)] == ["A", "Z", "AA", "AB", "BA"]
 

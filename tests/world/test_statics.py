@@ -11,6 +11,7 @@ import pytest
 import trimesh
 
 from pipeline.core.errors import InputError
+from pipeline.core.findings import FindingsError
 from pipeline.effects import scene_resolving
 from pipeline.formats.crs import WorldFrame
 from pipeline.scenario import loading
@@ -496,3 +497,15 @@ def test_a_mesh_that_lies_elsewhere_is_refused(tmp_path):
         located(tmp_path, meshes=[{"file": "m.ply"}])
     with pytest.raises(InputError, match="epsg and origin_deg: a mesh is in one system"):
         located(tmp_path, meshes=[{"file": "m.ply", "epsg": 25832, "origin_deg": [9, 51]}])
+
+
+def test_all_wrong_features_of_a_file_are_told_at_once(tmp_path: Path) -> None:
+    """Twenty by name, then how many more; what ``egvs new`` notes beside a height is no misspelt height."""
+    wrong = [polygon(SQUARE, name=f"w{number}", height_m=None, height_from="levels") for number in range(23)]
+    with pytest.raises(FindingsError) as caught:
+        built(tmp_path, polygon(SQUARE), polygon(SQUARE, height_m="tall", name="t"), *wrong)
+    told = [str(finding) for finding in caught.value.findings]
+    assert len(told) == 21
+    assert "feature 1 (t): height_m: 'tall'" in told[0]
+    assert "feature 2 (w0): height_m is missing" in told[1]
+    assert "4 more features are wrong" in told[-1]
