@@ -1,0 +1,89 @@
+"""Estimates the ground round a site from its empty scan, so that detectors count heights from it.
+
+Steps: the lowest return of each square; of these, what the ground can be: the highest surface below all returns that
+nowhere climbs more steeply than a street; between the squares that lie on it, straight lines; beyond them, the nearest.
+What is known to a roadside unit is used alone, its pose and its empty scan: no map.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+from scipy.ndimage import grey_erosion, map_coordinates
+
+from pipeline.core.grid import Roi
+from pipeline.validation.sweeps import SiteView
+
+Floats = NDArray[np.float64]
+
+SQUARE_M = 2.0
+STEEPEST = 0.15
+"""Rise per metre that streets do not exceed; the walls of a kerb or a house do."""
+
+_AROUND_M = 20.0  # beyond the region of interest: vehicles reach out of it
+_REACH = 15  # squares over which the climb is bounded
+_FEWEST = 3  # squares with ground that a surface needs
+
+
+@dataclass(frozen=True)
+class GroundMap:
+    """Height of the ground over squares.
+
+    Attributes
+    ----------
+    low_m
+        World x, y of the first square's centre.
+    z_m
+        The ground in the world frame at the squares' centres, (nx, ny) float64.
+    """
+
+    low_m: Floats
+    z_m: Floats
+
+    @classmethod
+    def of(cls, view: SiteView, roi: Roi) -> GroundMap:
+        """The ground in and round the region of interest, as the site's empty scan has it."""
+        low = np.asarray(roi.origin_m)[:2] - _AROUND_M
+        shape = tuple(np.ceil((np.asarray(roi.size_m)[:2] + 2 * _AROUND_M) / SQUARE_M).astype(int).tolist())
+        points = empty_points(view)
+        cell = np.floor((points[:, :2] - low) / SQUARE_M).astype(np.int64)
+        inside = ((cell >= 0) & (cell < shape)).all(axis=1)
+        lowest = np.full(shape, np.inf)
+        np.minimum.at(lowest, tuple(cell[inside].T), points[inside, 2])
+        return cls(low + SQUARE_M / 2, _surface(lowest, fallback_m=float(points[:, 2].min(initial=view.pose.z_m))))
+
+    def height_m(self, xy_m: Floats) -> Floats:
+        """The ground's z below places (n, 2) in the world frame, (n,)."""
+        at = ((xy_m - self.low_m) / SQUARE_M).T
+        found: Floats = map_coordinates(self.z_m, at, order=1, mode="nearest")
+        return found
+
+
+def empty_points(view: SiteView) -> Floats:
+    """The returns of the empty scan in the world frame, (n, 3)."""
+    met = np.isfinite(view.empty_range_m)
+    ways = view.sensor.directions(*view.pose.angles_deg)[met]
+    found: Floats = np.asarray(view.pose.position_m) + ways * view.empty_range_m[met, None]
+    return found
+
+
+def _surface(lowest: Floats, fallback_m: float) -> Floats:
+    """The ground at every square, from the lowest return of each (infinite where there is none)."""
+    seen = np.isfinite(lowest)
+    if not seen.any():
+        return np.full(lowest.shape, fallback_m)
+    steps = np.arange(-_REACH, _REACH + 1) * SQUARE_M
+    cone = -STEEPEST * np.hypot(*np.meshgrid(steps, steps, indexing="ij"))
+    highest = grey_erosion(np.where(seen, lowest, lowest[seen].max() + 1e3), structure=cone, mode="nearest")
+    ground = np.argwhere(seen & (lowest <= highest))
+    values = lowest[tuple(ground.T)]
+    squares = np.argwhere(np.ones(lowest.shape, dtype=np.bool_))
+    surface = NearestNDInterpolator(ground, values)(squares)
+    if len(ground) >= _FEWEST and np.ptp(ground, axis=0).all() and np.linalg.matrix_rank(ground - ground[0]) == 2:
+        between = LinearNDInterpolator(ground, values)(squares)
+        surface = np.where(np.isnan(between), surface, between)
+    found: Floats = surface.reshape(lowest.shape)
+    return found

@@ -1,0 +1,64 @@
+"""The ground as an empty scan tells it, and what is new in a sweep."""
+
+import numpy as np
+import pytest
+
+from pipeline.core.grid import Roi
+from pipeline.sensing.sensors import CATALOGUE
+from pipeline.sensing.sites import Pose
+from pipeline.validation.detectors import background
+from pipeline.validation.detectors.ground import SQUARE_M, STEEPEST, GroundMap
+from pipeline.validation.sweeps import SiteView, Sweep
+
+ROI = Roi((0.0, 0.0, 0.0), (40.0, 40.0, 5.0))
+SENSOR = CATALOGUE["VLP-32C"]
+
+
+def _view(range_of, pose=None):
+    pose = pose or Pose(-5.0, 20.0, 4.0)
+    return SiteView("s", pose, SENSOR, range_of(np.asarray(pose.position_m), SENSOR.directions(*pose.angles_deg)))
+
+
+def _to_plane(slope, wall_x_m=np.inf):
+    """Ranges to the plane z = slope * x, and to a wall across x."""
+
+    def range_of(start, ways):
+        with np.errstate(divide="ignore"):
+            down = (slope * start[0] - start[2]) / (ways[:, 2] - slope * ways[:, 0])
+            wall = (wall_x_m - start[0]) / ways[:, 0]
+        down, wall = (np.where(found > 0, found, np.inf) for found in (down, wall))
+        found = np.minimum(down, wall)
+        return np.where(found < SENSOR.range_m, found, np.inf)
+
+    return range_of
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.06, -0.1])
+def test_the_ground_of_a_slope_is_the_slope(slope):
+    ground = GroundMap.of(_view(_to_plane(slope)), ROI)
+    at = np.random.default_rng(0).uniform(5.0, 35.0, (200, 2))
+    np.testing.assert_allclose(ground.height_m(at), slope * at[:, 0], atol=2 * abs(slope) * 2 + 1e-9)
+
+
+def test_a_wall_is_no_ground():
+    ground = GroundMap.of(_view(_to_plane(0.0, wall_x_m=30.0)), ROI)
+    at = np.array([[10.0, 20.0], [29.0, 20.0], [31.0, 20.0], [39.0, 10.0]])
+    np.testing.assert_allclose(ground.height_m(at), 0.0, atol=STEEPEST * SQUARE_M)  # its foot is taken for a climb
+
+
+def test_where_nothing_was_met_the_ground_is_below_the_sensor():
+    view = _view(lambda _, ways: np.full(len(ways), np.inf))
+    np.testing.assert_array_equal(GroundMap.of(view, ROI).height_m(np.array([[1.0, 2.0]])), [4.0])
+
+
+def test_what_is_new_lies_before_the_empty_scan_and_in_the_world_where_it_was_met():
+    pose = Pose(1.0, 2.0, 3.0, yaw_deg=30.0, pitch_deg=-10.0, roll_deg=5.0)
+    view = _view(_to_plane(0.0), pose)
+    ways = SENSOR.directions()  # in the sensor's own frame
+    beam = np.flatnonzero(np.isfinite(view.empty_range_m))[:3].astype(np.uint32)
+    shorter = view.empty_range_m[beam] - [0.0, 0.14, 0.16]
+    points = np.column_stack([ways[beam] * shorter[:, None], np.ones(3)]).astype(np.float32)
+    sweep = Sweep(points, beam)
+    np.testing.assert_array_equal(background.new_in(sweep, view), [False, False, True])
+    there = np.asarray(pose.position_m) + SENSOR.directions(*pose.angles_deg)[beam] * shorter[:, None]
+    np.testing.assert_allclose(background.in_world(sweep, view), there, atol=1e-5)
