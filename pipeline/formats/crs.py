@@ -42,8 +42,8 @@ class WorldFrame:
     Attributes
     ----------
     projection
-        A projected coordinate reference system in metres, in any form that PROJ knows: ``"EPSG:25832"``, a PROJ string,
-        WKT. See :meth:`of`, which checks it.
+        A projected coordinate reference system in metres to the east and north, in any form that PROJ knows:
+        ``"EPSG:25832"``, a PROJ string, WKT. See :meth:`of`, which checks it.
     offset_m
         Added to its easting and northing to reach x and y; SUMO's ``netOffset``.
     """
@@ -53,13 +53,18 @@ class WorldFrame:
 
     @classmethod
     def of(cls, projection: str, offset_m: tuple[float, float], place: str) -> WorldFrame:
-        """A frame in a projection that was checked; InputError at ``place`` where it is unknown, or not in metres."""
+        """A frame in a projection that was checked; InputError at ``place`` where it is unknown, or not in metres to
+        the east and north."""
         crs = parsed(projection, place)
         right = "a projected system in metres, for example epsg = 32632 (UTM zone 32 north)"
         if not crs.is_projected:
             raise InputError(place, f"{projection} ({crs.name}) is no map projection", right)
         if any(axis.unit_name != "metre" for axis in crs.axis_info[:2]):
             raise InputError(place, f"{projection} ({crs.name}) counts in {crs.axis_info[0].unit_name}", right)
+        if {axis.direction for axis in crs.axis_info[:2]} != {"east", "north"}:
+            ways = " and ".join(axis.direction for axis in crs.axis_info[:2])
+            found = f"{projection} ({crs.name}) counts to the {ways}: the world would be turned round"
+            raise InputError(place, found, "a system that counts to the east and north")
         return cls(projection, offset_m)
 
     def from_degrees(self, lon_lat_deg: Floats) -> Floats:
@@ -110,6 +115,21 @@ def parsed(crs: Any, place: str) -> CRS:
         right = 'a coordinate reference system, for example "EPSG:25832"'
         raise InputError(place, f"{crs!r} is none that is known"[:160], right) from None
     return found.sub_crs_list[0] if found.is_compound else found
+
+
+def height_unit_m(crs: Any, place: str) -> float:
+    """How many metres a height of 1 is in a system: by its vertical axis (below 0 where that counts downwards).
+
+    Where it has none, by the unit of a map projection's other axes, and metres beside degrees.
+    """
+    from pyproj import CRS
+
+    parsed(crs, place)
+    found = CRS.from_user_input(crs)
+    for axis in found.axis_info:
+        if axis.direction in ("up", "down"):
+            return float(axis.unit_conversion_factor) * (1.0 if axis.direction == "up" else -1.0)
+    return float(found.axis_info[0].unit_conversion_factor) if found.is_projected else 1.0
 
 
 def utm_epsg(lon_deg: float, lat_deg: float) -> int:

@@ -179,14 +179,13 @@ class Georeference:
 
     def _neither(self, xy: Floats, place: str, right: str, taken: Reading | None = None) -> InputError:
         """The error for coordinates that lie far from everything; names what they would lie near as."""
-        readings = dict(self._others(xy))
-        told = [f"{_far(self.distance_m(points))} from it as {words}" for words, points in readings.items()]
+        away_m = {words: self.distance_m(points) for words, points in self._others(xy)}
+        told = [f"{_far(away)} from it as {words}" for words, away in away_m.items()]
         found = f"{_span(xy)} lie far from the region of interest"
         if taken is not None:
             found += f" ({_far(self.distance_m(taken.to_world(xy)))}) as {taken.words}"
-        away_m = {words: self.distance_m(points) for words, points in readings.items()}
-        nearest = min(away_m, key=lambda words: away_m[words])
-        cure = f"they would lie beside it as {nearest}; " if away_m[nearest] <= FAR_M else ""
+        nearest = min(away_m, key=lambda words: away_m[words], default="")
+        cure = f"they would lie beside it as {nearest}; " if away_m.get(nearest, np.inf) <= FAR_M else ""
         return InputError(place, f"{found} ({', '.join(told)})" if taken is None else found, cure + right)
 
     def _others(self, xy: Floats) -> Iterator[tuple[str, Floats]]:

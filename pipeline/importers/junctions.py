@@ -22,6 +22,7 @@ import shapely
 from shapely.geometry import LineString, Point, Polygon, box
 from shapely.geometry.base import BaseGeometry
 
+from pipeline.formats.crs import WorldFrame
 from pipeline.importers.shapes import XY
 from pipeline.traffic.network import LANE_WIDTH_M, Edge, Network
 from pipeline.traffic.network import Junction as Node
@@ -85,20 +86,18 @@ class Streets:
 
     def to_xy(self, lons_deg: Sequence[float], lats_deg: Sequence[float]) -> list[XY]:
         """World-frame x, y in metres of positions in degrees."""
-        frame = located(self.network.location)
-        assert frame is not None, "netconvert writes it"
-        xy_m = frame.from_degrees(np.column_stack([lons_deg, lats_deg]))
+        xy_m = self._frame.from_degrees(np.column_stack([lons_deg, lats_deg]))
         return [(x, y) for x, y in xy_m.tolist()]
 
     def to_degrees(self, points_m: Sequence[XY]) -> list[tuple[float, float]]:
         """Longitude and latitude in degrees of positions in the world frame."""
-        from pyproj import Proj
+        return [(lon, lat) for lon, lat in self._frame.to_degrees(np.array(points_m)).tolist()]
 
-        location = self.network.location
-        assert location is not None, "netconvert writes it"
-        east_m, north_m = location.offset_m
-        xs, ys = ([p[axis] - offset for p in points_m] for axis, offset in ((0, east_m), (1, north_m)))
-        return list(zip(*Proj(location.projection)(xs, ys, inverse=True), strict=True))
+    @property
+    def _frame(self) -> WorldFrame:
+        frame = located(self.network.location)
+        assert frame is not None, "netconvert writes it"
+        return frame
 
 
 @dataclass(frozen=True)

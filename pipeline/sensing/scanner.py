@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from pipeline.core.errors import InputError
 from pipeline.formats import point_clouds
+from pipeline.formats.crs import height_unit_m
 from pipeline.kernels import rays
 from pipeline.scenario.types import FARTHEST_M
 from pipeline.sensing import placing
@@ -202,7 +203,7 @@ class Scanner:
             world.metres(points[:, :2], place, "metres of the world frame, or a LAS file that names its system")
             return points
         reading = world.reading(points[:, :2], place, declared, "points in the system that the file's header names")
-        height_m = points[:, 2] - self.scene.scenario.crs.zero_height_m
+        height_m = points[:, 2] * height_unit_m(declared, place) - self.scene.scenario.crs.zero_height_m
         return np.column_stack([reading.to_world(points[:, :2]), height_m])
 
 

@@ -10,8 +10,9 @@ LANE_INSET_M = 0.25
 this. Networks are drawn to a few decimetres, and a pole at the kerb is right."""
 
 CLEARANCE_M = 4.5
-"""What is higher than this above the road stands in nobody's way: a sensor on a gantry, a bridge, a crown. The least
-clearance over roads in Germany (RAA 2008) and Japan (Road Structure Ordinance, article 12)."""
+"""What is higher than this above the road stands in nobody's way: a sensor on a gantry, a bridge, a crown. The height
+that is kept free above carriageways in Germany (https://www.hogeback-landschaftspflege.de/leistungen/lrp/); those of
+other countries were not looked up."""
 
 KERB_M = 0.3
 """What is not higher than this above the road is no obstacle: an island, a kerb, the surface of the road itself."""
@@ -24,7 +25,7 @@ COVERED_M2 = 2.0
 
 FAR_M = 500.0
 """Static geometry of which nothing is nearer to the region of interest than this belongs to another place: no sensor of
-the catalogue reaches half as far."""
+the catalogue reaches farther."""
 
 FEW_BOXES = 2.0
 """Vehicles in the region of interest in a mean frame; with fewer, the ranking rests on hardly any traffic."""

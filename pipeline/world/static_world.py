@@ -35,7 +35,7 @@ from pipeline.world.terrain import Surface
 Floats = NDArray[np.float64]
 
 GROUND_MARGIN_M = 500.0
-"""How far the ground plane goes on beyond everything; more than any sensor in the catalogue reaches."""
+"""How far the ground plane goes on beyond everything; no sensor in the catalogue reaches farther."""
 
 
 @dataclass(frozen=True)

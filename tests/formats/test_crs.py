@@ -113,3 +113,25 @@ def test_web_mercator_stretches_and_utm_does_not() -> None:
                                                   (-180.0, 10.0, 32601), (180.0, 10.0, 32660)])  # fmt: skip
 def test_the_utm_zone_of_a_place(lon: float, lat: float, code: int) -> None:
     assert crs.utm_epsg(lon, lat) == code
+
+
+@pytest.mark.parametrize("turned", ["EPSG:2053", "+proj=tmerc +lon_0=9 +axis=wsu +ellps=WGS84 +units=m +no_defs"])
+def test_a_system_that_counts_to_the_west_and_south_would_turn_the_world_round(turned: str) -> None:
+    with pytest.raises(
+        InputError, match=r"s: crs: .* counts to the west and south: .*; a system that counts to the east"
+    ):
+        WorldFrame.of(turned, (0.0, 0.0), "s: crs")
+
+
+@pytest.mark.parametrize(
+    ("system", "metres"),
+    [
+        ("EPSG:4326", 1.0), ("EPSG:4979", 1.0), ("EPSG:25832", 1.0), ("EPSG:25832+5783", 1.0),
+        ("EPSG:2263", 1200 / 3937), ("EPSG:2263+5703", 1.0),
+        ("EPSG:26918+6360", 1200 / 3937), ("EPSG:26918+6358", None),
+    ],
+)  # fmt: skip
+def test_heights_have_the_unit_of_the_vertical_axis_or_of_the_map_projection(system: str, metres: float | None) -> None:
+    """A US survey foot is 1200/3937 m; EPSG:6358 counts depths, downwards."""
+    found = crs.height_unit_m(system, "s")
+    assert found < 0 if metres is None else found == pytest.approx(metres, rel=1e-9)

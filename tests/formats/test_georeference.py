@@ -68,6 +68,7 @@ def test_a_projection_of_the_world_itself_is_taken_where_nothing_says_what_the_w
          r"lies on the Earth; \[crs\] with epsg \(UTM there: 32632\) and offset_m in s/scenario.toml, or a network"),
         (NOWHERE, DEGREES[:1], None, "look like longitude and latitude"),
         (NOWHERE, DEGREES, "EPSG:4326", r"^a.geojson: is in WGS 84, and nothing says.*32632"),
+        (NOWHERE, np.add(CORNERS / 1e6, 1e6), WORLD, r"lie far from the region .* \(1,413 km\) as metres .*; \"crs\""),
         (NOWHERE, CORNERS, "EPSG:2263", "is in NAD83 / New York Long Island .*, and nothing says"),
         (HERE, np.add(DEGREES, (1.8, 0.0)), None, r"lie far from the region of interest \(127 km from it as degrees, "),
         (HERE, np.add(DEGREES, (0.5, 0.0)), None, r"lie far from the region of interest \(35 km\) as degrees"),

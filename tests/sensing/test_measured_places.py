@@ -63,6 +63,17 @@ def test_las_in_a_projection_gives_what_metres_give(mini: Path, crs: str, point_
 
 
 @needs_laspy
+@pytest.mark.parametrize(("vertical", "unit_m"), [("+6360", 1200 / 3937), ("+5703", 1.0), ("", 1200 / 3937)])
+def test_las_in_feet_gives_what_metres_give(mini: Path, vertical: str, unit_m: float) -> None:
+    """New York's plane counts in US survey feet; its heights too, where no vertical system says otherwise."""
+    frame = WorldFrame("EPSG:32618", (-585_000.0, -4_510_000.0))
+    known = "\n[crs]\nepsg = 32618\noffset_m = [-585000, -4510000]\nzero_height_m = 5.0\n"
+    feet = WorldFrame("EPSG:2263").from_degrees(frame.to_degrees(POINTS[:, :2]))
+    write_las(mini / "m.las", np.column_stack([feet, (POINTS[:, 2] + 5.0) / unit_m]), f"EPSG:2263{vertical}")
+    assert scanned(mini, "m.las", known).rows.ends_m == pytest.approx(POINTS - [10, 12, 3], abs=2e-3)
+
+
+@needs_laspy
 def test_las_without_a_system_is_in_metres(mini: Path) -> None:
     write_las(mini / "m.las", POINTS, None)
     assert scanned(mini, "m.las").rows.ends_m == pytest.approx(POINTS - [10, 12, 3], abs=1e-4)

@@ -12,6 +12,8 @@ from hypothesis import strategies as st
 from pipeline.core.errors import InputError
 from pipeline.scenario.sensors import SensorModel
 from pipeline.sensing.sensors import CATALOGUE, Sensor, resolve, rotation
+from pipeline.world import limits
+from pipeline.world.static_world import GROUND_MARGIN_M
 
 BEAMS = {
     "VLP-16": 28_800, "VLP-32C": 57_600, "Pandar XT-32": 64_000, "OS1-64": 65_536, "OS1-128": 131_072,
@@ -219,3 +221,9 @@ def test_a_negative_azimuth_is_the_positive_one_to_the_last_bit() -> None:
     below, above = (Sensor("s", (10.0,), (offset,), 1, 100.0, "") for offset in (-8.018, 351.982))
     assert below.directions().tolist() == above.directions().tolist()
     assert Sensor("s", (0.0,), (-1e-9,), 1, 100.0, "").directions().tolist() == [[1.0, 0.0, 0.0]]
+
+
+def test_no_sensor_reaches_beyond_what_is_built_and_checked() -> None:
+    farthest_m = max(sensor.range_m for sensor in CATALOGUE.values())
+    assert farthest_m <= limits.FAR_M
+    assert farthest_m <= GROUND_MARGIN_M
