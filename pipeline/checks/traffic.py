@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import wraps
+from functools import partial, wraps
 
 from pipeline.checks.subject import Refusals, Subject
 from pipeline.core.errors import InputError
 from pipeline.core.findings import Finding
 from pipeline.traffic import fcd, sumo, sumo_folder
+from pipeline.traffic.demand import counts as demand
 from pipeline.traffic.demand import trips
 from pipeline.traffic.finished import sizes, survey
 from pipeline.world import world_frame
@@ -87,14 +88,15 @@ def kinds(subject: Subject) -> Iterator[Finding]:
 
 @_of_each_period
 def counts(subject: Subject) -> Iterator[Finding]:
-    """An error for each count at an edge, or of a kind, that is not there."""
+    """An error for each count at an edge, or of a kind, that is not there, or on a way that nobody can drive."""
     traffic, place = subject.scenario.traffic, sumo_folder.place_of(subject.scenario)
-    names, network = [kind.name for kind in traffic.kinds], subject.network
+    if subject.network is None or not traffic.counts:
+        return
+    edges, ways = {edge.id for edge in subject.network.edges}, demand.ways_of(traffic, subject.network)
     for count in traffic.counts:
-        where = f"{place}.counts ({count.title})"
-        if count.kind and count.kind not in names:
-            found, right = f"the fleet has no kind {count.kind!r}", f"one of {', '.join(names)}"
-            yield Finding("traffic", where, found, right, is_error=True)
+        where, refusals = demand.where_of(count, place), Refusals()
+        refusals.unless_refused("traffic", partial(demand.place_of, count, traffic, ways, place))
+        yield from refusals.found
         for edge in filter(None, (count.edge, count.from_edge, count.to_edge)):
-            if network is not None and edge not in {road.id for road in network.edges}:
+            if edge not in edges:
                 yield Finding("traffic", where, f"the network has no edge {edge!r}", "the id of an edge", is_error=True)

@@ -6,8 +6,8 @@ simulated around them. (A number of vehicles for the whole network does the oppo
 junction falls as the network grows.)
 
 Steps: find where streets come into the region and where they leave it (gates); each lane of a gate carries
-:data:`PER_LANE_H` vehicles an hour, by the class of its road; balance the flows from gate to gate (Furness; Ortuzar and
-Willumsen, Modelling Transport, 5.4),
+:data:`PER_LANE_H` vehicles an hour, by the class of its road; balance the flows from gate to gate as Furness' doubly
+constrained growth factors do (https://archive.nptel.ac.in/content/storage2/courses/105101087/08-Ltexhtml/p6/p.html),
 
 .. math:: q_{ij} = a_i \, b_j \, w_{ij}, \qquad \sum_j q_{ij} = q_i, \qquad
           \sum_i q_{ij} \approx q_j \sum_i q_i / \sum_j q_j,
@@ -33,8 +33,7 @@ PER_LANE_H = {
 }  # fmt: skip
 """Vehicles an hour and lane by OpenStreetMap's class of road, on an ordinary day outside the peaks.
 
-For a street with a lane each way twice as much in both directions together; German guidelines (RASt 06) expect 800 to
-2600 at the peak hour of main streets, 400 to 1000 of collector and below 400 of residential streets.
+Round figures of the order that planners reckon with; no source stands behind them.
 """
 
 _OTHER_H = 40.0

@@ -260,8 +260,7 @@ def _met(scenario: Scenario, prepared: Prepared) -> tuple[list[MetCount], list[F
     """Counted against simulated, and what to know of it."""
     if not prepared.counted:
         return [], []
-    when = prepared.timing
-    first_s, end_s = when.first_ms / 1000.0, (when.first_ms + when.frames * when.period_ms) / 1000.0
+    first_s, end_s = prepared.timing.first_ms / 1000.0, prepared.timing.end_ms / 1000.0
     passed = counts.met(scenario.traffic, prepared.folder / DRIVEN, first_s, end_s)
     return passed, counts.findings(passed, (end_s - first_s) / 3600.0, sumo_folder.place_of(scenario))
 

@@ -375,6 +375,11 @@ def test_counts_at_edges_and_of_kinds_that_are_not_there(street: Path) -> None:
     ]  # fmt: skip
 
 
+def test_a_count_on_a_way_that_nobody_can_drive_is_told_before_the_first_stage(street: Path) -> None:
+    (told,) = found(street, 'traffic.counts=[{from_edge="east",to_edge="west",per_hour=9}]')["traffic"]
+    assert told == "scenario.toml: traffic.counts (east to west): no way leads from 'east' to 'west'"
+
+
 def test_a_file_keeps_all_its_sites(street: Path) -> None:
     with pytest.raises(InputError, match="only_free acts on grid and along"):
         pipeline.load(street, ["sites.only_free=false"])

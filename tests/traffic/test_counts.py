@@ -51,7 +51,9 @@ def test_turning_movements_an_edge_and_a_kind_are_met(cross, tmp_path):
     ]  # fmt: skip
     assert [c["counted_per_h"] for c in met] == [300, 80, 120, 200, 60] and met[-1]["kind"] == "truck"
     assert all(c["geh"] < 5 for c in met), met
-    assert all(c["geh"] == round(counts.geh(c["counted_per_h"], c["simulated_per_h"]), 2) for c in met)
+    assert [c["geh"] for c in met] == pytest.approx(
+        [counts.geh(c["counted_per_h"], c["simulated_per_h"]) for c in met], abs=0.011
+    )
     assert result["warnings"] == [] and "--max-num-vehicles" not in result["flags"]
     routes = (tmp_path / "sumo" / "trips.rou.xml").read_text()
     kinds = Counter(re.findall(r'id="fleet\.\d+" type="(\w+)"', routes))
@@ -77,6 +79,23 @@ def test_counts_that_the_lanes_cannot_carry_are_told(cross, tmp_path):
     assert (warning["rule"], waiting["rule"]) == ("counts", "waiting")
     assert not warning["is_error"]
     assert re.search(r"1 of 1 counts are missed .*left0A0 to A0top0: \d+(\.\d)? for 9000", warning["found"])
+
+
+def test_frames_far_apart_change_no_rate(cross, tmp_path):
+    """SUMO ends with the last frame: 19 minutes of 20 are simulated, and the rate is that of these."""
+    lasting = {"frames": 20, "frame_period_s": 60.0, "warmup_s": 60.0}
+    (met,) = run_stage(traffic, counted(cross, [turn("left", "right", 300)], **lasting), tmp_path)["counts"]
+    routes = (tmp_path / "sumo" / "trips.rou.xml").read_text()
+    assert routes.count("<vehicle") == 100  # 300 an hour in 1200.5 s
+    assert met["simulated_per_h"] == pytest.approx(300, abs=8)  # 285 if divided by 20 minutes
+
+
+def test_a_kind_may_not_be_called_like_the_fleet(cross, tmp_path):
+    kinds = [KINDS[0] | {"name": "fleet"}, KINDS[1]]
+    rows = [turn("left", "right", 300), turn("left", "right", 60, "fleet")]
+    model = scenario(cross, network="net.xml", kinds=kinds, counts=rows, **LASTING)
+    with pytest.raises(InputError, match=r"counts \(left0A0 to A0right0\): a kind called 'fleet'; another name"):
+        run_stage(traffic, model, tmp_path)
 
 
 def test_what_drove_past_is_counted_by_edge_and_by_turn(tmp_path):
@@ -128,7 +147,7 @@ def test_ways_over_a_place_are_no_detours(town):
     ("rows", "message"),
     [
         ([{"edge": "nowhere", "per_hour": 1}], r"traffic\.counts \(nowhere\): the network has no edge 'nowhere'"),
-        ([turn("left", "right", 10, "tram")], r"counts\.0\.kind: the fleet has no kind 'tram'; .*car, truck"),
+        ([turn("left", "right", 10, "tram")], r"counts \(left0A0 to .*\): the fleet has no kind 'tram'; .*car, truck"),
         (
             [{"from_edge": "A0top0", "to_edge": "left0A0", "per_hour": 5}],
             r"\(A0top0 to left0A0\): no way leads from 'A0top0' to 'left0A0'",

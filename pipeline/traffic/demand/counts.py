@@ -7,7 +7,8 @@ vehicle of the fleet gets a kind, by share, among those that may drive its route
 the fleet.
 
 After the run, :func:`met` counts what really drove past in the frames that were recorded, and holds it against the
-counts. GEH is what traffic engineers compare hourly flows m and c by (Design Manual for Roads and Bridges, vol. 12):
+counts. GEH is what traffic engineers compare hourly flows m and c by, as SUMO's own tools have it
+(sumolib.statistics.geh; routeSampler's --geh-ok is 5 too):
 
     GEH = sqrt(2 (m - c)^2 / (m + c)),      a good match below 5
 """
@@ -27,7 +28,7 @@ from pipeline.core import files
 from pipeline.core.errors import InputError
 from pipeline.core.findings import Finding
 from pipeline.formats import safe_xml
-from pipeline.scenario.traffic import CountModel, TrafficModel
+from pipeline.scenario.traffic import CountModel, TrafficModel, VehicleKind
 from pipeline.traffic import sumo
 from pipeline.traffic.demand.ways import Place, Ways
 from pipeline.traffic.network import Network
@@ -76,38 +77,58 @@ def write_routes(
 
     InputError when a count names an edge or a kind that is not there, or a way that nobody can drive.
     """
-    ways = {vclass: Ways(network, vclass) for vclass in {kind.vclass for kind in traffic.kinds}}
-    groups = _groups(traffic, where)
+    ways = ways_of(traffic, network)
+    places = [place_of(count, traffic, ways, where) for count in traffic.counts]
+    named = [kind.name for kind in traffic.kinds]
+    groups = [group for group in ("", *named) if any(count.kind == group for count in traffic.counts)]
     vehicles: list[_Vehicle] = []
-    for (group, counts), child in zip(groups.items(), seed.spawn(len(groups)), strict=True):
-        kinds = [kind for kind in traffic.kinds if group in (FLEET, kind.name)]
-        main = ways[max(kinds, key=lambda kind: kind.share).vclass]
-        places = [main.place(c.edge or c.from_edge or "", c.to_edge, w) for c, w in _with_place(counts, where)]
+    for group, child in zip(groups, seed.spawn(len(groups)), strict=True):
+        kinds = _kinds(traffic, group)
+        there = [place for place, count in zip(places, traffic.counts, strict=True) if count.kind == group]
+        rates = [count.per_hour for count in traffic.counts if count.kind == group]
         rng, sampler = np.random.default_rng(child), int(child.generate_state(1)[0]) & 0x7FFFFFFF
-        candidates = main.candidates(places, traffic, rng, where)
-        rates = [c.per_hour for c in counts]
-        for index, (depart_s, edges) in enumerate(_sampled(places, rates, candidates, times_s, sampler, folder)):
-            able = [kind for kind in kinds if ways[kind.vclass].may_drive(edges)] or [kinds[0]]
+        candidates = ways[_main(kinds).vclass].candidates(there, traffic, rng, where)
+        for index, (depart_s, edges) in enumerate(_sampled(there, rates, candidates, times_s, sampler, folder)):
+            able = [kind for kind in kinds if ways[kind.vclass].may_drive(edges)]  # the main one may
             shares = np.array([kind.share for kind in able])
             kind = able[int(np.searchsorted(np.cumsum(shares) / shares.sum(), rng.random(), side="right"))]
-            vehicles.append(_Vehicle(depart_s, f"{group}.{index}", kind.name, " ".join(edges)))
+            vehicles.append(_Vehicle(depart_s, f"{group or FLEET}.{index}", kind.name, " ".join(edges)))
     lines = [vehicle.xml() for vehicle in sorted(vehicles, key=lambda v: (v.depart_s, v.name))]
     files.write_text(folder / name, "\n".join(["<routes>", *lines, "</routes>", ""]))
 
 
-def _groups(traffic: TrafficModel, where: str) -> dict[str, list[CountModel]]:
-    """The counts of the fleet, then those of each kind that was counted."""
-    names = [kind.name for kind in traffic.kinds]
-    for number, count in enumerate(traffic.counts):
-        if count.kind and count.kind not in names:
-            what, right = f"the fleet has no kind {count.kind!r}", f"one of {', '.join(names)}"
-            raise InputError(f"{where}.counts.{number}.kind", what, right)
-    groups = {name: [c for c in traffic.counts if (c.kind or FLEET) == name] for name in (FLEET, *names)}
-    return {name: counts for name, counts in groups.items() if counts}
+def ways_of(traffic: TrafficModel, network: Network) -> dict[str, Ways]:
+    """The ways of each vClass of the fleet."""
+    return {kind.vclass: Ways(network, kind.vclass) for kind in traffic.kinds}
 
 
-def _with_place(counts: Sequence[CountModel], where: str) -> Iterator[tuple[CountModel, str]]:
-    return ((count, f"{where}.counts ({count.title})") for count in counts)
+def place_of(count: CountModel, traffic: TrafficModel, ways: Mapping[str, Ways], where: str) -> Place:
+    """Where a count was taken; InputError when it names an edge or a kind that is not there, or a way that nobody can
+    drive.
+    """
+    where = where_of(count, where)
+    if not (kinds := _kinds(traffic, count.kind)):
+        right = f"one of {', '.join(kind.name for kind in traffic.kinds)}"
+        raise InputError(where, f"the fleet has no kind {count.kind!r}", right)
+    if count.kind == FLEET:
+        right = "another name for this kind: so vehicles are called that were counted without theirs"
+        raise InputError(where, f"a kind called {FLEET!r}", right)
+    return ways[_main(kinds).vclass].place(count.edge or count.from_edge or "", count.to_edge, where)
+
+
+def where_of(count: CountModel, traffic: str) -> str:
+    """What messages about a count of ``[traffic]`` point to."""
+    return f"{traffic}.counts ({count.title})"
+
+
+def _kinds(traffic: TrafficModel, group: str) -> list[VehicleKind]:
+    """Those that a count may be of: the whole fleet, or the one that it names."""
+    return [kind for kind in traffic.kinds if group in ("", kind.name)]
+
+
+def _main(kinds: Sequence[VehicleKind]) -> VehicleKind:
+    """The one whose ways all take, where they may."""
+    return max(kinds, key=lambda kind: kind.share)
 
 
 def _sampled(

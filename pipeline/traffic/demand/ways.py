@@ -4,7 +4,8 @@ A way leads from where one can come from nowhere else (the fringe) to where one 
 before the place and after it. It is plausible when it is no detour: at most :data:`DETOUR` times as long as the fastest
 way between the same ends, with no edge twice. Where no way over a place is, the shortest detours are taken.
 
-Lengths of ways are seconds at the speed limit. A turnaround is no way on, unless nothing else leads to a place.
+Lengths of ways are seconds at the speed limit. A turnaround is no way on; where nothing of the fringe leads to a place,
+ways start there, and likewise they end there.
 """
 
 from __future__ import annotations
