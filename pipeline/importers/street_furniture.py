@@ -35,7 +35,8 @@ def barriers(extract: Extract, xy: dict[int, XY], counts: ImportCounts) -> Itera
         if geometry.is_empty:
             counts.drop("barrier", "degenerate")
         else:
-            yield MappedSolid(f"way/{way.id}", "barrier", geometry, extent.top_m, extent.source, 0.0, radius_m)
+            name, base_m = f"way/{way.id}", extent.base_m
+            yield MappedSolid(name, "barrier", geometry, extent.top_m, extent.source, base_m, radius_m)
 
 
 def poles(extract: Extract, xy: dict[int, XY], counts: ImportCounts) -> Iterator[MappedSolid]:
@@ -44,7 +45,8 @@ def poles(extract: Extract, xy: dict[int, XY], counts: ImportCounts) -> Iterator
         known = next((POLES[name] for key, value in tags.items() if (name := f"{key}.{value}") in POLES), None)
         if known is not None:
             extent, at = extent_counted(tags, known, counts), point_at(xy[node])
-            yield MappedSolid(f"node/{node}", "pole", at, extent.top_m, extent.source, 0.0, known.half_width_m)
+            name, base_m = f"node/{node}", extent.base_m
+            yield MappedSolid(name, "pole", at, extent.top_m, extent.source, base_m, known.half_width_m)
         elif "barrier" in tags:
             counts.not_modelled[f"barrier={tags['barrier']}"] += 1
         elif tags.get("power") in ("tower", "portal"):

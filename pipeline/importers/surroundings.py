@@ -3,8 +3,8 @@
 Steps: cut each street where it crosses the circle round the junction, with a new node there; keep the pieces inside; of
 those for cars, keep the pieces that hang together with the middle. What is no street (buildings, trees) stays as it is.
 
-Distances are metres on the sphere, in the plane that touches it at the middle: within 1 km of it, right to a millimetre
-a kilometre.
+Distances are metres on a sphere, in the plane that touches it at the middle: within 1 km of it they differ from those
+on the ellipsoid by less than half a percent, and nothing rests on where exactly a street is cut.
 """
 
 from __future__ import annotations

@@ -118,11 +118,15 @@ def _flattened(values: dict[str, Any], above: str) -> Iterator[tuple[str, Any]]:
         yield above + key, value
 
 
+MOST_BLOCKS = 65535
+"""Of all periods together: ``tpog.parquet`` numbers blocks in 16 bits."""
+
+
 class TpogModel(StrictModel):
     """How frames are counted."""
 
     blocks: int = Field(
-        10, ge=1, le=65535, description="Blocks of consecutive frames; divides traffic.frames if that is given"
+        10, ge=1, le=MOST_BLOCKS, description="Blocks of consecutive frames; divides traffic.frames if that is given"
     )
 
 
@@ -254,6 +258,8 @@ class Scenario(StrictModel):
     @model_validator(mode="after")
     def _across(self) -> Scenario:
         blocks = self.tpog.blocks
+        if (all_blocks := blocks * max(1, len(self.traffic.periods))) > MOST_BLOCKS:
+            raise ValueError(f"tpog.blocks = {blocks} in each period are {all_blocks} blocks: at most {MOST_BLOCKS}")
         for period, traffic in self._traffic_by_period():
             if traffic.frames is not None and traffic.frames % blocks:
                 of = f" of the period {period!r}" if period else ""

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from pipeline.artefacts import schemas, tables
 from pipeline.artefacts.foreign_columns import foreign_columns
+from pipeline.artefacts.period_ranking import PERIOD_SCORES
 from pipeline.artefacts.readers import read_tpog
 from pipeline.checks import recorded
 from pipeline.core.findings import WARNINGS
@@ -39,7 +40,7 @@ from pipeline.stages.shared.scene import SCANS, scan_inputs, scene_of, sensor_di
 from pipeline.world import world_frame
 
 NAME = "score"
-ARTEFACTS = ("scores.parquet", "visibility.parquet", period_scores.PERIOD_SCORES)
+ARTEFACTS = ("scores.parquet", "visibility.parquet", PERIOD_SCORES)
 TRAJECTORIES = "trajectories.parquet"
 
 

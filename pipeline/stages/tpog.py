@@ -56,24 +56,25 @@ def run(work: Workspace, inputs: StageInputs) -> Summary:
     Returns
     -------
     dict
-        ``occupied_voxels``, ``static_voxels`` (left out), ``boxes_in_roi`` (mean a frame); ``left_over`` where a
-        finished file's frames are no whole number of blocks; warnings.
+        ``occupied_voxels``, ``static_voxels`` (left out), ``boxes_in_roi`` (mean a frame, of the mix); ``left_over``
+        where a finished file's frames are no whole number of blocks; warnings.
     """
     source, scenario = work.path("trajectories.parquet"), work.scenario
     grid, filled = scenario.roi.grid, static_voxels(world_of(work), scenario.roi.grid)
     counting = _Counting(np.flatnonzero(filled))
     with tables.writer(work.path(ARTEFACTS[0]), "tpog") as file:
-        periods, first_block, left_over = [], 0, 0
+        periods, in_roi, first_block, left_over = [], list[float](), 0, 0
         for name, frames, boxes in _recorded(source, grid):
             over = _left_over(scenario, frames)
             block_frames = (frames - over) // scenario.tpog.blocks
             blocks = count_blocks(boxes, grid, block_frames, scenario.tpog.blocks)
-            in_roi = counting.write(file, blocks, first_block, work.progress)
-            periods.append(PeriodBlocks(name, 1.0, frames - over, block_frames, memory_frames(in_roi)))
+            boxes_near = counting.write(file, blocks, first_block, work.progress)
+            in_roi.append(int(boxes_near.sum()) / (frames - over))
+            periods.append(PeriodBlocks(name, 1.0, frames - over, block_frames, memory_frames(boxes_near)))
             first_block, left_over = first_block + scenario.tpog.blocks, left_over + over
         periods = _weighted(periods, scenario)
         file.describe(work.metadata(inputs, grid=grid.to_json(), **_described(periods)))
-    mean = counting.boxes / sum(period.frames for period in periods)
+    mean = float(np.average(in_roi, weights=[period.weight for period in periods]))
     doubts = [
         *recorded.in_region(mean, source),
         *recorded.through_solids(counting.hidden, counting.seen, counting.solid, grid, world_of(work)),
@@ -101,7 +102,6 @@ class _Counting:
     solid: NDArray[np.int64]
     hidden: NDArray[np.int64] = field(init=False)
     seen: int = 0
-    boxes: int = 0
     ever: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
@@ -125,9 +125,7 @@ class _Counting:
             self.ever = (counts > 0) | (False if self.ever is None else self.ever)
             boxes.append(boxes_near)
             progress("blocks", block + 1, 0)
-        in_roi = np.concatenate(boxes)
-        self.boxes += int(in_roi.sum())
-        return in_roi
+        return np.concatenate(boxes)
 
 
 def _recorded(source: Path, grid: Grid) -> Iterator[tuple[str, int, Iterator[FrameBoxes]]]:

@@ -28,7 +28,7 @@ from pipeline.formats.georeference import Georeference, Reading
 from pipeline.traffic.network import location_of
 from pipeline.world.footprints import Footprint, FootprintFile, polygons_of
 from pipeline.world.mapped_heights import extent_of, is_underground
-from pipeline.world.solid_types import POLES, TRUNK_RADIUS_M, SolidType, SolidTypes
+from pipeline.world.solid_types import TRUNK_RADIUS_M, SolidType, SolidTypes
 from pipeline.world.world_frame import located
 
 _INNER = "inner"
@@ -101,8 +101,8 @@ class _Reader:
 
     def _take_point(self, place: str, name: str, kind: str, element: Element, tags: dict[str, str]) -> None:
         """A pole, or a tree with its trunk; all other points of interest are none."""
-        solid = POLES.get(kind) or self._types.named(kind)
-        radius_m = solid.half_width_m if solid is not None and (kind in POLES or solid.is_tree) else None
+        solid = self._types.pole(kind)
+        radius_m = None if solid is None else solid.half_width_m
         is_geo = "x" not in element.attrib
         x, y = (element.get(key) for key in (("lon", "lat") if is_geo else ("x", "y")))
         if solid is None or radius_m is None or x is None or y is None:

@@ -145,11 +145,15 @@ class SolidTypes:
         changes = changes or {}
         ignored = tuple(f"{name}." for name, value in changes.items() if value == IGNORE and name)
         self._solid = {name: kind for name, kind in SOLID.items() if not name.startswith(ignored)}
+        self._poles = {name: kind for name, kind in POLES.items() if not name.startswith(ignored)}
         self._none = set(NOT_SOLID)
         for name, value in sorted(changes.items()):
             if value == IGNORE:
                 self._none.add(name)
                 self._solid.pop(name, None)
+                self._poles.pop(name, None)
+            elif name in POLES:
+                self._poles[name] = POLES[name] if value == "solid" else replace(POLES[name], height_m=float(value))
             else:
                 self._none.discard(name)
                 kind = self._solid.get(name) or SOLID.get(name) or self.named(name) or _CLOSED
@@ -158,6 +162,11 @@ class SolidTypes:
     def knows(self, name: str) -> bool:
         """Whether the table says anything of a type."""
         return any(prefix in self._solid or prefix in self._none for prefix in _prefixes(name))
+
+    def pole(self, name: str) -> SolidType | None:
+        """How a point of a type stands; None when it is neither a pole nor a tree."""
+        solid = self._poles.get(name) or self.named(name)
+        return solid if name in self._poles or (solid is not None and solid.is_tree) else None
 
     def named(self, name: str) -> SolidType | None:
         """How a type stands; None when it is not solid, or unknown."""

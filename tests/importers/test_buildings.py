@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from pipeline.formats.osm import Bounds, Extract, Tags, Way
+from pipeline.importers import street_furniture
 from pipeline.importers.buildings import buildings
 from pipeline.importers.mapped_solids import ImportCounts, MappedSolid
 
@@ -108,3 +109,17 @@ def test_a_building_that_is_only_a_point_is_counted() -> None:
     extract = Extract({node: (0.0, 0.0) for node in XY}, points, {}, (), Bounds(0, 0, 1, 1), False)
     assert not list(buildings(extract, XY, counts))
     assert counts.dropped == {"no_outline": {"building": 2}}
+
+
+def test_what_stands_on_a_wall_starts_above_it() -> None:
+    """``min_height`` is the underside of barriers and poles, too."""
+    tags = {"barrier": "fence", "min_height": "1.2", "height": "2.5"}
+    lamp = {"highway": "street_lamp", "min_height": "3", "height": "8"}
+    extract = Extract(
+        dict.fromkeys(XY, (0.0, 0.0)), {1: lamp}, {7: Way(7, (1, 2), tags)}, (), Bounds(0, 0, 1, 1), False
+    )
+    made = [
+        *street_furniture.barriers(extract, XY, ImportCounts()),
+        *street_furniture.poles(extract, XY, ImportCounts()),
+    ]
+    assert [(solid.kind, solid.base_m, solid.height_m) for solid in made] == [("barrier", 1.2, 2.5), ("pole", 3.0, 8.0)]

@@ -53,7 +53,7 @@ def of(table: object) -> list[dict[str, object]]:
 
 
 def test_the_mix_is_exact(split: Path, tmp_path: Path) -> None:
-    pipeline.run(pipeline.load(split), tmp_path)
+    record = pipeline.run(pipeline.load(split), tmp_path)
     path = tmp_path / "tpog.parquet"
     day, night, mix = read_tpog(path, "day"), read_tpog(path, "night"), read_tpog(path)
     assert (day.frames, night.frames) == (24, 16)
@@ -62,6 +62,10 @@ def test_the_mix_is_exact(split: Path, tmp_path: Path) -> None:
         ("night", 1.0, 4, 3),
     ]
     assert mix.frames == 5 * 24 + 3 * 16
+    boxes = [tables.read(tmp_path / "trajectories.parquet", "trajectories")[0].column("frame").to_numpy()]
+    by_day, by_night = (np.count_nonzero(boxes[0] < 24) / 24, np.count_nonzero(boxes[0] >= 24) / 16)
+    mean = record.stages["tpog"].summary["boxes_in_roi"]
+    assert mean == pytest.approx((2.5 * by_day + by_night) / 3.5)
     wanted = {}
     for cell in zip(*np.nonzero(day.counts + night.counts), strict=True):
         shares = Fraction(int(day.counts[cell]), 24), Fraction(int(night.counts[cell]), 16)
@@ -190,6 +194,7 @@ def test_a_period_whose_best_site_is_another_is_told() -> None:
         ("weight = 2.5", "weight = 0", r"traffic\.periods\.0\.weight: 0; input should be greater than 0\n$"),
         ("weight = 2.5", "weight = 2.123456789", "make a mix of .* frames; weights with fewer digits"),
         ("begin_s = 12", "begin = 12", "begin"),
+        ("blocks = 4", "blocks = 40000", "blocks = 40000 in each period are 80000 blocks: at most 65535"),
         ("length_s = 8", "length_s = 80", "frames"),
         ("[score]", "[effects.moving_occlusion]\n[score]", 'method = "frames" replays all periods alike'),
     ],

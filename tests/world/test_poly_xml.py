@@ -335,6 +335,17 @@ def test_trees_and_poles_among_the_points(tmp_path: Path) -> None:
     assert file.left_out == {"points of type shop": 1, "points of type building": 1, "points of type natural": 1}
 
 
+def test_the_users_table_goes_for_points_too(tmp_path: Path) -> None:
+    points = [
+        f'<poi id="{i}" type="{kind}" x="{i}" y="2"/>'
+        for i, kind in enumerate(("highway.street_lamp", "power.pole", "barrier.bollard", "man_made.mast"))
+    ]
+    table = {"highway.street_lamp": 4.5, "power": "ignore", "barrier.bollard": "ignore", "man_made.mast": "solid"}
+    file = read(tmp_path, *points, types=table)
+    assert [(f.name, f.height_m) for f in file.footprints] == [("0", 4.5), ("3", 15.0)]
+    assert file.left_out == {"points of type power": 1, "points of type barrier": 1}
+
+
 def test_what_stands_there_twice_is_built_once(tmp_path: Path) -> None:
     """With full types, polyconvert writes a tower as a building and as a tower."""
     file = read(tmp_path, poly("building.yes"), poly("man_made.tower"), poly("historic.yes"))

@@ -16,8 +16,6 @@ from pipeline.scoring.leave_out import LeaveOut
 from pipeline.scoring.scorer import PeriodTpog, SiteScore, ranks
 from pipeline.scoring.uncertainty import Estimate
 
-PERIOD_SCORES = "scores_by_period.parquet"
-
 
 def period_tpogs(path: Path, *, standard_errors: bool) -> tuple[PeriodTpog, ...]:
     """The TPOG of each period of ``tpog.parquet``; none where it has no periods."""
