@@ -1,0 +1,286 @@
+"""Is average precision KITTI's? Cases computed by hand, a literal twin of KITTI's procedure, and properties."""
+
+import math
+
+import numpy as np
+import pytest
+
+from pipeline.core.errors import InputError
+from pipeline.core.grid import Roi
+from pipeline.validation.frames import TrafficFrame
+from pipeline.validation.metrics.average_precision import evaluate
+from pipeline.validation.metrics.leave_out import Estimate, blocks_of
+from pipeline.validation.metrics.matching import Objects, Record, within
+from pipeline.validation.sweeps import Detections
+from tests.oracles import kitti
+
+CAR = (0.75, 4.0, 2.0, 1.5, 0.0)  # z, length, width, height, yaw
+
+
+def box(x, z=0.75, length=4.0):
+    return (x, 0.0, z, length, 2.0, 1.5, 0.0)
+
+
+def objects(boxes, cars=None, points=None):
+    n = len(boxes)
+    return Objects(
+        np.array(boxes, float).reshape(n, 7),
+        np.ones(n, bool) if cars is None else np.array(cars, bool),
+        np.full(n, 100) if points is None else np.array(points),
+    )
+
+
+def found(*scored):
+    return Detections(np.array([b for b, _ in scored], float).reshape(-1, 7), np.array([s for _, s in scored], float))
+
+
+def one_frame(truth, *scored):
+    """The measures of one frame, beside nine that are empty."""
+    empty = [(objects([]), Detections.none())] * 9
+    return evaluate(Record.of(*zip((truth, found(*scored)), *empty, strict=True)))
+
+
+def values(evaluation, view="bev", iou=70, end=""):
+    names = (f"ap_{view}_r11", f"ap_{view}_r40", f"recall_{view}")
+    return [evaluation.measures[f"{name}_iou{iou}{end}"].value for name in names]
+
+
+A, B, ASTRAY = box(0.0), box(10.0), box(50.0)
+
+
+# ---- by hand. An object alone counts 41 times, two count 21 times each: 42 objects. The score of row i of the 42 is
+# taken for step k where k / 40 <= (i + 1.5) / 42 (nearer than the next row): row k for k <= 30, row k + 1 from then on.
+# So of two objects the surer one gives the steps 0 to 20 and the other one the steps 21 to 40. R11 takes the steps 0, 4
+# .. 40: six of the former and five of the latter; R40 takes 20 of each.
+
+
+@pytest.mark.parametrize(
+    ("truth", "scored", "r11", "r40", "recall"),
+    [
+        pytest.param([A, B], [(A, 0.9), (B, 0.8)], 1, 1, 1, id="perfect"),
+        pytest.param([A, B], [], 0, 0, 0, id="no detections"),
+        pytest.param([A, B], [(ASTRAY, 0.9)], 0, 0, 0, id="none found"),
+        # Half is found: steps 0 to 20 have precision 1, the others are not reached.
+        pytest.param([A, B], [(A, 0.9)], 6 / 11, 1 / 2, 1 / 2, id="one of two"),
+        # All steps have the threshold .5, and there 1 of 2 is true.
+        pytest.param([A], [(A, 0.5), (ASTRAY, 0.9)], 1 / 2, 1 / 2, 1, id="reversed scores"),
+        # Below the lowest threshold nothing counts.
+        pytest.param([A], [(A, 0.5), (ASTRAY, 0.1)], 1, 1, 1, id="false one is unsure"),
+        # Equal scores enter together: 1 of 2.
+        pytest.param([A], [(A, 0.5), (ASTRAY, 0.5)], 1 / 2, 1 / 2, 1, id="tie"),
+        # The duplicate lies below the only threshold; with the same score it is a false positive: 1 of 2.
+        pytest.param([A], [(A, 0.9), (A, 0.8)], 1, 1, 1, id="duplicate"),
+        pytest.param([A], [(A, 0.9), (A, 0.9)], 1 / 2, 1 / 2, 1, id="duplicate of the same score"),
+        # With another object below, the duplicate counts from there on. Steps 0 to 20: 1 of 1; then 2 of 3.
+        # R11 (6 + 5 * 2/3) / 11 = 28/33; R40 (20 + 20 * 2/3) / 40 = 5/6.
+        pytest.param([A, B], [(A, 0.9), (A, 0.8), (B, 0.5)], 28 / 33, 5 / 6, 1, id="duplicate above another"),
+        pytest.param([A, B], [(A, 0.9), (ASTRAY, 0.7), (B, 0.5)], 28 / 33, 5 / 6, 1, id="false one between"),
+        # At .9 it is 1 of 2, at .5 2 of 3; the better of the right holds for all: 2/3.
+        pytest.param([A, B], [(ASTRAY, 0.95), (A, 0.9), (B, 0.5)], 2 / 3, 2 / 3, 1, id="monotone from the right"),
+        # Two objects .4 m apart, a box between: it overlaps each by 3.8 / 4.2 = .905, and one of them takes it.
+        pytest.param([box(0.0), box(0.4)], [(box(0.2), 0.9)], 6 / 11, 1 / 2, 1 / 2, id="two claimed by one box"),
+        # x = 0 overlaps by 1 and x = .4 by 3.6 / 4.4 = .818. First pass: the surer one (.9). Second pass at .9: that
+        # one, alone. The better one lies below every threshold.
+        pytest.param([A], [(box(0.4), 0.9), (A, 0.8)], 1, 1, 1, id="the surer one gives the threshold"),
+        # First pass: the object at 0 takes .9 (its only one: x = .8 overlaps it by 3.2 / 4.8); .8 is left, and overlaps
+        # the object at .4 by 3.6 / 4.4. So all are found, though the box at .4 fits the second object to the digit.
+        pytest.param([box(0), box(0.4)], [(box(0.4), 0.9), (box(0.8), 0.8)], 1, 1, 1, id="objects in turn"),
+    ],
+)
+def test_by_hand(truth, scored, r11, r40, recall):
+    evaluation = one_frame(objects(truth), *scored)
+    for view in ("bev", "3d"):
+        np.testing.assert_allclose(values(evaluation, view), [r11, r40, recall], atol=1e-12)
+    for kind, value in (("r11", r11), ("r40", r40)):
+        assert evaluation.measures[f"ap_combined_{kind}_iou70"].value == pytest.approx(2 * value)
+
+
+def test_no_objects_is_no_number_and_is_told():
+    evaluation = one_frame(objects([]), (A, 0.9))
+    assert all(math.isnan(its.value) and math.isnan(its.se) for its in evaluation.measures.values())
+    doubts = [str(doubt) for doubt in evaluation.doubts("site c03, cluster")]
+    assert doubts[0] == ("site c03, cluster: no vehicles in 10 frames: there is no average precision; more frames")
+    assert len(doubts) == 5  # of each subset
+    evaluation = one_frame(objects([A]), (A, 0.9))
+    assert "the only vehicles are in one of 10 blocks of frames" in str(evaluation.doubts("site c03")[0])
+    assert evaluation.measures["ap_bev_r40_iou70"].value == 1 and math.isnan(evaluation.measures["ap_bev_r40_iou70"].se)
+
+
+def test_an_overlap_must_exceed_the_bound():
+    """Half the length is an overlap of exactly .5; so is a shift d with (4 - d) / (4 + d) = .5, but for its digits."""
+    for other in (box(0.0, length=2.0), box(4 / 3), box(-4 / 3)):
+        assert values(one_frame(objects([A]), (other, 0.9)), iou=50) == [0, 0, 0]
+    assert values(one_frame(objects([A]), (box(1.33), 0.9)), iou=50) == [1, 1, 1]
+    assert values(one_frame(objects([A]), (box(1.33), 0.9)), iou=70) == [0, 0, 0]
+
+
+def test_height_counts_in_space_alone():
+    """Half its height up: an overlap of 1 from above, of .75 / 2.25 = 1/3 in space."""
+    evaluation = one_frame(objects([A]), (box(0.0, z=1.5), 0.9))
+    assert values(evaluation, "bev", 50) == [1, 1, 1] and values(evaluation, "3d", 50) == [0, 0, 0]
+    assert evaluation.measures["ap_combined_r40_iou50"].value == 1
+
+
+def test_what_does_not_count_takes_its_detection_out():
+    truth = objects([A, B], cars=[True, False], points=[4, 30])
+    evaluation = one_frame(truth, (A, 0.5), (B, 0.9))
+    assert {name: counts.sum() for name, counts in evaluation.objects.items()} == {
+        "": 2, "cars": 1, "points_1": 2, "points_5": 1, "points_20": 1,
+    }  # fmt: skip
+    assert values(evaluation, end="_cars") == [1, 1, 1]
+    assert values(evaluation, end="_points_20") == [1, 1, 1]
+    # A second box on the bus, and one that fits neither, are false positives for cars too: 1 of 3 at .5.
+    evaluation = one_frame(truth, (A, 0.5), (B, 0.9), (B, 0.8), (ASTRAY, 0.7))
+    np.testing.assert_allclose(values(evaluation, end="_cars"), [1 / 3, 1 / 3, 1])
+
+
+@pytest.mark.parametrize("cars", [[True, False], [False, True]])
+def test_a_box_that_fits_both_is_for_the_one_that_counts(cars):
+    evaluation = one_frame(objects([box(0.0), box(0.4)], cars=cars), (box(0.2), 0.9))
+    assert values(evaluation, end="_cars") == [1, 1, 1]
+
+
+def test_standard_error_by_hand():
+    """One object a frame, found in five of ten. Recall .5; without a found one 4/9, without a missed one 5/9. Pseudo-
+    values 10 * .5 - 9 * that: 1 and 0. se^2 = mean of (1/2)^2 / 9, so se = 1/6: that of a mean of five 1 and five 0."""
+    truth, hit = objects([A]), found((A, 0.9))
+    record = Record.of([truth] * 10, [hit] * 5 + [Detections.none()] * 5)
+    recall = evaluate(record).measures["recall_bev_iou70"]
+    np.testing.assert_allclose(recall.left_out, [4 / 9] * 5 + [5 / 9] * 5)
+    assert recall.value == 0.5 and recall.se == pytest.approx(1 / 6)
+
+
+def test_standard_error_of_unequal_blocks():
+    """A mean over frames: pseudo-values are the blocks' own means, whatever their lengths."""
+    frames, rng = np.bincount(blocks_of(47, 10)), np.random.default_rng(0)
+    sums = rng.normal(size=10) * frames
+    left_out = (sums.sum() - sums) / (frames.sum() - frames)
+    estimate = Estimate.of(np.concatenate([[sums.sum() / 47], left_out]), frames)
+    expected = ((sums / frames - sums.sum() / 47) ** 2 / (47 / frames - 1)).mean() ** 0.5
+    assert estimate.se == pytest.approx(expected)
+
+
+def test_blocks_are_neighbours_of_equal_length():
+    assert list(blocks_of(7, 3)) == [0, 0, 0, 1, 1, 2, 2]
+    with pytest.raises(InputError, match="--frames: 9; at least 10: standard errors come from 10 blocks"):
+        blocks_of(9)
+
+
+# ---- against the twin
+
+
+def random_scenes(seed, frames, objects_a_frame=5.0):
+    """Crowded and sloppy, with duplicates and coarse scores: every rule is at work."""
+    rng = np.random.default_rng(seed)
+    truth, detections = [], []
+    for _ in range(frames):
+        n = rng.poisson(objects_a_frame)
+        boxes = np.column_stack([
+            rng.uniform(0, 12, (n, 2)), np.full(n, 0.8), rng.uniform(3.5, 5, n), rng.uniform(1.6, 2.2, n),
+            rng.uniform(1.4, 1.8, n), rng.uniform(-3, 3, n),
+        ])  # fmt: skip
+        truth.append(Objects(boxes, rng.random(n) < 0.7, rng.integers(0, 30, n)))
+        seen = np.repeat(boxes, rng.integers(0, 3, n), axis=0)
+        seen = seen + rng.normal(0, [0.3, 0.1, 0.05, 0.2, 0.1, 0.1, 0.1], seen.shape)
+        false = boxes[rng.random(n) < 0.3] + [20, 0, 0, 0, 0, 0, 0]
+        both = np.concatenate([seen, false])
+        detections.append(Detections(both, rng.integers(1, 12, len(both)) / 8))
+    return truth, detections
+
+
+def twin(truth, detections, subset, view, iou):
+    scenes = []
+    for its, given in zip(truth, detections, strict=True):
+        counts = {"": its.points >= 0, "cars": its.is_car, "points_5": its.points >= 5, "points_20": its.points >= 20}
+        rows = sorted(range(len(its.boxes)), key=lambda i: (not counts[subset][i], tuple(its.boxes[i])))
+        columns = sorted(range(len(given.scores)), key=lambda j: (-given.scores[j], tuple(given.boxes[j])))
+        scenes.append(
+            kitti.Scene(
+                [(its.boxes[i], not counts[subset][i]) for i in rows],
+                [(given.boxes[j], given.scores[j]) for j in columns],
+            )
+        )
+    objects = sum(not ignored for scene in scenes for _, ignored in scene.objects)
+    return kitti.average_precision(scenes * -(-41 // objects), view, iou)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_it_is_the_twins(seed):
+    truth, detections = random_scenes(seed, 20)
+    evaluation = evaluate(Record.of(truth, detections))
+    for subset in ("", "cars", "points_20"):
+        for view, iou in (("bev", 0.7), ("3d", 0.5)):
+            end = f"_{subset}" if subset else ""
+            right = twin(truth, detections, subset, view, iou)
+            np.testing.assert_allclose(values(evaluation, view, round(100 * iou), end), right, rtol=0, atol=1e-12)
+            assert 0.05 < right[1] < 0.95  # a case that can tell
+
+
+def test_left_out_values_are_those_of_fewer_frames():
+    truth, detections = random_scenes(7, 20)
+    estimate = evaluate(Record.of(truth, detections), 5).measures
+    for block in (0, 3):
+        rest = [k for k in range(20) if k // 4 != block]
+        right = twin([truth[k] for k in rest], [detections[k] for k in rest], "cars", "3d", 0.5)
+        names = [f"{kind}_iou50_cars" for kind in ("ap_3d_r11", "ap_3d_r40", "recall_3d")]
+        np.testing.assert_allclose([estimate[name].left_out[block] for name in names], right, rtol=0, atol=1e-12)
+
+
+def test_few_objects_are_frames_counted_often():
+    truth, detections = random_scenes(3, 12, 1.0)
+    assert 5 < sum(len(its.boxes) for its in truth) < 30
+    got = values(evaluate(Record.of(truth, detections)), "bev", 50)
+    np.testing.assert_allclose(got, twin(truth, detections, "", "bev", 0.5), atol=1e-12)
+
+
+def test_the_order_in_which_things_are_given_has_no_say():
+    truth, detections = random_scenes(11, 40)
+    rng = np.random.default_rng(0)
+
+    def shuffled(its):
+        row = rng.permutation(len(its.boxes))
+        if isinstance(its, Objects):
+            return Objects(its.boxes[row], its.is_car[row], its.points[row])
+        return Detections(its.boxes[row], its.scores[row])
+
+    plain = evaluate(Record.of(truth, detections))
+    other = evaluate(Record.of([shuffled(its) for its in truth], [shuffled(its) for its in detections]))
+    for name, its in plain.measures.items():
+        assert (its.value, its.se) == (other.measures[name].value, other.measures[name].se), name
+
+
+def test_scores_matter_by_their_order_alone():
+    truth, detections = random_scenes(12, 30)
+    bent = [Detections(its.boxes, np.exp(7 * its.scores) - 100) for its in detections]
+    plain, other = (evaluate(Record.of(truth, its)).measures for its in (detections, bent))
+    assert all(plain[name].value == other[name].value for name in plain)
+
+
+# ---- what comes in
+
+
+def test_vehicles_of_a_frame():
+    boxes = np.array([box(1.0), box(2.0), box(3.0), box(30.0)])
+    frame = TrafficFrame(0, tuple("abcd"), ("taxi", "bus", "bicycle", "taxi"), boxes, np.zeros(4))
+    its = Objects.of(frame, np.array([7, 8, 9, 10]), Roi((0.0, -5.0, 0.0), (10.0, 10.0, 5.0)))
+    assert list(its.is_car) == [True, False] and list(its.points) == [7, 8] and list(its.boxes[:, 0]) == [1, 2]
+
+
+def test_detections_beyond_the_region_are_dropped():
+    roi = Roi((0.0, -5.0, 0.0), (10.0, 10.0, 5.0))
+    kept = within(found((box(0.0), 0.1), (box(10.0), 0.2), (box(5.0, z=99.0), 0.3)), roi)
+    assert list(kept.scores) == [0.1, 0.3]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "score", "message"),
+    [
+        (box(math.nan), 1.0, "detection 1 of frame 1: x_m is nan; a finite number"),
+        (box(0.0), math.inf, "detection 1 of frame 1: score is inf; a finite number"),
+        (box(0.0, length=-1.0), 1.0, "detection 1 of frame 1: length_m is -1; a length of at least 0"),
+    ],
+)
+def test_what_is_no_box_is_refused(wrong, score, message):
+    with pytest.raises(InputError) as caught:
+        Record.of([objects([])] * 2, [Detections.none(), found((A, 0.5), (wrong, score))])
+    assert str(caught.value) == message
