@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.cli import arguments, interrupts
+from pipeline.cli import arguments, interrupts, validation_verbs
 from pipeline.cli.arguments import Audit, Jobs, Out, ScenarioPath, Set, Top
 from pipeline.core.errors import EgvsError, InputError
 from pipeline.core.findings import FindingsError
@@ -319,6 +319,10 @@ def effects(
         with Screen() as screen:
             changes = ablations.ablation(resolved, folder, jobs=jobs, progress=screen.progress)
         tables.print_ablation(changes)
+
+
+for verb in validation_verbs.VERBS:  # does a score foretell detection?
+    app.command()(verb)
 
 
 # ---- catalogues, and scenarios to begin with

@@ -28,6 +28,10 @@ _RIGHT = {
         ("NAME", "SOURCE", "settings", "at"),
         "a class with NAME, SOURCE, settings and at, see pipeline.validation.detectors.base",
     ),
+    "egvs.scores": (
+        ("name", "formula", "source", "sign", "function"),
+        "a Score, see pipeline.validation.surrogates.base",
+    ),
     "egvs.point_clouds": (("read",), "a module or an object with a function read"),
 }
 """What an object of a group must have, and what would be right, in words."""

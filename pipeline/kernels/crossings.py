@@ -97,3 +97,24 @@ def add_falling(o, d, shape, voxel_m, rows, first, range_m, share, weights, unit
             amounts[k + 1] = np.int64(np.rint(weight * share[first[i] + k] * unit))
         t_falls[count] = np.inf
         _walk(o, d[beam], shape, voxel_m, hits, amounts[0], (t_falls, amounts), None, None, times)
+
+
+@_kernel
+def best_free(first, cells, log_free, best):  # type: ignore[no-untyped-def]
+    """Raise ``best`` to the chance that all voxels before a crossing are free, as if they were independent.
+
+    Parameters
+    ----------
+    first, cells
+        As :func:`crossings` fills them.
+    log_free
+        Logarithm of the chance that each voxel is free, flat, float64; may be minus infinity. Sums of logarithms stay
+        numbers where products of chances would vanish.
+    best
+        Of each voxel, flat, float64; raised, logarithms too.
+    """
+    for n in range(first.shape[0] - 1):
+        free = 0.0
+        for i in range(first[n], first[n + 1]):
+            best[cells[i]] = max(best[cells[i]], free)
+            free += log_free[cells[i]]
