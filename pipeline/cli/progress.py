@@ -64,7 +64,10 @@ class Screen:
         summary = {key: value for key, value in record.summary.items() if key not in ("flags", WARNINGS)}
         if counts := summary.pop("counts", None):
             summary["worst GEH of counts"] = max(count["geh"] for count in counts)
+        periods = summary.pop("periods", {}) if stage == "traffic" else {}
         self._print(f"{stage:<8} {took:>10}   {in_words(summary)}")
+        for period, its in periods.items():
+            self._print(f"{period:>19}   {in_words(its)}")
         for warning in warnings_of([record.summary]):
             self._print(f"warning: {warning}")
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pyarrow as pa
 
+from pipeline.artefacts import schemas
 from pipeline.artefacts.readers import SEPARABLE, read_scores
 from pipeline.core.errors import InputError
 from pipeline.report.drawing.map_frame import MapSite
@@ -39,12 +40,18 @@ class ScoredSite(MapSite):
     beats_next: float | None = None
     longitude_deg: float | None = None
     latitude_deg: float | None = None
+    own: tuple[tuple[str, str], ...] = ()
+    """The user's own columns of the sites file and what stands there, as texts."""
 
     @classmethod
     def all_of(cls, scores: pa.Table) -> tuple[ScoredSite, ...]:
         """The rows of ``scores.parquet``, in its order."""
         names = [column.name for column in fields(cls) if column.name in scores.column_names]
-        return tuple(cls(**row) for row in scores.select(names).to_pylist())
+        known = {*schemas.names("scores"), *names}
+        foreign = [name for name in scores.column_names if name not in known]
+        rows, own = scores.select(names).to_pylist(), scores.select(foreign).to_pylist()
+        texts = (tuple((name, _text(value)) for name, value in values.items()) for values in own)
+        return tuple(cls(**row, own=its) for row, its in zip(rows, texts, strict=True))
 
     @property
     def is_separable(self) -> bool:
@@ -55,6 +62,11 @@ class ScoredSite(MapSite):
     def relative_se(self) -> float | None:
         """The standard error as a share of the score; None where it is not known, or the score is 0."""
         return self.egvs_se / self.egvs if self.egvs_se is not None and self.egvs > 0 else None
+
+
+def _text(value: object) -> str:
+    """A value of a user's own column as text; empty where there is none."""
+    return "" if value is None else f"{value:.12g}" if isinstance(value, float) else str(value)
 
 
 @dataclass(frozen=True)
@@ -74,6 +86,12 @@ class Pole:
         """By how much its best candidate beats its worst, as a share of the worst; None for one, or from nothing."""
         worst = self.sites[-1].egvs
         return self.best.egvs / worst - 1 if len(self.sites) > 1 and worst > 0 else None
+
+    @property
+    def own(self) -> tuple[str, ...]:
+        """What the user's own columns say there; several texts of one column side by side."""
+        columns = zip(*(site.own for site in self.sites), strict=True)
+        return tuple(", ".join(filter(None, dict.fromkeys(text for _, text in column))) for column in columns)
 
 
 def poles_of(by_rank: Iterable[ScoredSite]) -> tuple[Pole, ...]:
@@ -115,6 +133,11 @@ class Ranking:
     def poles(self) -> tuple[Pole, ...]:
         """The poles, the one with the best candidate first."""
         return poles_of(self.sites)
+
+    @property
+    def own_names(self) -> tuple[str, ...]:
+        """The user's own columns of the sites file."""
+        return tuple(name for name, _ in self.sites[0].own)
 
     @property
     def is_tie(self) -> bool:

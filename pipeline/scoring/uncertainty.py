@@ -234,16 +234,20 @@ def beats_next(estimate: Estimate) -> NDArray[np.float64]:
     return chance
 
 
-def in_words(estimate: Estimate) -> dict[str, object]:
-    """For a stage's summary: how the errors came about."""
-    said: dict[str, object] = {"standard_errors_from": " and ".join(map(_groups_in_words, estimate.strata))}
-    joined = [f"autocorrelation {part.alike:.2f}" for part in estimate.strata if part.joined > 1]
-    return said | ({"neighbouring_groups_joined": " and ".join(joined)} if joined else {})
+def in_words(estimate: Estimate, names: Sequence[str] = ("",)) -> dict[str, object]:
+    """For a stage's summary: how the errors came about; ``names`` of the periods, one a record."""
+    each = [
+        f"{name}: {words}" if name else words
+        for name, words in zip(names, map(_groups_in_words, estimate.strata), strict=True)
+    ]
+    return {"standard_errors_from": "; ".join(each)}
 
 
 def _groups_in_words(part: Stratum) -> str:
     each = f"{len(part.pseudo)} groups of {part.groups.total // len(part.pseudo)} frames"
-    return f"{each}, widened by {part.widening - 1.0:.0%}" if part.widening >= 1.005 else each
+    joined = f", joined because neighbours were alike (autocorrelation {part.alike:.2f})" if part.joined > 1 else ""
+    widened = f", widened by {part.widening - 1.0:.0%}" if part.widening >= 1.005 else ""
+    return each + joined + widened
 
 
 def doubts(estimate: Estimate, place: str, frame_period_s: float, names: Sequence[str] = ("",)) -> list[Finding]:

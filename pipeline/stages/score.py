@@ -137,9 +137,10 @@ def run(
     if skipped := scene_of(work).skipped(NAME):
         summary["skipped"] = skipped
     if estimate is not None:
-        summary |= uncertainty.in_words(estimate)
+        records = [period.name for period in periods] or [""]
+        summary |= uncertainty.in_words(estimate, records)
         place, period_s = f"{FILE}: traffic.frames", work.scenario.traffic.frame_period_s
-        doubts = uncertainty.doubts(estimate, place, period_s, [period.name for period in periods] or [""])
+        doubts = uncertainty.doubts(estimate, place, period_s, records)
         doubts += period_scores.disagreements(names, worths, periods)
         if doubts:
             summary[WARNINGS] = [doubt.to_json() for doubt in doubts]

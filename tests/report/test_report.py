@@ -49,11 +49,11 @@ PLAIN = Backdrop((), Roads())
 VOID = {"meta", "br", "link", "img", "input", "hr"}
 
 
-def scenario(folder, sites, **keys):
+def scenario(folder, sites, columns=(), **keys):
     """A region of 12 m x 8 m x 2 m; ``keys`` are laid over the sections of the same name."""
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "sites.csv").open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows([("site", "x_m", "y_m", "z_m"), *sites])
+        csv.writer(file).writerows([("site", "x_m", "y_m", "z_m", *columns), *sites])
     (folder / "fcd.csv").write_text("")
     values = {
         "name": "trial",
@@ -360,6 +360,19 @@ def test_effects_are_named_and_no_longer_left_out(made):
 
 
 # ---- edges
+
+
+def test_own_columns_of_the_sites_file_are_shown_by_pole(tmp_path):
+    rows = [("a", 6, 9, 2, "City & Co", 7), ("b", 6, 9, 3, "City & Co", 8), ("c", 6, -1, 3, "", 9)]
+    table = page(*finished(tmp_path, rows, columns=("owner", "fid"))).split("What your file of sites says of them")[1].split("</table>")[0]
+    assert '>Pole</th><th scope="col">owner</th><th scope="col">fid</th>' in table
+    assert ">a</th><td>City &amp; Co</td><td>" in table
+    assert ">c</th><td>–</td><td>9</td>" in table
+    assert {"7, 8", "8, 7"} & {cell.split("<")[0] for cell in table.split("<td>")}
+
+
+def test_without_own_columns_there_is_no_table_of_them(made):
+    assert "What your file of sites says" not in made[2]
 
 
 def test_one_site(tmp_path):

@@ -105,14 +105,19 @@ def test_frames_stand_one_after_another_and_weights_need_no_new_traffic(split: P
 
 
 def test_a_run_with_periods_is_the_same_again_and_shows_them(split: Path, tmp_path: Path, egvs) -> None:  # type: ignore[no-untyped-def]
-    code, printed, _ = egvs("run", split, "--out", tmp_path / "out")
+    code, printed, told = egvs("run", split, "--out", tmp_path / "out")
     assert code == 0
+    (night,) = (line for line in told.splitlines() if line.split()[0] == "night")
+    assert night.split("   ")[-1].startswith("frames 16; vehicles 2 fewest, 2 most, 2 different; rows 32;")
+    assert "standard errors from day: 4 groups of 6 frames" in told
     assert "rank and share of the best in each period; in the mix: day 71.4%, night 28.6%" in printed
     assert "scores_by_period.parquet" in printed
     page = (tmp_path / "out" / "report.html").read_text()
     assert "By period" in page
     assert "night<br>(28.6%)" in page
-    assert ">40 frames" in page
+    assert ">40 frames<small>one each 0.5 s, 20 s in all, in 2 periods" in page
+    assert "<dt>day</dt><dd>24 frames; 2 to 2 vehicles at a time, 2 different;" in page
+    assert page.index("<h2>By period") < page.index("<h2>Where the sites stand")
     ranking = PeriodRanking.read(tmp_path / "out")
     assert ranking is not None
     assert (ranking.periods, ranking.frames) == (("day", "night"), 40)
@@ -166,7 +171,9 @@ def test_errors_of_a_mix_and_of_its_periods_are_told(split: Path, tmp_path: Path
     assert all(row["egvs_se"] > 0 for row in rows)  # type: ignore[operator]
     assert all(row["egvs_se"] > 0 for row in of(read_scores_by_period(tmp_path / "scores_by_period.parquet")))  # type: ignore[operator]
     summary = record.stages["score"].summary
-    assert " and " in summary["standard_errors_from"]
+    day, night = summary["standard_errors_from"].split("; ")
+    assert day.startswith("day: 4 groups of 6 frames")
+    assert night.startswith("night: 4 groups of 4 frames")
     places = [finding.place for finding in warnings_of([summary]) if finding.rule == "traffic's memory"]
     assert places
     assert set(places) <= {"scenario.toml: traffic.frames (day)", "scenario.toml: traffic.frames (night)"}
