@@ -364,10 +364,14 @@ def test_effects_are_named_and_no_longer_left_out(made):
 
 def test_own_columns_of_the_sites_file_are_shown_by_pole(tmp_path):
     rows = [("a", 6, 9, 2, "City & Co", 7), ("b", 6, 9, 3, "City & Co", 8), ("c", 6, -1, 3, "", 9)]
-    table = page(*finished(tmp_path, rows, columns=("owner", "fid"))).split("What your file of sites says of them")[1].split("</table>")[0]
+    table = (
+        page(*finished(tmp_path, rows, columns=("owner", "fid")))
+        .split("What your file of sites says of them")[1]
+        .split("</table>")[0]
+    )
     assert '>Pole</th><th scope="col">owner</th><th scope="col">fid</th>' in table
     assert ">a</th><td>City &amp; Co</td><td>" in table
-    assert ">c</th><td>–</td><td>9</td>" in table
+    assert ">c</th><td>\u2013</td><td>9</td>" in table
     assert {"7, 8", "8, 7"} & {cell.split("<")[0] for cell in table.split("<td>")}
 
 
