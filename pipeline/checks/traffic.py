@@ -9,6 +9,7 @@ from functools import partial, wraps
 from pipeline.checks.subject import Refusals, Subject
 from pipeline.core.errors import InputError
 from pipeline.core.findings import Finding
+from pipeline.scenario.models import Scenario
 from pipeline.traffic import fcd, sumo, sumo_folder
 from pipeline.traffic.demand import counts as demand
 from pipeline.traffic.demand import trips
@@ -41,15 +42,17 @@ def times(subject: Subject) -> Iterator[Finding]:
     yield from refusals.found
 
 
-@_of_each_period
 def recorded_places(subject: Subject) -> Iterator[Finding]:
     """An error where a finished file is in other coordinates than the scenario, or cannot be read from its start."""
-    scenario, refusals = subject.scenario, Refusals()
-    if (name := scenario.traffic.fcd) is not None:
-        refusals.unless_refused(
-            "traffic", lambda: fcd.check_place(scenario.find(name, "traffic.fcd"), world_frame.of(scenario))
-        )
+    whole, refusals = subject.scenario, Refusals()
+    for name in dict.fromkeys(alone.traffic.fcd for alone in whole.by_period().values()):
+        if name is not None:
+            refusals.unless_refused("traffic", partial(_check_place, whole, name))
     yield from refusals.found
+
+
+def _check_place(scenario: Scenario, name: str) -> None:
+    fcd.check_place(scenario.find(name, "traffic.fcd"), world_frame.of(scenario))
 
 
 @_of_each_period

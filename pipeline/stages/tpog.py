@@ -64,8 +64,9 @@ def run(work: Workspace, inputs: StageInputs) -> Summary:
     counting = _Counting(np.flatnonzero(filled))
     with tables.writer(work.path(ARTEFACTS[0]), "tpog") as file:
         periods, in_roi, first_block, left_over = [], list[float](), 0, 0
+        by_period = scenario.by_period()
         for name, frames, boxes in _recorded(source, grid):
-            over = _left_over(scenario, frames)
+            over = _left_over(by_period.get(name, scenario), frames)
             block_frames = (frames - over) // scenario.tpog.blocks
             blocks = count_blocks(boxes, grid, block_frames, scenario.tpog.blocks)
             boxes_near = counting.write(file, blocks, first_block, work.progress)

@@ -45,13 +45,15 @@ def inputs(work: Workspace) -> StageInputs:
     for period in shown["periods"]:
         del period["weight"]
     settings = {"seed": scenario.seed, "name": scenario.name, "traffic": shown}
-    if traffic.fcd is not None:
+    periods = [alone.traffic for alone in scenario.by_period().values()]
+    if any(period.fcd is not None for period in periods):
         settings |= world_frame.key(scenario)
     # one that acts by itself depends on the network alone
     if named := registry.settings(effect for effect in effects if not effect.SELF_ACTING):
         settings["effects"] = named
     hashes = {_label(path, scenario): files.sha256_of(path) for path in sources}
-    version = None if traffic.fcd is not None and not traffic.vtypes else sumo.version()
+    asks_sumo = any(period.fcd is None or period.vtypes for period in periods)
+    version = sumo.version() if asks_sumo else None
     return StageInputs(settings, hashes, {"sumo": version}, registry.modules(effects))
 
 
@@ -118,7 +120,7 @@ def _record(
     """Write the frames of one period."""
     effects, notes = on_traffic.live(scenario)
     folder = work.path(COMPANIONS[0]) / period
-    with recording.record(scenario, folder, effects, work.progress, traci, world_frame.of(scenario)) as recorded:
+    with recording.record(scenario, folder, effects, work.progress, traci, world_frame.of(work.scenario)) as recorded:
         tally, reports = trajectories.write(scenario, recorded, effects, file, work.progress, first_frame)
         summary = recorded.summary()
         doubts = trajectories.doubts(tally, recorded, scenario.roi.box)

@@ -16,7 +16,10 @@ import pipeline
 from pipeline.core.errors import InputError
 from pipeline.formats.crs import WorldFrame
 from pipeline.report.ranking import Ranking
+from pipeline.stages import traffic
+from tests.checks.conftest import net_xml
 from tests.conftest import write_mini
+from tests.stages import inputs_of
 
 CRS = "\n[crs]\nepsg = 32632\noffset_m = [-550700, -5635200]\n"
 FRAME = WorldFrame("EPSG:32632", (-550_700.0, -5_635_200.0))
@@ -124,9 +127,7 @@ def test_a_csv_may_have_longitude_and_latitude(tmp_path: Path, in_metres: pa.Tab
     assert scores(folder, tmp_path / "run").equals(in_metres)
 
 
-def test_fcd_in_degrees_ends_in_the_scores_of_metres(tmp_path: Path, in_metres: pa.Table) -> None:
-    """As ``--fcd-output.geo`` writes it; a scene whose frame is unknown refuses it."""
-    folder = write_mini(tmp_path / "mini")
+def fcd_in_degrees(folder: Path) -> None:
     head, *rows = (folder / "fcd.csv").read_text().splitlines()
     moved = []
     for row in rows:
@@ -134,6 +135,31 @@ def test_fcd_in_degrees_ends_in_the_scores_of_metres(tmp_path: Path, in_metres: 
         lon, lat = to_degrees(float(x), float(y))
         moved.append(";".join([time, name, f"{lon:.13f}", f"{lat:.13f}", *rest]))
     (folder / "fcd.csv").write_text("\n".join([head, *moved]) + "\n")
+
+
+def test_a_periods_fcd_lies_where_the_scenarios_network_says(tmp_path: Path, in_metres: pa.Table) -> None:
+    """Another place for the world is other traffic: the stage runs again."""
+    folder = write_mini(tmp_path / "mini")
+    fcd_in_degrees(folder)
+    location = 'netOffset="-550700,-5635200" projParameter="+proj=utm +zone=32 +datum=WGS84 +units=m +no_defs"'
+    lanes = net_xml().replace('netOffset="0.00,0.00" projParameter="!"', location)
+    (folder / "net.net.xml").write_text(lanes)
+    scenario = folder / "scenario.toml"
+    period = '[[traffic.periods]]\nname = "day"\nfcd = "fcd.csv"\n\n[[traffic.kinds]]'
+    text = (
+        scenario.read_text().replace('fcd = "fcd.csv"', 'network = "net.net.xml"').replace("[[traffic.kinds]]", period)
+    )
+    scenario.write_text(text)
+    assert scores(folder, tmp_path / "run")["egvs"].to_pylist() == in_metres["egvs"].to_pylist()
+    before = inputs_of(traffic, pipeline.load(folder), tmp_path / "run").to_json()
+    (folder / "net.net.xml").write_text(lanes.replace("-550700", "-550701"))
+    assert inputs_of(traffic, pipeline.load(folder), tmp_path / "run").to_json() != before
+
+
+def test_fcd_in_degrees_ends_in_the_scores_of_metres(tmp_path: Path, in_metres: pa.Table) -> None:
+    """As ``--fcd-output.geo`` writes it; a scene whose frame is unknown refuses it."""
+    folder = write_mini(tmp_path / "mini")
+    fcd_in_degrees(folder)
     with pytest.raises(
         InputError, match=r"fcd.csv: its coordinates \(9.72.* look like longitude and latitude, and nothing"
     ):

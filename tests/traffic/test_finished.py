@@ -11,8 +11,11 @@ import pipeline
 from pipeline.artefacts import tables
 from pipeline.core.errors import InputError
 from pipeline.scenario.traffic import TrafficModel
+from pipeline.stages import traffic
 from pipeline.studies.variants import counted_frames
+from tests.checks.conftest import net_xml
 from tests.conftest import fcd
+from tests.stages import inputs_of
 
 LORRY = '<vType id="lorry" vClass="truck"/>'
 CAR = '<vType id="car" length="4" width="1.7" height="1.4"/>'
@@ -65,6 +68,32 @@ def test_what_fills_no_block_is_left_over_and_told(mini: Path, tmp_path: Path, e
     assert egvs("run", mini, "--set", "traffic.frames=39", "--out", tmp_path / "given")[0] == 0
     ours, its = (pipeline.read_tpog(tmp_path / way / "tpog.parquet") for way in ("three", "given"))
     assert (ours.counts == its.counts).all()
+
+
+def test_what_fills_no_block_of_a_periods_file_is_left_over(mini: Path, tmp_path: Path) -> None:
+    """``[traffic]`` simulates, and one of its periods is a finished file."""
+    (mini / "net.net.xml").write_text(net_xml())
+    period = '[[traffic.periods]]\nname = "day"\nfcd = "fcd.csv"\n\n[[traffic.kinds]]'
+    network = ('fcd = "fcd.csv"', 'network = "net.net.xml"')
+    unsaid(mini, network, ("[[traffic.kinds]]", period), ("blocks = 4", "blocks = 3"))
+    record = pipeline.run(pipeline.load(mini), tmp_path)
+    assert record.stages["tpog"].summary["left_over"] == "the last 1 of 40 frames, so that 3 blocks are alike"
+
+
+def test_sumo_counts_where_any_period_is_simulated(mini: Path, tmp_path: Path) -> None:
+    """Another SUMO is other traffic, whatever the first period comes from."""
+    (mini / "net.net.xml").write_text(net_xml())
+    (mini / "c.sumocfg").write_text('<configuration><net-file value="net.net.xml"/></configuration>')
+    day, night = 'name = "day"\nfcd = "fcd.csv"\n', 'name = "night"\nsumocfg = "c.sumocfg"\nlength_s = 20\n'
+    periods = f"[[traffic.periods]]\n{day}\n[[traffic.periods]]\n{night}\n"
+
+    def version(text: str) -> object:
+        (mini / "scenario.toml").write_text(text)
+        return inputs_of(traffic, pipeline.load(mini), tmp_path).to_json()["sumo"]
+
+    text = (mini / "scenario.toml").read_text()
+    assert version(text) is None
+    assert version(text.replace('fcd = "fcd.csv"\n', "").replace("[[traffic.kinds]]", f"{periods}[[traffic.kinds]]"))
 
 
 def test_warm_up_and_period_still_act(mini: Path, tmp_path: Path) -> None:
