@@ -1,7 +1,8 @@
 """All solid things of an OpenStreetMap extract are collected here, clear of the carriageway.
 
 Steps of :func:`collect`: buildings (ways, multipolygons, parts), barriers, poles, trees and rows of trees -> solids;
-what stands on the carriageway is cut off or dropped, because vehicles drive there; crowns that hang over it are lifted.
+what stands on the carriageway lower than :data:`pipeline.world.limits.CLEARANCE_M` is cut off or dropped, because
+vehicles drive there; crowns that hang over it are lifted, as streets are trimmed.
 Nothing is left out without being counted. Frame: the network's x, y in metres.
 
 All default sizes are round figures for towns of no special kind, not measurements; the counts say how often each was
@@ -23,9 +24,7 @@ from pipeline.importers.mapped_solids import ImportCounts, MappedSolid
 from pipeline.importers.shapes import large_pieces_of, pieces_of
 from pipeline.importers.street_furniture import barriers, poles
 from pipeline.importers.vegetation import trees
-
-HEADROOM_M = 4.5
-"""Crowns are kept clear of the carriageway up to here, as streets are trimmed; what starts above may span it."""
+from pipeline.world.limits import CLEARANCE_M
 
 _MARGIN_M = 0.01
 
@@ -57,7 +56,7 @@ def _lanes_under(solid: MappedSolid, lanes: shapely.STRtree) -> list[BaseGeometr
 def _beside_carriageway(solid: MappedSolid, lanes: shapely.STRtree, counts: ImportCounts) -> list[MappedSolid]:
     """The parts of an object that stand beside the carriageway, each as a solid of its own."""
     under = _lanes_under(solid, lanes)
-    if solid.base_m >= HEADROOM_M or not under:
+    if solid.base_m >= CLEARANCE_M or not under:
         pieces = pieces_of(solid.geometry)
     else:
         # A line's own width must stay clear too.
@@ -76,7 +75,7 @@ def _beside_carriageway(solid: MappedSolid, lanes: shapely.STRtree, counts: Impo
 
 def _above_traffic(crown: MappedSolid, lanes: shapely.STRtree, counts: ImportCounts) -> MappedSolid:
     """Lift the underside of a crown that hangs over the carriageway, as far as the tree is high enough."""
-    lifted_m = min(HEADROOM_M, 0.8 * crown.height_m)
+    lifted_m = min(CLEARANCE_M, 0.8 * crown.height_m)
     if lifted_m <= crown.base_m or not _lanes_under(crown, lanes):
         return crown
     counts.raised_crowns += 1

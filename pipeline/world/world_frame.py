@@ -32,10 +32,12 @@ def of(scenario: Scenario) -> Georeference:
     """Where the world frame lies, if the scenario or its network says it; a network of OpenStreetMap is converted.
 
     InputError where ``[crs]`` names nothing that fits: no projection in metres, one that stretches lengths, or another
-    place than the network says.
+    place than the network says; or where the network's own projection stretches lengths.
     """
     stated, own = _stated(scenario), _of_network(scenario)
     box, place = scenario.roi.box, str(scenario.file)
+    if own is not None:
+        _check_network(own, scenario)
     if stated is not None:
         _check_stretch(stated, scenario)
         if own is not None:
@@ -120,6 +122,14 @@ def _check_stretch(frame: WorldFrame, scenario: Scenario) -> None:
     )
     right = f"a system that keeps lengths there, for example epsg = {utm_epsg(lon_deg, lat_deg)}, with its offset_m"
     raise InputError(place, found, right)
+
+
+def _check_network(own: WorldFrame, scenario: Scenario) -> None:
+    x, y, _ = scenario.roi.center_m
+    if abs((stretch := own.stretch((x, y))) - 1.0) > STRETCH_MOST:
+        found = f"its <location> ({own.projection}) draws lengths {stretch:.3g} times as long at the region of interest"
+        right = "a projection that keeps lengths there: netconvert takes UTM for a map (--proj.utm)"
+        raise InputError(f"{scenario.file}: the network", found, right)
 
 
 def _check_agreement(stated: WorldFrame, own: WorldFrame, scenario: Scenario) -> None:

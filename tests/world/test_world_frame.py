@@ -131,6 +131,14 @@ def test_what_contradicts_itself_is_refused(tmp_path: Path, crs: dict[str, Any],
         world_frame.of(load(tmp_path, with_location(tmp_path, UTM), (700, 1200), crs=crs))
 
 
+def test_a_network_that_draws_lengths_too_long_is_refused(tmp_path: Path) -> None:
+    """Vehicles keep their size, streets do not: at 51 degrees Web Mercator draws them 1.6 times as long."""
+    scene = load(tmp_path, with_location(tmp_path, "EPSG:3857", "-1081000,-6594000"), (700, 1200))
+    with pytest.raises(InputError, match=r"the network: its <location> \(EPSG:3857\) draws lengths 1.58 times as long"):
+        world_frame.of(scene)
+    world_frame.of(load(tmp_path, with_location(tmp_path, UTM, "0,0"), (700, 1200)))  # a forgotten offset is none
+
+
 def test_an_offset_needs_its_projection(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="crs: offset_m without epsg"):
         load(tmp_path, {"fcd": "f.csv"}, crs={"offset_m": [1, 2]})
