@@ -122,7 +122,8 @@ def check(o, d, shape, voxel_m):
     """(excluded, mismatches, asked): segments with a chord within 1e-8 m of the bound; wrong ones; settled by
     rationals."""
     verdict = np.empty(len(o), np.int64)
-    compare(o, d, np.asarray(shape, np.int64), voxel_m, verdict)
+    # Contiguous, so that one kernel is compiled for all callers.
+    compare(np.ascontiguousarray(o), np.ascontiguousarray(d), np.asarray(shape, np.int64), voxel_m, verdict)
     excluded = mismatches = 0
     for i in np.flatnonzero(verdict):
         wrong = walk(o[i], d[i], shape, voxel_m) ^ oracle.crossed(o[i], d[i], shape, voxel_m)
@@ -193,7 +194,7 @@ def hunt(case, make, seed, n, shape, voxel_m, built=False):
     while done < n:
         size = min(n - done, 50_000)
         o, d = make(rng, size, shape, voxel_m)
-        found = check(np.ascontiguousarray(o), np.ascontiguousarray(d), shape, voxel_m)
+        found = check(o, d, shape, voxel_m)
         excluded, mismatches, asked, done = excluded + found[0], mismatches + found[1], asked + found[2], done + size
     told = f"sorted cuts with a margin; {asked} by fractions"
     return Row(case, RULE, told, done, excluded, mismatches, "-" if built else f"{excluded} within 1e-8 m of the bound")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from benchmarks import casting, others, savings, scaling, stability, steps
+from benchmarks import casting, others, savings, scaling, steps
 from pipeline.artefacts.recorded_boxes import FrameBoxes
 from pipeline.core.grid import Grid
 
@@ -114,11 +114,10 @@ def test_a_bias_is_told_from_scatter() -> None:
 @pytest.mark.slow
 @pytest.mark.system
 def test_tables_of_one_round_are_filled(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What they measure is another matter; the type checker reads the dearer tables."""
+    """What they measure is another matter; the type checker reads the dearer tables, such as those of kernels that are
+    compiled anew without what they are compared for."""
     monkeypatch.setattr(casting, "_ROUNDS", 1)
-    monkeypatch.setattr(stability, "REPEATS", 1)
     monkeypatch.setattr(savings, "REPEATS", 1)
     shares = [row[1] for row in casting.rows() if row[0].endswith("Embree alone")]
     assert shares == ["1.00 x Embree alone"] * 2
-    assert [row[3] > 0 for row in stability.box_rows()] == [True, False]
     assert savings._beams()[0][3]

@@ -3,16 +3,14 @@ else's would be, and used by name."""
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
-import sys
 import tomllib
 from pathlib import Path
 
 import pytest
 
 import pipeline
+from tests import processes
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "extending.md"
 _BLOCK = re.compile(r'^```\w+ title="([^"]+)"\n(.*?)^```$', re.DOTALL | re.MULTILINE)
@@ -43,14 +41,15 @@ def install(files: dict[str, str], folder: Path) -> Path:
     return folder
 
 
+@pytest.fixture(autouse=True)
+def wide(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A terminal that breaks no line."""
+    monkeypatch.setenv("COLUMNS", "200")
+
+
 def egvs(*arguments: object, beside: Path) -> tuple[int, str]:
     """The command line in a process of its own that sees the folder ``beside``: exit code, and all that it prints."""
-    done = subprocess.run(
-        [sys.executable, "-c", "from pipeline.cli.app import main; main()", *map(str, arguments)],
-        env=os.environ | {"PYTHONPATH": str(beside), "COLUMNS": "200"},
-        capture_output=True,
-        text=True,
-    )
+    done = processes.egvs(*arguments, beside=beside)
     return done.returncode, done.stdout + done.stderr
 
 
@@ -125,10 +124,5 @@ write_points(path, points)
 read, dropped = read_points(path, "here")
 assert dropped == 0 and read.tobytes() == points.tobytes()
 """
-    done = subprocess.run(
-        [sys.executable, "-c", code, tmp_path / "scan.xyz"],
-        env=os.environ | {"PYTHONPATH": str(beside)},
-        capture_output=True,
-        text=True,
-    )
+    done = processes.python(code, tmp_path / "scan.xyz", beside=beside)
     assert done.returncode == 0, done.stderr

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
+from subprocess import CompletedProcess
 
 import numpy as np
 import pytest
@@ -17,6 +15,7 @@ from pipeline.effects import registry
 from pipeline.effects.base import Detect
 from pipeline.scenario.effects import EffectParameters
 from pipeline.scoring import visibility
+from tests import processes
 from tests.core.test_plugins import install, site  # noqa: F401  the fixture
 
 EFFECT = '''
@@ -54,11 +53,8 @@ def package(tmp_path: Path) -> Path:
     return folder
 
 
-def egvs(package: Path | None, *arguments: object) -> subprocess.CompletedProcess[str]:
-    path = {} if package is None else {"PYTHONPATH": str(package)}
-    code = "from pipeline.cli.app import main; main()"
-    words = [sys.executable, "-c", code, *(str(a) for a in arguments)]
-    return subprocess.run(words, capture_output=True, text=True, env=os.environ | path)
+def egvs(package: Path | None, *arguments: object) -> CompletedProcess[str]:
+    return processes.egvs(*arguments, beside=package)
 
 
 @pytest.mark.system

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import math
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +31,7 @@ from pipeline.stages import scan, score, statics, tpog, traffic
 from pipeline.stages.base import Workspace
 from pipeline.stages.shared.scans import scans
 from pipeline.stages.shared.scene import scene_of
+from tests import processes
 from tests.conftest import BUILDING, SCENARIO, SITES, collection, fcd, feature
 from tests.stages import run_stage
 
@@ -550,6 +549,8 @@ def test_bytes_do_not_depend_on_threads(done: tuple[Path, Path], settings: list[
 MODULES = ("pipeline.effects.scan", "pipeline.effects.score", "pipeline.effects.traffic")
 IMPORTED = """
 import sys
+import warnings
+warnings.simplefilter("error")
 import pipeline
 from pipeline.stages import score
 from tests.stages import run_stage
@@ -570,7 +571,7 @@ def test_what_is_not_named_is_not_imported(
 ) -> None:
     out = shutil.copytree(done[1], tmp_path / "out")
     program = IMPORTED.format(MODULES=MODULES, folder=str(done[0]), settings=settings, out=str(out))
-    run = subprocess.run([sys.executable, "-W", "error", "-c", program], capture_output=True, text=True, check=False)
+    run = processes.python(program)
     assert (run.returncode, run.stderr) == (0, "")
     assert run.stdout.strip() == repr(expected)
 
@@ -583,8 +584,8 @@ import pipeline
 pipeline.run(pipeline.load({str(mini)!r}), {str(tmp_path / "out")!r}, jobs=1)
 print([name for name in sys.modules if name.startswith({MODULES})])
 """
-    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert run.stdout.strip() == "[]"
+    run = processes.python(program)
+    assert (run.returncode, run.stdout.strip()) == (0, "[]"), run.stderr
 
 
 def test_more_beams_than_whole_numbers_hold_are_refused(

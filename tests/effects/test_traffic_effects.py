@@ -9,7 +9,6 @@ import math
 import re
 import shutil
 import subprocess
-import sys
 from collections import Counter
 from pathlib import Path
 
@@ -39,6 +38,7 @@ from pipeline.traffic.boxes import Size
 from pipeline.traffic.frames import FrameGroup
 from pipeline.world import terrain
 from pipeline.world.mesh import read_ply
+from tests import processes
 from tests.stages import inputs_of, run_stage
 
 HILL = Path(__file__).resolve().parents[2] / "scenarios" / "hill"
@@ -150,9 +150,8 @@ from pipeline.scenario.loading import from_values
 scene = from_values({scenario(flat, **(SMALL | {"frames": 8})).model_dump(mode="json")!r}, Path({str(flat)!r}), "place")
 run_stage(traffic, scene, Path({str(tmp_path)!r})); run_stage(statics, scene, Path({str(tmp_path)!r}))
 print([m for m in sys.modules if m.startswith("pipeline.effects.traffic")])"""
-    root = HILL.parent.parent
-    done = subprocess.run([sys.executable, "-c", code], cwd=root, check=True, capture_output=True, text=True)
-    assert done.stdout.strip() == "[]"
+    done = processes.python(code)
+    assert (done.returncode, done.stdout.strip()) == (0, "[]"), done.stderr
 
 
 def test_a_flat_network_keeps_its_flat_ground(flat, tmp_path):

@@ -12,6 +12,7 @@ import pytest
 from pipeline.core import plugins
 from pipeline.core.errors import InputError, MissingBackendError
 from pipeline.formats.point_clouds import GROUP, read_points, write_points
+from tests import processes
 from tests.core.test_plugins import install, site  # noqa: F401  the fixture
 
 pytestmark = pytest.mark.system
@@ -54,10 +55,7 @@ except InputError as error:
 
 def test_a_package_adds_a_format(tmp_path: Path) -> None:
     install(tmp_path / "site", "foo", "foo = foo_points:FOO\nbar = foo_points:BAR", {"foo_points": FOO}, GROUP)
-    code = f"import sys; sys.path.insert(0, {str(tmp_path / 'site')!r})\n{USER}"
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(tmp_path / "a.FOO")], capture_output=True, text=True, check=False
-    )
+    done = processes.python(USER, tmp_path / "a.FOO", beside=tmp_path / "site")
     assert done.returncode == 0, done.stderr
     assert "a.bar: is of the unknown kind '.bar'; one of .foo, .pcd, .ply" in done.stdout
 

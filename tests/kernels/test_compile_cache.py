@@ -60,10 +60,13 @@ def test_a_called_kernel_that_changed_is_noticed(package: Path) -> None:
     assert call(package) == "3 kept"
     folder = package / "pipeline" / "kernels" / "__pycache__"
     assert kept(folder) == 2
-    for added in (3, 4, 5):
-        (package / "pipeline" / "kernels" / "inner.py").write_text(INNER.format(added))
-        assert call(package) == f"{1 + added} compiled"
+    for number in range(3):
+        (folder / f"numba-{number:012}").mkdir()
+        os.utime(folder / f"numba-{number:012}", (number, number))
+    (package / "pipeline" / "kernels" / "inner.py").write_text(INNER.format(3))
+    assert call(package) == "4 compiled"
     assert kept(folder) == 3  # the present one, and two that a program may still use
+    assert not list(folder.glob("numba-000*")), "those that were used longest ago went"
 
 
 def test_a_folder_of_the_users_is_used(package: Path, tmp_path: Path) -> None:

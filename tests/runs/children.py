@@ -6,7 +6,6 @@ copies, removes or makes one. So a kill falls on a moment of the work, whatever 
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import signal
 import sys
@@ -16,10 +15,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-_CONTEXT = multiprocessing.get_context("forkserver")
-_CONTEXT.set_forkserver_preload(
-    ["pipeline.runs.workflow", "pipeline.report.page", *(f"pipeline.stages.{s}" for s in ("statics", "scan", "score"))]
-)
+from tests.processes import CONTEXT
+
 _STEPS = ("open", "os.rename", "os.link", "os.remove", "os.mkdir", "os.rmdir", "shutil.copyfile")
 
 
@@ -41,9 +38,9 @@ class Child:
     """A running :class:`Job`; ``waits`` is set when it has to wait for another run."""
 
     def __init__(self, job: Job) -> None:
-        self.job, self.waits = job, _CONTEXT.Event()
-        self._answer, sender = _CONTEXT.Pipe(duplex=False)
-        self.process = _CONTEXT.Process(target=_work, args=(job, sender, self.waits))
+        self.job, self.waits = job, CONTEXT.Event()
+        self._answer, sender = CONTEXT.Pipe(duplex=False)
+        self.process = CONTEXT.Process(target=_work, args=(job, sender, self.waits))
         self.process.start()
         sender.close()
 

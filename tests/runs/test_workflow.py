@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import re
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -23,6 +22,7 @@ from pipeline.runs import workflow
 from pipeline.runs.locking import alone
 from pipeline.runs.stages import STAGES
 from pipeline.world import casting
+from tests import processes
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ("statics.ply", "scans.parquet", "trajectories.parquet", "tpog.parquet", "scores.parquet")
@@ -260,17 +260,16 @@ def test_a_ranking_fits_the_terminal(mini: Path, tmp_path: Path, width: int) -> 
 @pytest.mark.parametrize("words", [("run",), ("accuracy", "--budget", "20s")])
 def test_an_interrupt_is_answered_in_words(tmp_path: Path, words: tuple[str, ...]) -> None:
     """It comes while SUMO is at work, which is seen by what SUMO writes."""
-    out, code = tmp_path / "out", "from pipeline.cli.app import main; main()"
+    out = tmp_path / "out"
     scenario = ROOT / "scenarios" / "nishishinjuku"
-    command = [sys.executable, "-c", code, words[0], str(scenario), "--out", str(out), *words[1:]]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
-        while not list(out.rglob("fcd.csv")) and process.poll() is None:
-            time.sleep(0.01)  # decides nothing: SUMO simulates for longer than a look takes
-        process.send_signal(signal.SIGINT)
-        _, said = process.communicate()
-    assert process.returncode == 130, said
-    assert "egvs: interrupted; run the same command again" in said
-    assert "Traceback" not in said
+    started = processes.Started(processes.EGVS, words[0], scenario, "--out", out, *words[1:])
+    while not list(out.rglob("fcd.csv")) and started.process.is_alive():
+        time.sleep(0.01)  # decides nothing: SUMO simulates for longer than a look takes
+    os.kill(started.process.pid, signal.SIGINT)
+    done = started.ended()
+    assert done.returncode == 130, done.stderr
+    assert "egvs: interrupted; run the same command again" in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 def test_a_record_of_an_earlier_version_is_one_of_nothing(done: tuple[Path, Path]) -> None:
