@@ -204,6 +204,7 @@ def twin(truth, detections, subset, view, iou):
     return kitti.average_precision(scenes * -(-41 // objects), view, iou)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_it_is_the_twins(seed):
     truth, detections = random_scenes(seed, 20)

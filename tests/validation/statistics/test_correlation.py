@@ -1,0 +1,248 @@
+"""Correlations over sites: intervals that hold, what cannot be told, several junctions, two scores."""
+
+import math
+
+import numpy as np
+import pytest
+import scipy.stats
+from scipy.special import ndtr, ndtri
+
+from pipeline.validation.metrics.average_precision import evaluate
+from pipeline.validation.metrics.leave_out import blocks_of
+from pipeline.validation.metrics.matching import Record
+from pipeline.validation.statistics.coefficients import KINDS
+from pipeline.validation.statistics.correlation import Study
+from pipeline.validation.statistics.intervals import Interval, share_above
+from pipeline.validation.statistics.junctions import Draws, Junction, Measured
+from tests.validation.metrics.test_average_precision import random_scenes
+from tests.validation.statistics import made_up
+
+
+def study(junctions, resamples=300, seed=1):
+    return Study([junctions] if isinstance(junctions, Junction) else junctions, seed, resamples)
+
+
+def with_scores(junction, **scores):
+    scores = {name: np.asarray(values, float) for name, values in scores.items()}
+    return Junction(junction.name, junction.sites, {**junction.scores, **scores}, junction.measures)
+
+
+@pytest.fixture
+def thirteen():
+    return made_up.junction(np.random.default_rng(0), 13, (0.8, 0.3))
+
+
+# ---- intervals
+
+
+def test_an_interval_without_bias_is_that_of_the_quantiles():
+    draws = np.linspace(-1, 1, 2001)
+    interval = Interval.of(0.0, draws)
+    np.testing.assert_allclose([interval.low, interval.high], [-0.95, 0.95], atol=1e-9)
+
+
+def test_bias_is_corrected_by_the_normal_scale():
+    """A tenth of the resamples lie below the value: z0 = -1.2816, so the ends are at Phi(2 z0 -+ 1.96)."""
+    draws = np.linspace(0, 1, 10_001)
+    interval, z0 = Interval.of(0.1, draws), ndtri(0.1)
+    np.testing.assert_allclose([interval.low, interval.high], ndtr(2 * z0 + np.array([-1.96, 1.96])), atol=5e-4)
+
+
+def test_values_that_equal_count_half():
+    assert Interval.of(0.5, np.array([0.0] * 50 + [0.5] * 50 + [1.0] * 50)) == Interval(0.0, 1.0)
+
+
+def test_what_an_interval_cannot_tell():
+    assert "all resamples agree" in Interval.of(1.0, np.ones(100)).why
+    draws = np.concatenate([np.full(10, math.nan), np.linspace(0, 1, 90)])
+    assert Interval.of(0.5, draws).why == "10% of the resamples have equal values only"
+    assert math.isnan(Interval.of(0.5, draws).low)
+    assert math.isfinite(Interval.of(0.5, draws[8:]).low)
+
+
+def test_share_above():
+    assert share_above(np.array([1.0, -1.0, 0.0, 2.0, math.nan])) == pytest.approx(2.5 / 4)
+    assert math.isnan(share_above(np.array([math.nan])))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_intervals_hold_the_truth_as_often_as_they_say(kind):
+    """Of 100 studies 95 % should; fewer than 87 would happen by chance once in 1000. ``benchmarks.coverage`` has the
+    numbers."""
+    rng, held = np.random.default_rng(3), 0
+    for _ in range(100):
+        interval = study(made_up.junction(rng, 40, (0.7,))).correlation("s0", "ap", kind).interval
+        held += interval.low <= made_up.truth(0.7, kind) <= interval.high
+    assert held >= 87
+
+
+# ---- resampling
+
+
+@pytest.mark.slow
+def test_blocks_drawn_are_as_good_as_average_precision_computed_anew():
+    """A draw of blocks is a sum of frames: AP of these frames against its linear form from the left-out values."""
+    truth, found = random_scenes(21, 60)
+    measures = evaluate(Record.of(truth, found)).measures
+    block, rng = blocks_of(60), np.random.default_rng(5)
+    weights = rng.multinomial(10, np.full(10, 0.1), 30)
+    for name, least in (("ap_bev_r40_iou50", 0.85), ("recall_3d_iou50_cars", 0.98)):
+        measured = Measured.of([measures[name]])
+        linear = Draws(np.zeros((30, 1), np.int64), weights).of_measure(measured, np.array([True]))[:, 0]
+        anew = []
+        for drawn in weights:
+            rows = [k for k in range(60) for _ in range(drawn[block[k]])]
+            again = evaluate(Record.of([truth[k] for k in rows], [found[k] for k in rows])).measures
+            anew.append(again[name].value)
+        assert np.corrcoef(linear, anew)[0, 1] > least
+        assert np.std(linear) == pytest.approx(np.std(anew), rel=0.25)
+        assert np.mean(linear) == pytest.approx(np.mean(anew), abs=0.01)
+
+
+def test_blocks_drawn_scatter_by_the_standard_error():
+    made = made_up.junction(np.random.default_rng(6), 3, (0.5,)).measures["ap"]
+    draws = Draws.of("a", 3, 10, 20_000, 0)
+    fixed = Draws(np.tile(np.arange(3), (20_000, 1)), draws.blocks).of_measure(made, made.known)
+    se = np.sqrt(9 / 10 * ((made.left_out - made.left_out.mean(axis=1, keepdims=True)) ** 2).sum(axis=1))
+    np.testing.assert_allclose(fixed.std(axis=0), se, rtol=0.02)
+    np.testing.assert_allclose(fixed.mean(axis=0), made.values, atol=0.005)
+
+
+def test_a_resample_has_whole_sites(thirteen):
+    """A site's score and measure stay together, and a site that is drawn twice has the same of both."""
+    draws = Draws.of("a", 13, 10, 50, 0)
+    score, measure = draws.of_score(thirteen.scores["s0"]), draws.of_measure(thirteen.measures["ap"], np.ones(13, bool))
+    for row in range(50):
+        assert len(np.unique(score[row])) == len(np.unique(measure[row])) == len(np.unique(draws.sites[row]))
+    assert (draws.blocks.sum(axis=1) == 10).all()
+
+
+# ---- one junction
+
+
+def test_values_are_those_of_scipy_and_the_same_twice(thirteen):
+    a, b = thirteen.scores["s0"], thirteen.measures["ap"].values
+    right = scipy.stats.pearsonr(a, b), scipy.stats.spearmanr(a, b), scipy.stats.kendalltau(a, b)
+    found = [study(thirteen).correlation("s0", "ap", kind) for kind in KINDS]
+    np.testing.assert_allclose([its.value for its in found], [its.statistic for its in right])
+    assert found == [study(thirteen).correlation("s0", "ap", kind) for kind in KINDS]
+    assert found != [study(thirteen, seed=2).correlation("s0", "ap", kind) for kind in KINDS]
+    assert all(its.sites == 13 and its.interval.low < its.value < its.interval.high for its in found)
+
+
+def test_what_is_asked_before_has_no_say(thirteen):
+    alone = study(thirteen).correlation("s1", "ap", "kendall")
+    asked = study(thirteen)
+    asked.correlation("s0", "ap", "kendall")
+    asked.difference("s0", "s1", "ap", "spearman")
+    assert asked.correlation("s1", "ap", "kendall") == alone
+
+
+def test_a_constant_score_has_no_correlation_and_it_is_told(thirteen):
+    found = study(with_scores(thirteen, flat=np.full(13, 0.1))).correlation("flat", "ap", "spearman")
+    assert math.isnan(found.value) and math.isnan(found.interval.low)
+    (doubt,) = found.doubts("flat, ap")
+    assert str(doubt) == (
+        "flat, ap: no correlation: flat is the same at all sites of made up; more sites, or sites that differ more"
+    )
+
+
+@pytest.mark.parametrize(
+    ("sites", "defined", "why"),
+    [
+        (2, False, "made up has 2 sites with values; 3 are needed"),
+        (4, True, "made up has 4 sites; an interval needs 5"),
+        (5, True, ""),
+    ],
+)
+def test_few_sites(sites, defined, why):
+    found = study(made_up.junction(np.random.default_rng(0), sites, (0.5,))).correlation("s0", "ap", "pearson")
+    assert found.why == why
+    assert math.isfinite(found.value) == defined and math.isfinite(found.interval.high) == (not why)
+
+
+def test_a_perfect_order_of_ranks_has_an_interval_only_if_resamples_differ():
+    made = made_up.junction(np.random.default_rng(0), 8, (1.0,))
+    sure = Measured(made.scores["s0"], np.tile(made.scores["s0"][:, None], (1, 10)))  # no block changes anything
+    found = study(Junction("j", made.sites, made.scores, {"ap": sure})).correlation("s0", "ap", "spearman")
+    assert found.value == 1 and math.isnan(found.interval.low) and "all resamples agree" in found.why
+
+
+def test_sites_without_a_value_are_left_out_and_named(thirteen):
+    values = thirteen.scores["s0"].copy()
+    values[4] = math.nan
+    measured = thirteen.measures["ap"]
+    left_out = measured.left_out.copy()
+    left_out[7, 3] = math.nan
+    partly = Junction("j", thirteen.sites, {"s0": values}, {"ap": Measured(measured.values, left_out)})
+    found = study(partly).correlation("s0", "ap", "spearman")
+    rest = [k for k in range(13) if k not in (4, 7)]
+    assert found.value == pytest.approx(scipy.stats.spearmanr(values[rest], measured.values[rest]).statistic)
+    assert found.sites == 11 and found.dropped == ("j c04", "j c07")
+    assert "left out, for a value is not defined there: j c04, j c07" in str(found.doubts("s0")[0])
+
+
+# ---- two scores
+
+
+def test_two_scores_are_compared_on_the_same_resamples(thirteen):
+    found = study(thirteen, 1000).difference("s0", "s1", "ap", "spearman")
+    each = [study(thirteen, 1000).correlation(name, "ap", "spearman") for name in ("s0", "s1")]
+    assert found.value == pytest.approx(each[0].value - each[1].value)
+    assert found.interval.low < found.value < found.interval.high and 0.5 < found.better <= 1
+    back = study(thirteen, 1000).difference("s1", "s0", "ap", "spearman")
+    assert back.better == pytest.approx(1 - found.better) and back.value == -found.value
+
+
+def test_a_score_is_no_better_than_its_copy_and_pairing_tells_more_than_two_intervals(thirteen):
+    rng = np.random.default_rng(1)
+    near = with_scores(thirteen, copy=thirteen.scores["s0"], near=thirteen.scores["s0"] + 0.1 * rng.normal(size=13))
+    same = study(near).difference("s0", "copy", "ap", "pearson")
+    assert same.value == 0 and same.better == 0.5 and "all resamples agree" in same.why
+    width = [its.interval.high - its.interval.low for its in (
+        study(near).difference("s0", "near", "ap", "pearson"), study(near).correlation("s0", "ap", "pearson"),
+    )]  # fmt: skip
+    assert width[0] < 0.5 * width[1]
+
+
+# ---- several junctions
+
+
+def test_sites_are_ranked_within_their_junctions():
+    """The scale of a junction has no say: one junction's scores and detection lie far above the other's."""
+    rng = np.random.default_rng(9)
+    low, high = (made_up.junction(rng, n, (0.6,), name=name) for n, name in ((12, "low"), (9, "high")))
+    moved = Measured(high.measures["ap"].values * 7 + 100, high.measures["ap"].left_out * 7 + 100)
+    high = Junction("high", high.sites, {"s0": high.scores["s0"] * 50 + 1e4}, {"ap": moved})
+    for kind in KINDS:
+        each = [study(its).correlation("s0", "ap", kind).value for its in (low, high)]
+        both = study([low, high]).correlation("s0", "ap", kind)
+        assert both.value == pytest.approx((12 * each[0] + 9 * each[1]) / 21)
+        assert both.sites == 21 and both.interval.low < both.value < both.interval.high
+        assert study([high, low]).correlation("s0", "ap", kind).interval.low == pytest.approx(both.interval.low)
+    ranks = []
+    for its in (low, high):
+        for values in (its.scores["s0"], its.measures["ap"].values):
+            rank = scipy.stats.rankdata(values)
+            ranks.append((rank - rank.mean()) / rank.std())
+    pooled = np.corrcoef(np.concatenate(ranks[::2]), np.concatenate(ranks[1::2]))[0, 1]
+    assert study([low, high]).correlation("s0", "ap", "spearman").value == pytest.approx(pooled)
+
+
+def test_more_junctions_make_intervals_narrower():
+    rng = np.random.default_rng(10)
+    junctions = [made_up.junction(rng, 13, (0.5,), name=f"j{k}") for k in range(6)]
+    width = [np.subtract(its.high, its.low) for its in (
+        study(junctions[:1]).correlation("s0", "ap", "spearman").interval,
+        study(junctions).correlation("s0", "ap", "spearman").interval,
+    )]  # fmt: skip
+    assert width[1] < 0.6 * width[0]
+
+
+def test_one_junction_with_a_constant_score_is_named():
+    rng = np.random.default_rng(11)
+    fine, flat = (made_up.junction(rng, 9, (0.5,), name=name) for name in ("fine", "flat"))
+    flat = with_scores(flat, s0=np.ones(9))
+    found = study([fine, flat]).correlation("s0", "ap", "kendall")
+    assert math.isnan(found.value) and found.why == "s0 is the same at all sites of flat"
