@@ -46,10 +46,9 @@ def load(path: str | Path, overrides: Iterable[str] = ()) -> Scenario:
             raise InputError(f"--set {override}", found, "extends = ... in a scenario.toml")
         values = _lay_over(values, override)
     scenario = from_values(values, file.parent, str(file))
-    source, idle = scenario.traffic.idle_keys()
-    if idle:
+    for table, source, idle in scenario.traffic.idle_keys():
         found = f"{', '.join(sorted(idle))} would act on nothing beside {source}"
-        raise InputError(f"{file}: traffic", found, "remove it")
+        raise InputError(f"{file}: {table}", found, "remove it")
     return scenario
 
 

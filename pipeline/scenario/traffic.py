@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, model_validator
@@ -60,6 +61,12 @@ class PeriodModel(StrictModel):
     vehicles: int | None = Field(None, ge=1, description="Its own number of vehicles at all times")
     begin_s: float | None = Field(None, ge=0, description="As traffic.begin_s")
     length_s: Positive | None = Field(None, description="Time recorded, instead of traffic.frames")
+
+    @model_validator(mode="after")
+    def _one_source(self) -> PeriodModel:
+        if self.sumocfg is not None and self.fcd is not None:
+            raise ValueError("sumocfg and fcd: a period has one source")
+        return self
 
     def over(self, traffic: TrafficModel) -> TrafficModel:
         """The traffic of this period alone; ValueError where the keys do not go together."""
@@ -248,8 +255,19 @@ class TrafficModel(StrictModel):
         """The kinds that the scenario itself names."""
         return self.kinds if self.kinds != _FLEET else ()
 
-    def idle_keys(self) -> tuple[str, set[str]]:
-        """The source of the traffic, and the keys that the user set although they act on nothing with this source."""
+    def idle_keys(self) -> Iterator[tuple[str, str, set[str]]]:
+        """Tables with keys that the user set although they act on nothing: the table, the source of its traffic, the
+        keys. A key of ``[traffic]`` acts if it does in any period."""
+        alone = [period.over(self) for period in self.periods] or [self]
+        found = [traffic._idle() for traffic in alone]
+        if everywhere := set.intersection(*(idle for _, idle in found)) & self.model_fields_set:
+            yield "traffic", found[0][0], everywhere
+        for period, (source, idle) in zip(self.periods, found, strict=False):
+            if own := idle & period.model_fields_set:
+                yield f"traffic.periods ({period.name})", source, own
+
+    def _idle(self) -> tuple[str, set[str]]:
+        """The source of the traffic, and the keys that act on nothing with this source."""
         source = next(key for key in SOURCES if getattr(self, key) is not None)
         if self.routes and source == "network":
             source = "routes"

@@ -165,6 +165,19 @@ def test_of_a_mix_each_group_is_left_out_of_its_own_record() -> None:
     assert len(Estimate.of(found[None], leave_out.groups).strata) == 2
 
 
+def test_variances_and_biases_of_a_mix_add_up_by_hand() -> None:
+    """One site, 100 bit. By day two equal groups, without which it has 98 and 100; by night groups of 10 and 20
+    frames, without which it has 97 and 99."""
+    records = (Groups(np.array([10, 10]), 0.0), Groups(np.array([10, 20]), 0.0))
+    estimate = Estimate.of(np.array([[100.0, 98.0, 100.0, 97.0, 99.0]]), records)
+    # day: h = 2, so S~ = 200 - (98 + 100) / 2 = 101; pseudo-values 102 and 100; se^2 = ((1 + 1) / 1) / 2 = 1
+    # night: h = 3 and 1.5, so S~ = 200 - (2/3 97 + 1/3 99) = 307/3; pseudo-values 300 - 194 = 106, 150 - 49.5 = 100.5;
+    #        se^2 = ((11/3)^2 / 2 + (11/6)^2 / 0.5) / 2 = (121/18 + 121/18) / 2 = 121/18
+    assert estimate.se[0] == pytest.approx((1 + 121 / 18) ** 0.5)
+    assert estimate.bias[0] == pytest.approx((100 - 101) + (100 - 307 / 3))
+    assert estimate.freedom == pytest.approx((1 + 121 / 18) ** 2 / (1 + (121 / 18) ** 2))  # one degree each
+
+
 def test_errors_of_a_mix_and_of_its_periods_are_told(split: Path, tmp_path: Path) -> None:
     record = pipeline.run(pipeline.load(split), tmp_path)
     rows = of(pipeline.read_scores(tmp_path / "scores.parquet"))
@@ -203,6 +216,14 @@ def test_a_period_whose_best_site_is_another_is_told() -> None:
         ("begin_s = 12", "begin = 12", "begin"),
         ("blocks = 4", "blocks = 40000", "blocks = 40000 in each period are 80000 blocks: at most 65535"),
         ("length_s = 8", "length_s = 80", "frames"),
+        ("length_s = 8", 'fcd = "a"\nsumocfg = "b"', "sumocfg and fcd: a period has one source"),
+        (
+            "length_s = 8",
+            "vehicles = 5",
+            r"traffic.periods \(night\): vehicles would act on nothing beside fcd; remove it",
+        ),
+        ("length_s = 8", 'counts = [{edge = "e", per_hour = 5}]', r"\(night\): counts would act on nothing beside fcd"),
+        ("frames = 40", "step_s = 1.0", "traffic: step_s would act on nothing beside fcd"),
         ("[score]", "[effects.moving_occlusion]\n[score]", 'method = "frames" replays all periods alike'),
     ],
 )
@@ -219,6 +240,15 @@ def test_periods_that_cannot_be_are_refused(
     code, _, complaint = egvs("run", split, "--out", tmp_path / "out")
     assert code == 2
     assert re.search(message, complaint)
+
+
+def test_a_key_that_acts_in_one_period_may_stand_for_all(split: Path) -> None:
+    """Of the first period, a finished file, SUMO's step is none of its business."""
+    file = split / "scenario.toml"
+    text = file.read_text().replace('fcd = "fcd.csv"', "step_s = 0.5").replace("length_s = 12", 'fcd = "fcd.csv"')
+    file.write_text(text.replace("begin_s = 12", 'sumocfg = "night.sumocfg"'))
+    day, night = (scenario.traffic for scenario in pipeline.load(split).by_period().values())
+    assert (day.fcd, night.sumocfg, night.step_s) == ("fcd.csv", "night.sumocfg", 0.5)
 
 
 def test_a_period_that_is_not_there_is_refused(split: Path, tmp_path: Path) -> None:
