@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import Any
 
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from pipeline.cli.terminal import NARROW, console, table
@@ -24,7 +23,7 @@ def print_comparison(found: Comparison, top: int | None = None) -> None:
     """Everything; the ``top`` sites of the first run where that is given."""
     out = console(_FILE_WIDTH, soft_wrap=False)
     for run in found.runs:
-        out.print(f"{run.label}  {run.folder}", markup=False, soft_wrap=True)
+        out.print(f"{run.label}  {run.folder}", soft_wrap=True)
     out.print()
     for part in _fitting(found.runs, out.width):
         out.print(_site_table(found, part, found.sites[:top], out.width))
@@ -40,7 +39,7 @@ def print_comparison(found: Comparison, top: int | None = None) -> None:
 
 def _print_notes(out: Console, notes: Sequence[str]) -> None:
     for note in notes:
-        out.print(f"note: {note}", markup=False, soft_wrap=True)
+        out.print(f"note: {note}", soft_wrap=True)
 
 
 def _columns(run: ComparedRun, is_wide: bool) -> list[str]:
@@ -76,7 +75,7 @@ def _site_table(found: Comparison, runs: Sequence[ComparedRun], sites: Sequence[
             cells |= {"longitude": f"{site.longitude_deg:.6f}", "latitude": f"{site.latitude_deg:.6f}"}
         for run in runs:
             cells |= _cells(run.label, run.sites.get(site.site))
-        rows.add_row(*(escape(cells[name]) for name in (*names, *of_runs)))
+        rows.add_row(*(cells[name] for name in (*names, *of_runs)))
     return rows
 
 
@@ -100,7 +99,7 @@ def _agreement_table(found: Comparison) -> Table:
         best = same + _few(pair.best_a) if same else f"{_few(pair.best_a)} / {_few(pair.best_b)}"
         tau, rho = ("-" if value is None else f"{value:.2f}" for value in (pair.tau, pair.rho))
         lost = "-" if pair.regret_a is None else f"{pair.regret_a:.2%}"
-        rows.add_row(f"{pair.a}, {pair.b}", str(pair.shared), tau, rho, escape(best) if pair.shared else "-", lost)
+        rows.add_row(f"{pair.a}, {pair.b}", str(pair.shared), tau, rho, best if pair.shared else "-", lost)
     return rows
 
 
@@ -112,7 +111,7 @@ def _difference_table(found: Comparison) -> Table:
     labels = [run.label for run in found.runs]
     rows = table(["what differs", *labels], left=["what differs", *labels])
     for difference in found.differences:
-        rows.add_row(escape(difference.what), *(escape(_value(value)) for value in difference.values))
+        rows.add_row(difference.what, *(_value(value) for value in difference.values))
     return rows
 
 

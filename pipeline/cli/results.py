@@ -85,14 +85,14 @@ def print_stage(folder: Path, stage: str, record: RunRecord, *, top: int | None 
         _print_scores(out, folder, record, top)
     done = record.stages[stage]
     for name in (*done.artefacts, *done.summary.get("clouds", ())):
-        out.print(str(folder / name), markup=False)
+        out.print(str(folder / name))
 
 
 def print_verification(folder: Path, differences: list[str]) -> None:
     """What verify found."""
     well = ["every artefact is as the run made it, and a second run makes the same bytes"]
     for line in differences or well:
-        console(_FILE_WIDTH).print(f"{folder}: {line}", markup=False)
+        console(_FILE_WIDTH).print(f"{folder}: {line}")
 
 
 def print_check(checked: Checked) -> None:
@@ -102,10 +102,10 @@ def print_check(checked: Checked) -> None:
         if findings:
             out.print(f"{len(findings)} {what}{'s' if len(findings) > 1 else ''}")
         for rule in dict.fromkeys(finding.rule for finding in findings):
-            out.print(f"  {rule}", markup=False)
+            out.print(f"  {rule}")
             for finding in findings:
                 if finding.rule == rule:
-                    out.print(f"    {finding}", markup=False)
+                    out.print(f"    {finding}")
     if not checked.findings:
         out.print("nothing found")
     out.print(f"{checked.sites} sites, {checked.solids} solids and {checked.lanes} lanes held against one another")
@@ -113,10 +113,10 @@ def print_check(checked: Checked) -> None:
 
 def print_new_scenario(made: NewScenario) -> None:
     """What ``egvs new`` made."""
-    out = Console(highlight=False, soft_wrap=True)
+    out = console(_FILE_WIDTH)
     for key, value in made.to_json().items():
-        out.print(f"{key}: {in_words(value) if isinstance(value, dict) else value_in_words(value)}", markup=False)
-    out.print(f"next: egvs run {made.folder}", markup=False)
+        out.print(f"{key}: {in_words(value) if isinstance(value, dict) else value_in_words(value)}")
+    out.print(f"next: egvs run {made.folder}")
 
 
 def period_table(by_period: PeriodRanking, top: int | None = None) -> Table:

@@ -24,25 +24,25 @@ def print_study(study: AccuracyStudy, command: str) -> None:
     same = [row for row in study.rows if row.kind != "measures"]
     other = [row for row in study.rows if row.kind == "measures"]
     out.print(_settings("settings that approximate the same number, against the reference", same, True, is_wide))
-    out.print(f"reference: {_reference(study)}. * on the front of time and error, = recommended", markup=False)
-    out.print(f"seconds are medians; {study.repeated} times a stage was run again for them\n", markup=False)
+    out.print(f"reference: {_reference(study)}. * on the front of time and error, = recommended")
+    out.print(f"seconds are medians; {study.repeated} times a stage was run again for them\n")
     if other:
         title = "settings that measure something else, against the scenario on the same traffic"
         out.print(_settings(title, other, False, is_wide))
     if not is_wide:
-        out.print("stages, memory and disk: in a wider window, or in accuracy.parquet", markup=False)
+        out.print("stages, memory and disk: in a wider window, or in accuracy.parquet")
     for why in dict.fromkeys(study.skipped.values()):
         names = [name for name, its in study.skipped.items() if its == why]
-        out.print(f"skipped, {why}: {'; '.join(names)}", markup=False)
+        out.print(f"skipped, {why}: {'; '.join(names)}")
     if study.seeds is not None:
         _print_seeds(out, study.seeds)
     for better, worse, chance, frames in study.neighbours[:3]:
         known = math.isfinite(frames)
         enough = f"about {frames:,.0f} frames tell them apart" if known else "no traffic would tell them apart"
-        out.print(f"{better} above {worse}: chance {chance:.0%}; {enough}", markup=False)
-    out.print(_recommendation(study, command), markup=False)
+        out.print(f"{better} above {worse}: chance {chance:.0%}; {enough}")
+    out.print(_recommendation(study, command))
     for path in study.files:
-        out.print(str(path), markup=False)
+        out.print(str(path))
 
 
 def _reference(study: AccuracyStudy) -> str:

@@ -95,7 +95,7 @@ def print_store(store: Store) -> None:
         age, rest = _duration(now - entry.created), _duration(now - entry.last_used)
         rows.add_row(entry.stage, entry.key[:12], _size(entry.bytes), age, f"{rest} ago")
     out.print(rows)
-    out.print(f"{store.folder}: {_total(entries)}, of at most {_size(store.bound_bytes)}", markup=False)
+    out.print(f"{store.folder}: {_total(entries)}, of at most {_size(store.bound_bytes)}")
 
 
 def print_removed(store: Store, removed: list[Entry]) -> None:

@@ -14,8 +14,12 @@ NARROW, WIDE = 110, 190
 
 
 def console(file_width: int, *, soft_wrap: bool = True) -> Console:
-    """Standard output: as wide as the terminal, or ``file_width`` columns where it goes to a file."""
-    return Console(width=None if sys.stdout.isatty() else file_width, highlight=False, soft_wrap=soft_wrap)
+    """Standard output: as wide as the terminal, or ``file_width`` columns where it goes to a file.
+
+    Nothing in a text is taken for a style or an emoji: names may have brackets and colons.
+    """
+    width = None if sys.stdout.isatty() else file_width
+    return Console(width=width, highlight=False, markup=False, emoji=False, soft_wrap=soft_wrap)
 
 
 def table(names: Iterable[str], left: Collection[str], whole: Collection[str] = (), *, fold: bool = True) -> Table:

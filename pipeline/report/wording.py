@@ -63,8 +63,8 @@ def which_to_trust(ranking: Ranking) -> str:
 def site_caption(site: ScoredSite, voxels_seen: int, voxels: int) -> str:
     """One site in numbers."""
     return (
-        f"{site.site}: rank {site.rank}, EGVS {whole(site.egvs)} bit, {plain(site.z_m)} m above the ground at "
-        f"x = {plain(site.x_m)} m, y = {plain(site.y_m)} m, with a {site.sensor}. "
+        f"{site.site}: rank {site.rank}, EGVS {whole(site.egvs)} bit, at x = {plain(site.x_m)} m, "
+        f"y = {plain(site.y_m)} m, z = {plain(site.z_m)} m, with a {site.sensor}. "
         f"It sees {whole(voxels_seen)} of {whole(voxels)} uncertain voxels. "
         f"{whole(site.returns)} of its {whole(site.beams_in_roi)} beams towards the region end on the ground "
         f"or on what stands there."

@@ -291,6 +291,11 @@ class Scenario(StrictModel):
         return scenarios
 
     @property
+    def is_recorded(self) -> bool:
+        """Whether its traffic, or that of a period, is a finished file."""
+        return any(traffic.fcd is not None for _, traffic in self._traffic_by_period())
+
+    @property
     def folder(self) -> Path:
         """The folder that relative file names start from."""
         return self._folders[0]

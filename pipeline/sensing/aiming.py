@@ -8,6 +8,9 @@ the order of turns (roll, pitch, yaw):
 .. math:: \rho \sin(pitch + \phi) = d_z, \quad \rho = \sqrt{m_x^2 + m_z^2}, \quad \phi = atan2(m_z, m_x), \\
           yaw = atan2(d_y, d_x) - atan2(m_y, m'_x), \quad m'_x = \rho \cos(pitch + \phi)
 
+Of the two pitches that satisfy this the one is taken that keeps the sign of :math:`m_x`: a window that looks backwards
+stays behind the sensor, which is then turned round and not upside down.
+
 So a sensor without roll whose middle azimuth is 0 has a pitch of the point's elevation less the middle elevation. Both
 angles are rounded to 1e-6 degree, so that the last bits of an arc tangent do not travel on.
 """
@@ -139,7 +142,7 @@ def angles_to(place: str, from_m: Spot, to_m: Spot, roll_deg: float, sensor: Sen
     Raises
     ------
     InputError
-        Where the point is straight above or below the sensor, or the sensor would have to look backwards.
+        Where the point is straight above or below the sensor, or no pitch between -90 and 90 lets the ray meet it.
     """
     target = f"({', '.join(f'{v:g}' for v in to_m)})"
     x, y, z = (to - at for to, at in zip(to_m, from_m, strict=True))
@@ -149,8 +152,8 @@ def angles_to(place: str, from_m: Spot, to_m: Spot, roll_deg: float, sensor: Sen
     far_m = math.hypot(level_m, z)
     middle_x, middle_y, middle_z = _rolled(sensor.middle_deg, roll_deg)
     level = level_m / far_m
-    forward = math.sqrt(max((level - middle_y) * (level + middle_y), 0.0))
-    pitch_deg = math.degrees(math.atan2(z / far_m, forward) - math.atan2(middle_z, middle_x))
+    forward = math.copysign(math.sqrt(max((level - middle_y) * (level + middle_y), 0.0)), middle_x)
+    pitch_deg = math.remainder(math.degrees(math.atan2(z / far_m, forward) - math.atan2(middle_z, middle_x)), 360.0)
     if level < abs(middle_y) or abs(pitch_deg) > 90:
         right = "a point that the sensor's middle ray can meet with a pitch between -90 and 90"
         raise InputError(

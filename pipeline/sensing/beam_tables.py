@@ -31,6 +31,8 @@ _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 _DIGITS = 6
 _GAP_DEG = 5.0
 """Azimuths that leave no wider gap go all round."""
+_SAME_DEG = 1e-6
+"""Gaps that differ by less are equally wide."""
 
 
 class BeamTable:
@@ -56,11 +58,12 @@ class BeamTable:
 
     @property
     def azimuth_span_deg(self) -> tuple[float, float] | None:
-        """First and last azimuth of the smallest arc that holds all beams, counter-clockwise; None for all round."""
+        """First and last azimuth of the smallest arc that holds all beams, counter-clockwise; None for all round: no
+        gap is wide, or several are equally wide, as in a coarse table of a whole turn."""
         at = np.unique(np.mod(self.azimuth_deg, 360.0))
         gaps = np.diff(at, append=at[0] + 360.0)
         widest = int(np.argmax(gaps))
-        if gaps[widest] <= _GAP_DEG:
+        if gaps[widest] <= _GAP_DEG or np.count_nonzero(gaps > gaps[widest] - _SAME_DEG) > 1:
             return None
         first = float(at[(widest + 1) % len(at)])
         first -= 360.0 if first > 180.0 else 0.0

@@ -6,6 +6,8 @@ warnings stay in the stage's summary.
 
 from __future__ import annotations
 
+from typing import Any
+
 from pipeline.checks import checking, files
 from pipeline.core.errors import InputError
 from pipeline.core.findings import WARNINGS, FindingsError
@@ -14,6 +16,7 @@ from pipeline.sensing.sites import Site
 from pipeline.stages.base import StageInputs, Summary, Workspace
 from pipeline.stages.shared.built import built
 from pipeline.stages.shared.scene import sensor_digests
+from pipeline.world import world_frame
 
 NAME = "check"
 ARTEFACTS = ()
@@ -26,6 +29,7 @@ def inputs(work: Workspace) -> StageInputs:
     hashes = files.digests(scenario, candidates) | _sensors(scenario, candidates)
     settings = scenario.model_dump(mode="json", exclude={**dict.fromkeys(UNREAD, True), "roi": {"voxel_m"}})
     settings["keep_visibility"] = scenario.score.keep_visibility
+    settings |= _world(scenario)
     return StageInputs(settings, hashes)
 
 
@@ -33,6 +37,14 @@ def _sensors(scenario: Scenario, candidates: tuple[Site, ...]) -> dict[str, str]
     """Beam tables and entries of the catalogue, by hash; none where one is not there, which is known already."""
     try:
         return sensor_digests(scenario, candidates)
+    except InputError:
+        return {}
+
+
+def _world(scenario: Scenario) -> dict[str, Any]:
+    """Where the world frame lies, and the SUMO that converts a map; nothing where that is wrong, which is told."""
+    try:
+        return world_frame.key(scenario)
     except InputError:
         return {}
 

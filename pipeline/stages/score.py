@@ -136,19 +136,18 @@ def run(
     summary: Summary = {"sites": len(done), "best": best, "egvs_limit": scorer.limit}
     if skipped := scene_of(work).skipped(NAME):
         summary["skipped"] = skipped
+    doubts = period_scores.disagreements(names, worths, periods)
     if estimate is not None:
         records = [period.name for period in periods] or [""]
         summary |= uncertainty.in_words(estimate, records)
         place, period_s = f"{FILE}: traffic.frames", work.scenario.traffic.frame_period_s
-        doubts = uncertainty.doubts(estimate, place, period_s, records)
-        doubts += period_scores.disagreements(names, worths, periods)
-        if doubts:
-            summary[WARNINGS] = [doubt.to_json() for doubt in doubts]
+        doubts = uncertainty.doubts(estimate, place, period_s, records) + doubts
     if audit:
         summary["audit"] = _worst([d.audit for d in done if d.audit is not None])
-    if work.scenario.traffic.fcd is not None:  # without a network, the record alone knows the road
-        found = recorded.on_the_road(scene_of(work).sites, tpog)
-        summary[WARNINGS] = [*summary.get(WARNINGS, ()), *(finding.to_json() for finding in found)]
+    if work.scenario.is_recorded:  # without a network, the record alone knows the road
+        doubts += recorded.on_the_road(scene_of(work).sites, tpog)
+    if doubts:
+        summary[WARNINGS] = [doubt.to_json() for doubt in doubts]
     return summary
 
 

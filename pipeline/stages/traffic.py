@@ -20,7 +20,7 @@ from typing import Any
 
 from pipeline.artefacts import tables
 from pipeline.core import files
-from pipeline.core.errors import InputError
+from pipeline.core.errors import InputError, MissingBackendError
 from pipeline.core.findings import WARNINGS
 from pipeline.core.sumo_home import sumo_home
 from pipeline.effects import on_traffic, registry
@@ -45,16 +45,25 @@ def inputs(work: Workspace) -> StageInputs:
     for period in shown["periods"]:
         del period["weight"]
     settings = {"seed": scenario.seed, "name": scenario.name, "traffic": shown}
-    periods = [alone.traffic for alone in scenario.by_period().values()]
-    if any(period.fcd is not None for period in periods):
+    if scenario.is_recorded:
         settings |= world_frame.key(scenario)
     # one that acts by itself depends on the network alone
     if named := registry.settings(effect for effect in effects if not effect.SELF_ACTING):
         settings["effects"] = named
     hashes = {_label(path, scenario): files.sha256_of(path) for path in sources}
-    asks_sumo = any(period.fcd is None or period.vtypes for period in periods)
+    asks_sumo = any(alone.traffic.fcd is None or alone.traffic.vtypes for alone in scenario.by_period().values())
     version = sumo.version() if asks_sumo else None
-    return StageInputs(settings, hashes, {"sumo": version}, registry.modules(effects))
+    sizes_by = {"sizes_by": _sumo_at_hand()} if scenario.is_recorded else {}
+    return StageInputs(settings, hashes, {"sumo": version, **sizes_by}, registry.modules(effects))
+
+
+def _sumo_at_hand() -> str | None:
+    """The version of the SUMO that says how large its own types in a finished file are; without one, such a file is
+    refused."""
+    try:
+        return sumo.version()
+    except MissingBackendError:
+        return None
 
 
 def _sources(scenario: Scenario) -> list[Path]:

@@ -19,13 +19,16 @@ from pipeline.artefacts import periods, tables
 from pipeline.artefacts.period_ranking import PeriodRanking
 from pipeline.artefacts.readers import read_periods, read_scores_by_period, read_tpog
 from pipeline.core.errors import InputError
-from pipeline.core.findings import warnings_of
+from pipeline.core.findings import Finding, warnings_of
 from pipeline.core.grid import Grid
 from pipeline.scoring.egvs import EntropyField, binary_entropy
 from pipeline.scoring.leave_out import Groups, LeaveOut
 from pipeline.scoring.scorer import SiteScore
 from pipeline.scoring.uncertainty import Estimate
+from pipeline.stages import traffic
+from pipeline.stages.base import Workspace
 from pipeline.stages.shared import period_scores
+from pipeline.studies.effect_overview import called
 
 PERIODS = """
 [[traffic.periods]]
@@ -203,6 +206,55 @@ def test_a_period_whose_best_site_is_another_is_told() -> None:
     assert found.found == "b is the best site, not a of the mix, which is rank 2 there and scores 25.0% less"
     assert period_scores.disagreements(["a", "b"], [worth(9.0, 9.0, 4.0), worth(7.0, 6.0, 4.0)], named) == []
     assert period_scores.disagreements(["a"], [worth(9.0, 0.0, 0.0)], named) == []
+
+
+def test_periods_disagree_without_standard_errors_too(
+    split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = Finding("periods disagree", "scenario.toml: traffic.periods (night)", "b is the best site, not a", "")
+    monkeypatch.setattr(period_scores, "disagreements", lambda *_: [told])
+    for override in ("score.standard_error=true", "score.standard_error=false", "tpog.blocks=1"):
+        record = pipeline.run(pipeline.load(split, [override]), tmp_path / override)
+        assert told in warnings_of([record.stages["score"].summary]), override
+
+
+def test_the_report_tells_what_its_tables_leave_out(
+    split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = "".join(f"p{n},{10 + n},12,3\n" for n in range(4))
+    (split / "sites.csv").write_text(f"site,x_m,y_m,z_m\n{rows}")
+    for name, count in (("LISTED", 2), ("FIRST", 1), ("LAST", 1)):
+        monkeypatch.setattr(f"pipeline.report.page.{name}", count)
+    pipeline.run(pipeline.load(split), tmp_path)
+    html = (tmp_path / "report.html").read_text()
+    assert "2 more are not shown; scores_by_period.parquet holds them all" in html
+    assert "Choose any of the 2 listed sites here" in html
+    assert re.search(r"Vehicles at a time</dt><dd>2<small>", html)
+
+
+def test_an_effect_that_periods_forbid_is_not_advised(split: Path) -> None:
+    """Replaying the frames of all periods alike is refused in a scenario; it must not be recommended for one."""
+    (found,) = (call for call in called(pipeline.load(split)) if call.name == "moving_occlusion")
+    assert (found.state, found.why) == (
+        "off",
+        'cannot act here: method = "frames" replays all periods alike, whatever their weights;'
+        ' method = "independent" takes the mix',
+    )
+
+
+def test_the_world_frame_counts_where_a_period_alone_is_a_finished_file(
+    split: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Degrees in a recorded file are brought into the world frame, whichever period names it."""
+    file, fcd = split / "scenario.toml", 'fcd = "fcd.csv"\n'
+    each = file.read_text().replace(fcd, "").replace("length_s", f"{fcd}length_s")
+    file.write_text(each.replace("[traffic]", '[traffic]\nnetwork = "n.net.xml"'))
+    (split / "n.net.xml").write_text("<net/>")
+    scenario = pipeline.load(split)
+    assert scenario.traffic.fcd is None
+    assert scenario.is_recorded
+    monkeypatch.setattr("pipeline.world.world_frame.key", lambda _: {"world_frame": "here"})
+    assert traffic.inputs(Workspace(scenario, split)).settings["world_frame"] == "here"
 
 
 @pytest.mark.parametrize(

@@ -63,7 +63,10 @@ def test_targets_that_a_hand_can_check(target: list[float], yaw_deg: float, pitc
 
 
 @given(
-    st.tuples(*[st.floats(-60, 60)] * 3), st.floats(-30, 30), st.floats(-40, 40), st.floats(-30, 30)
+    st.tuples(*[st.floats(-60, 60)] * 3),
+    st.floats(-30, 30),
+    st.one_of(st.floats(-40, 40), st.floats(140, 220)),
+    st.floats(-30, 30),
 )  # to, elevation, azimuth, roll
 def test_the_middle_ray_meets_the_point(
     to_m: tuple[float, float, float], elevation: float, azimuth: float, roll_deg: float
@@ -92,6 +95,15 @@ def test_the_middle_ray_meets_the_point(
     pointed = rotation(yaw_deg, pitch_deg, roll_deg) @ ray
     assert np.cross(pointed, way / np.linalg.norm(way)) == pytest.approx(np.zeros(3), abs=1e-7)
     assert pointed @ way > 0
+
+
+def test_a_window_that_looks_backwards_is_turned_round() -> None:
+    """Its middle ray has azimuth 180: the point to the east is met with the nose to the west. It lies 45 degrees below
+    level, so the back goes down, and the nose up."""
+    back = Sensor("back", (-10.0, 10.0), (0.0, 0.0), 61, 100.0, "", azimuth_deg=(150.0, 210.0))
+    assert aiming.angles_to("here", (0, 0, 6), (6, 0, 0), 0.0, back) == (180.0, 45.0)
+    aside = Sensor("aside", (0.0,), (0.0,), 61, 100.0, "", azimuth_deg=(90.0, 150.0))
+    assert aiming.angles_to("here", (0, 0, 6), (6, 0, 6), 0.0, aside) == (-120.0, 0.0)
 
 
 def test_aim_roi_is_the_middle_of_the_region(mini: Path) -> None:

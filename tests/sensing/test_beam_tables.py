@@ -30,6 +30,20 @@ def windowed(first: float, last: float, step: float, *elevations: float) -> Sens
     return resolve("s", {"s": model(**keys)}, "here")
 
 
+@pytest.mark.parametrize(
+    ("azimuths", "span"),
+    [
+        (range(0, 360, 10), None), ([0, 120, 240], None), (range(-60, 61, 10), (-60, 60)), ([150, 210], (150, 210)),
+        ([30], (30, 30)), ([0, 90, 350], (-10, 90)),
+    ],
+)  # fmt: skip
+def test_a_coarse_table_of_a_whole_turn_looks_to_no_side(
+    azimuths: list[float], span: tuple[float, float] | None
+) -> None:
+    table = BeamTable(np.zeros(len(azimuths)), np.array(azimuths, dtype=np.float64))
+    assert table.azimuth_span_deg == span
+
+
 # --- fields of view ---------------------------------------------------------------------------------------------------
 
 

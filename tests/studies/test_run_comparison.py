@@ -148,6 +148,18 @@ def test_an_effect_that_a_run_lacks_is_told_by_its_parameters_alone(mini: Path, 
     ]
 
 
+def test_a_table_that_is_empty_in_one_run_is_told_by_the_others_rows() -> None:
+    runs = [
+        run_comparison.ComparedRun(label, Path(), {}, settings, {})
+        for label, settings in (
+            ("A", {"traffic.periods": [], "seed": 1}),
+            ("B", {"traffic.periods[day].weight": 1.0, "seed": 1}),
+        )
+    ]
+    found = [(d.what, d.values) for d in run_comparison._differences(runs)]
+    assert found == [("traffic.periods[day]", (None, "there"))]
+
+
 def test_letters_go_on_after_z() -> None:
     assert [run_comparison._letter(n) for n in (0, 25, 26, 27, 52)] == ["A", "Z", "AA", "AB", "BA"]
 

@@ -9,9 +9,11 @@ import pytest
 
 import pipeline
 from pipeline.artefacts import tables
-from pipeline.core.errors import InputError
+from pipeline.core.errors import InputError, MissingBackendError
+from pipeline.runs import stage_keys
 from pipeline.scenario.traffic import TrafficModel
 from pipeline.stages import traffic
+from pipeline.stages.base import Workspace
 from pipeline.studies.variants import counted_frames
 from tests.checks.conftest import net_xml
 from tests.conftest import fcd
@@ -135,6 +137,21 @@ def test_sizes_come_from_sumos_own_files_and_its_defaults(mini: Path, tmp_path: 
     truck, passenger = ("truck", 7.1, 2.4, 2.4), ("passenger", 5.0, 1.8, 1.5)  # SUMO's defaults, its documentation
     car = ("passenger", 4.5, 1.8, 1.5)  # the scenario's kind comes before the file's
     assert found == {truck, passenger, car, ("bus", 12.5, 2.5, 3.4)}
+
+
+def test_another_sumo_may_have_other_sizes_for_its_own_types(
+    mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The trajectories' key holds SUMO's version though no SUMO drove; without a SUMO there is a key all the same."""
+
+    def missing() -> str:
+        raise MissingBackendError("no sumo")
+
+    keys = set()
+    for version in (lambda: "1.20.0", lambda: "1.28.0", missing):
+        monkeypatch.setattr("pipeline.traffic.sumo.version", version)
+        keys.add(stage_keys.inputs("traffic", Workspace(pipeline.load(mini), tmp_path)).key)
+    assert len(keys) == 3
 
 
 def test_a_file_of_vtypes_comes_before_the_default_fleet(mini: Path, tmp_path: Path) -> None:

@@ -169,6 +169,13 @@ class MovingOcclusion(TransmitScore[MovingOcclusionParameters]):
 
     ready: Replay | FacingBoxes | Independent | None = field(default=None, compare=False, repr=False)
 
+    def refusal(self, scene: Scene) -> InputError | None:
+        """The frames of periods cannot be replayed by their weights."""
+        if self.parameters.method != "frames" or not scene.scenario.traffic.periods:
+            return None
+        found = 'method = "frames" replays all periods alike, whatever their weights'
+        return InputError("effects.moving_occlusion", found, 'method = "independent" takes the mix')
+
     def seen(self, scene: Scene) -> str:
         """Wherever there is traffic."""
         del scene
