@@ -44,9 +44,9 @@ def _work(name: str) -> tuple[dict[str, Callable[[], Any]], int, int]:
         d = directions[caster.scan(site.pose.position_m, directions, sensor.range_m).beam]
         start, single = np.tile((position - origin).astype(np.float32), (len(d), 1)), d.astype(np.float32)
         proposed = caster._owner[caster._scene.run(start, single)]
-        ranges, doubtful = np.empty(len(d)), np.empty(len(d), dtype=np.int64)
+        ranges, met, doubtful = np.empty(len(d)), *(np.empty(len(d), dtype=np.int64) for _ in range(2))
         count = rays.settle(
-            proposed, caster._triangles, caster._planes, position - origin, d, sensor.range_m, ranges, doubtful
+            proposed, caster._triangles, caster._planes, position - origin, d, sensor.range_m, ranges, met, doubtful
         )
         jobs.append(
             (
@@ -59,19 +59,20 @@ def _work(name: str) -> tuple[dict[str, Callable[[], Any]], int, int]:
                 single,
                 proposed,
                 ranges,
+                met,
                 doubtful,
                 count,
             )
         )
 
     def settle() -> None:
-        for _, _, range_m, o, d, _start, _single, proposed, ranges, doubtful, _count in jobs:
-            rays.settle(proposed, caster._triangles, caster._planes, o, d, range_m, ranges, doubtful)
+        for _, _, range_m, o, d, _start, _single, proposed, ranges, met, doubtful, _count in jobs:
+            rays.settle(proposed, caster._triangles, caster._planes, o, d, range_m, ranges, met, doubtful)
 
     def search() -> None:
-        for *_, o, d, _start, _single, _proposed, ranges, doubtful, count in jobs:
+        for *_, o, d, _start, _single, _proposed, ranges, met, doubtful, count in jobs:
             rays.search(
-                doubtful[:count], caster._triangles, caster._planes, caster._boxes, caster._starts, o, d, ranges
+                doubtful[:count], caster._triangles, caster._planes, caster._boxes, caster._starts, o, d, ranges, met
             )
 
     work: dict[str, Callable[[], Any]] = {

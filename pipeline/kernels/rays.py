@@ -122,7 +122,7 @@ def meet(triangle, plane, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-de
 
 
 @_kernel
-def settle(proposed, triangles, planes, o, d, range_m, ranges, doubtful):  # type: ignore[no-untyped-def]
+def settle(proposed, triangles, planes, o, d, range_m, ranges, met, doubtful):  # type: ignore[no-untyped-def]
     """Place the hits that were proposed, and tell which proposals float32 cannot be trusted with.
 
     Parameters
@@ -138,6 +138,8 @@ def settle(proposed, triangles, planes, o, d, range_m, ranges, doubtful):  # typ
         Of a hit that is further away, it is enough to know that it is.
     ranges
         Filled: range of each hit, infinity where nothing is met, (n,) float64.
+    met
+        Filled: the triangle that each ray meets; where nothing is met, of no meaning, (n,) int64.
     doubtful
         Filled: the rays that met a triangle less than ``SURE_M`` inside, its enlargement only, or at an angle below
         ``SHALLOW``, (n,) int64.
@@ -150,6 +152,7 @@ def settle(proposed, triangles, planes, o, d, range_m, ranges, doubtful):  # typ
     ox, oy, oz, count = o[0], o[1], o[2], 0
     for ray in range(proposed.shape[0]):
         ranges[ray], k = np.inf, proposed[ray]
+        met[ray] = k
         if k >= 0:
             ranges[ray], depth, sine = meet(triangles[k], planes[k], ox, oy, oz, d[ray, 0], d[ray, 1], d[ray, 2])
             if depth >= SURE_M and (sine >= SHALLOW or ranges[ray] > range_m + 1.0):
@@ -166,7 +169,7 @@ def _inverse(x):  # type: ignore[no-untyped-def]
 
 
 @_kernel
-def search(rays, triangles, planes, boxes, starts, o, d, ranges):  # type: ignore[no-untyped-def]
+def search(rays, triangles, planes, boxes, starts, o, d, ranges, met):  # type: ignore[no-untyped-def]
     """Find the first hit of a few rays among all triangles.
 
     Parameters
@@ -176,8 +179,8 @@ def search(rays, triangles, planes, boxes, starts, o, d, ranges):  # type: ignor
     boxes, starts
         Boxes round the triangles, round each ``GROUP`` consecutive boxes of those, and so on to a single one: (b, 6)
         float64, low and high corner; where each level starts, (levels + 1,) int64.
-    triangles, planes, o, d, ranges
-        As in :func:`settle`; ``ranges`` is filled for these rays.
+    triangles, planes, o, d, ranges, met
+        As in :func:`settle`; ``ranges`` and ``met`` are filled for these rays.
     """
     ox, oy, oz, top = o[0], o[1], o[2], starts.shape[0] - 2
     for r in range(rays.shape[0]):
@@ -196,7 +199,8 @@ def search(rays, triangles, planes, boxes, starts, o, d, ranges):  # type: ignor
                 continue
             if first <= last:
                 t, _, _ = meet(triangles[k], planes[k], ox, oy, oz, dx, dy, dz)
-                best = min(best, t)
+                if t < best:
+                    best, met[ray] = t, k
             k += 1
             while level < top and (k % GROUP == 0 or k == starts[level + 1] - starts[level]):
                 level, k = level + 1, (k - 1) // GROUP + 1

@@ -25,6 +25,7 @@ from pipeline.scenario.effects import EffectsModel
 from pipeline.scenario.sensors import SensorModel
 from pipeline.scenario.traffic import TrafficModel
 from pipeline.scenario.types import Latitude, Longitude, Name, Point2, Point3, Positive
+from pipeline.scenario.validation import ValidationModel
 
 FILE = "scenario.toml"
 _SUMO = "$SUMO_HOME/"
@@ -252,6 +253,7 @@ class Scenario(StrictModel):
     scan: ScanModel = ScanModel()
     score: ScoreModel = ScoreModel()
     effects: EffectsModel = EffectsModel()
+    validation: ValidationModel = ValidationModel()
 
     _folders: tuple[Path, ...] = PrivateAttr(default=(Path(),))
 

@@ -11,7 +11,7 @@ from pipeline.scenario.types import NotNegative, Positive
 
 MOST_BEAMS = 10_000_000
 
-_OPTICS = ("wavelength_nm", "divergence_mrad", "rated_range_m", "rated_reflectivity")
+_OPTICS = ("wavelength_nm", "divergence_mrad", "rated_range_m", "rated_reflectivity", "range_sigma_m")
 _FIELD_OF_VIEW = ("azimuth_deg", "beams", "pattern")
 _OF_RINGS = ("channels", "azimuth_offsets_deg", "azimuth_step_deg", "azimuth_deg")
 
@@ -69,6 +69,10 @@ class SensorModel(StrictModel):
         None, description="A target of rated_reflectivity, met squarely, is just noticed here; only effects ask"
     )
     rated_reflectivity: Positive = Field(0.8, description="See rated_range_m; only effects ask")
+
+    range_sigma_m: NotNegative = Field(
+        0.03, description="Standard deviation of a measured range; only point clouds with traffic ask"
+    )
 
     @property
     def optics(self) -> dict[str, Any]:

@@ -10,14 +10,17 @@ A measured scan holds returns only: it cannot tell which beams met nothing, so t
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core.errors import InputError
+from pipeline.core.grid import Roi
 from pipeline.formats import point_clouds
 from pipeline.formats.crs import height_unit_m
 from pipeline.kernels import rays
@@ -29,6 +32,7 @@ from pipeline.sensing.sensors import Sensor
 from pipeline.sensing.sites import Pose, ScannedSite, Site
 from pipeline.world import world_frame
 from pipeline.world.casting import Caster, EmptyScan
+from pipeline.world.mesh import World
 
 _BEAMS = 4096  # beams expanded at once: bounds the memory
 
@@ -72,23 +76,35 @@ class Scanner:
     """Scans from any pose before one scene. Threads may share one; it pickles to the scene that it was built from.
 
     Every scan belongs to the caller.
+
+    Parameters
+    ----------
+    scene
+        What is scanned.
+    whole
+        Cast every beam of a sensor, also those that cannot meet the region of interest, and tell what each ends on.
     """
 
-    def __init__(self, scene: Scene) -> None:
-        self.scene = scene
+    def __init__(self, scene: Scene, *, whole: bool = False) -> None:
+        self.scene, self.whole = scene, whole
         self._expanders = [effect for effect in scene.effects if isinstance(effect, BeamExpander)]
         cutters = [effect for effect in scene.effects if isinstance(effect, BeamCutter)]
         self._opaque = scene.world
         for effect in cutters:
             self._opaque = effect.opaque(self._opaque)
-        self._cuts = [effect.cutter(scene.world, scene.roi) for effect in cutters]
+        self._cuts = [effect.cutter(scene.world, _round(scene) if whole else scene.roi) for effect in cutters]
         self._at_sites = frozenset(_standing(scene))
         self._casters: dict[bool, Caster] = {}
         self._directions: dict[tuple[Sensor, tuple[float, float, float]], NDArray[np.float64]] = {}
         self._lock = threading.Lock()
 
-    def __reduce__(self) -> tuple[type[Scanner], tuple[Scene]]:
-        return Scanner, (self.scene,)
+    def __reduce__(self) -> tuple[Any, ...]:
+        return partial(Scanner, whole=self.whole), (self.scene,)
+
+    @property
+    def opaque_world(self) -> World:
+        """The world that beams are cast at, whose faces a whole sweep names: without what effects let beams through."""
+        return self._opaque
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -128,14 +144,15 @@ class Scanner:
 
     def _cast(self, pose: Pose, sensor: Sensor, place: str) -> Scan:
         placing.check(self.scene, pose, sensor, place)
-        caster = self._caster((pose.position_m, sensor) in self._at_sites)
+        caster = self._caster((pose.position_m, sensor) in self._at_sites and not self.whole)
+        cast = caster.sweep if self.whole else caster.scan
         directions = self._beam_directions(sensor, pose)
         if self._expanders:
             starts = range(0, len(directions), _BEAMS)
-            parts = [self._expanded(caster, pose, sensor, s, directions[s : s + _BEAMS]) for s in starts]
+            parts = [self._expanded(cast, pose, sensor, s, directions[s : s + _BEAMS]) for s in starts]
             rows = _joined(parts)
         else:
-            rows = caster.scan(pose.position_m, directions, sensor.range_m)
+            rows = cast(pose.position_m, directions, sensor.range_m)
         for cut in self._cuts:
             rows = cut(rows, pose)
         return Scan(pose, sensor, sensor.beams, rows)
@@ -153,14 +170,14 @@ class Scanner:
             return self._casters[at_a_site]
 
     def _expanded(
-        self, caster: Caster, pose: Pose, sensor: Sensor, start: int, directions: NDArray[np.float64]
+        self, cast: Callable[..., EmptyScan], pose: Pose, sensor: Sensor, start: int, directions: NDArray[np.float64]
     ) -> EmptyScan:
         """Cast the sub-beams of some beams, of which the first is number ``start``."""
         beam, weight = np.arange(start, start + len(directions)), np.ones(len(directions))
         for effect in self._expanders:
             directions, parent, share = effect.expand(directions, sensor, pose)
             beam, weight = beam[parent], weight[parent] * share
-        scan = caster.scan(pose.position_m, directions, sensor.range_m)
+        scan = cast(pose.position_m, directions, sensor.range_m)
         return replace(scan, beam=beam[scan.beam].astype(np.uint32), weight=weight[scan.beam])
 
     def _beam_directions(self, sensor: Sensor, pose: Pose) -> NDArray[np.float64]:
@@ -207,6 +224,14 @@ class Scanner:
         return np.column_stack([reading.to_world(points[:, :2]), height_m])
 
 
+def _round(scene: Scene) -> Roi:
+    """A box round the static world and the region of interest."""
+    low, high = np.asarray(scene.roi.origin_m), np.add(scene.roi.origin_m, scene.roi.size_m)
+    corners = np.concatenate([scene.world.vertices_m, [low, high]])
+    low, high = corners.min(axis=0) - 1.0, corners.max(axis=0) + 1.0
+    return Roi(tuple(low.tolist()), tuple((high - low).tolist()))
+
+
 def _standing(scene: Scene) -> Iterator[tuple[tuple[float, float, float], Sensor]]:
     """Where the scene's own sensors stand; a site whose sensor is unknown is refused when it is scanned."""
     for site in scene.cast_sites:
@@ -227,6 +252,6 @@ def _different(ascending: NDArray[np.uint32]) -> int:
 
 def _joined(scans: list[EmptyScan]) -> EmptyScan:
     """Scans of consecutive beams of one site as one."""
-    names = ("beam", "ends_m", "returned", "weight")
+    names = ["beam", "ends_m", "returned", "weight", *(["face"] if scans[0].face is not None else [])]
     fields = {name: np.concatenate([getattr(scan, name) for scan in scans]) for name in names}
     return EmptyScan(**fields, doubtful=sum(scan.doubtful for scan in scans))

@@ -54,6 +54,8 @@ class Sensor:
         them.
     rated_range_m, rated_reflectivity
         A target of this reflectivity (0 to 1), met squarely, is still noticed at this range. Only effects ask for them.
+    range_sigma_m
+        Standard deviation of a measured range; only point clouds with traffic ask for it.
     azimuth_deg
         First and last azimuth of a ring; None: all round, from 0.
     table
@@ -72,6 +74,7 @@ class Sensor:
     divergence_mrad: tuple[float, float] = _DEFAULT["divergence_mrad"].default
     rated_range_m: float | None = _DEFAULT["rated_range_m"].default
     rated_reflectivity: float = _DEFAULT["rated_reflectivity"].default
+    range_sigma_m: float = _DEFAULT["range_sigma_m"].default
     azimuth_deg: tuple[float, float] | None = None
     table: BeamTable | None = None
     assumed: str = ""

@@ -49,7 +49,7 @@ def _world(scenario: Scenario) -> dict[str, Any]:
         return {}
 
 
-UNREAD = ("description", "extends", "seed", "tpog", "scan", "score")
+UNREAD = ("description", "extends", "seed", "tpog", "scan", "score", "validation")
 
 
 def run(work: Workspace, inputs: StageInputs) -> Summary:

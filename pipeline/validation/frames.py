@@ -8,7 +8,7 @@ spot is the site's fault. People on foot and on bicycles are in the frame, and i
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +42,8 @@ class TrafficFrame:
         (n, 7) float64, as :data:`BOX`.
     pitch_rad
         Nose up, (n,) float64.
+    part
+        0, or 1.. for the rear parts of an articulated vehicle, (n,) int64; all 0 where it is not given.
     """
 
     number: int
@@ -49,6 +51,16 @@ class TrafficFrame:
     kinds: tuple[str, ...]
     boxes: NDArray[np.float64]
     pitch_rad: NDArray[np.float64]
+    part: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+
+    def __post_init__(self) -> None:
+        if not len(self.part):
+            object.__setattr__(self, "part", np.zeros(len(self.boxes), dtype=np.int64))
+
+    def several_parts(self) -> NDArray[np.bool_]:
+        """Which boxes are of vehicles with more than one part, (n,)."""
+        jointed = {name for name, part in zip(self.vehicles, self.part.tolist(), strict=True) if part}
+        return np.array([name in jointed for name in self.vehicles], dtype=np.bool_)
 
     def wanted(self, roi: Roi) -> NDArray[np.int64]:
         """The rows that are ground truth: vehicles whose centre is in the region of interest (half-open, as voxels)."""
@@ -71,7 +83,7 @@ def read(path: Path, numbers: NDArray[np.int64]) -> Iterator[TrafficFrame]:
     InputError
         For a file that is corrupt or out of order.
     """
-    columns = ["frame", "vehicle", "kind", *BOX, "pitch_rad"]
+    columns = ["frame", "vehicle", "part", "kind", *BOX, "pitch_rad"]
     left = list(numbers.tolist())
     with tables.reader(path, "trajectories") as (file, _):
         last = -1
@@ -84,12 +96,12 @@ def read(path: Path, numbers: NDArray[np.int64]) -> Iterator[TrafficFrame]:
                 raise InputError(path, f"frames are out of order near frame {frame[0]}", "rows sorted by frame")
             last = int(frame[-1])
             values = np.column_stack([table.column(name).to_numpy() for name in (*BOX, "pitch_rad")])
+            part = table.column("part").to_numpy().astype(np.int64)
             names, kinds = table.column("vehicle").to_pylist(), table.column("kind").to_pylist()
             while left and left[0] <= last:
                 number = left.pop(0)
                 rows = slice(*np.searchsorted(frame, [number, number + 1]).tolist())
-                yield TrafficFrame(
-                    number, tuple(names[rows]), tuple(kinds[rows]), values[rows, :7], values[rows, 7].copy()
-                )
+                boxes, pitch = values[rows, :7], values[rows, 7].copy()
+                yield TrafficFrame(number, tuple(names[rows]), tuple(kinds[rows]), boxes, pitch, part[rows].copy())
     for number in left:
         yield TrafficFrame(number, (), (), np.empty((0, 7)), np.empty(0))

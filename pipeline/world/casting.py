@@ -17,7 +17,7 @@ m of the line between them may be given the farther of the two, which then lies 
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -59,6 +59,8 @@ class EmptyScan:
         How many beams float32 alone would not have settled.
     weight
         Only where effects weight beams: the share of its beam that each row is, (n,) float64.
+    face
+        Only of a whole sweep: the face of the world that each beam ends on, -1 for none (leaves), (n,) int64.
     """
 
     beam: NDArray[np.uint32]
@@ -66,6 +68,7 @@ class EmptyScan:
     returned: NDArray[np.bool_]
     doubtful: int = 0
     weight: Floats | None = None
+    face: NDArray[np.int64] | None = None
 
 
 class Caster:
@@ -92,6 +95,7 @@ class Caster:
         if sites_m is not None:
             met = met[reachable(world.triangles_m[met], roi, sites_m, range_m)]
         met = met[_along_curve(triangles[met].mean(axis=1))]
+        self._faces = met
         self._triangles = triangles[met]
         self._planes = _planes(self._triangles)
         self._boxes, self._starts = _boxes(self._triangles)
@@ -116,11 +120,27 @@ class Caster:
         reaches = np.empty(len(directions), dtype=np.bool_)
         rays.can_meet(o, directions * range_m, self._size_m, reaches)
         beam = np.flatnonzero(reaches)
-        d = directions[beam]
-        ranges, doubtful = self.first_hits(o, d, range_m)
+        return self._ended(beam, o, directions[beam], range_m)[0]
+
+    def sweep(self, position_m: tuple[float, float, float], directions: Floats, range_m: float) -> EmptyScan:
+        """Cast every beam, whether or not it can meet the region of interest; as :meth:`scan`, and what is met.
+
+        Beams may leave the region anywhere: for a caster without ``sites_m``.
+        """
+        o = np.asarray(position_m, dtype=np.float64) - self._origin_m
+        scan, met = self._ended(np.arange(len(directions)), o, directions, range_m)
+        face = np.full(len(directions), -1, dtype=np.int64)
+        face[scan.returned] = self._faces[met[scan.returned]]
+        return replace(scan, face=face)
+
+    def _ended(
+        self, beam: NDArray[np.int64], o: Floats, d: Floats, range_m: float
+    ) -> tuple[EmptyScan, NDArray[np.int64]]:
+        """Where some beams end, and what they meet."""
+        ranges, met, doubtful = self._first(o, d, range_m)
         returned = ranges <= range_m
         ends = d * np.where(returned, ranges, range_m)[:, None]
-        return EmptyScan(beam.astype(np.uint32), ends, returned, doubtful)
+        return EmptyScan(beam.astype(np.uint32), ends, returned, doubtful), met
 
     def first_hits(self, o_roi_m: Floats, d: Floats, range_m: float = float("inf")) -> tuple[Floats, int]:
         """Range of each ray's first hit (infinity for none), and how many rays had to be searched in float64.
@@ -128,16 +148,22 @@ class Caster:
         ``o_roi_m`` is the sensor in the ROI's frame, (3,); ``d`` are unit directions (n, 3); hits beyond ``range_m`` do
         not matter.
         """
-        ranges = np.full(len(d), np.inf)
+        ranges, _, count = self._first(o_roi_m, d, range_m)
+        return ranges, count
+
+    def _first(self, o_roi_m: Floats, d: Floats, range_m: float) -> tuple[Floats, NDArray[np.int64], int]:
+        """As :meth:`first_hits`, and which of the kept triangles each ray meets."""
+        ranges, met = np.full(len(d), np.inf), np.full(len(d), -1, dtype=np.int64)
         if self._scene is None or len(d) == 0:
-            return ranges, 0
+            return ranges, met, 0
         start = np.broadcast_to(o_roi_m.astype(np.float32), d.shape)
         nearest = self._scene.run(np.ascontiguousarray(start), d.astype(np.float32))
         proposed = self._owner[nearest]
         doubtful = np.empty(len(d), dtype=np.int64)
-        count = rays.settle(proposed, self._triangles, self._planes, o_roi_m, d, range_m, ranges, doubtful)
-        rays.search(doubtful[:count], self._triangles, self._planes, self._boxes, self._starts, o_roi_m, d, ranges)
-        return ranges, int(count)
+        count = rays.settle(proposed, self._triangles, self._planes, o_roi_m, d, range_m, ranges, met, doubtful)
+        some = doubtful[:count]
+        rays.search(some, self._triangles, self._planes, self._boxes, self._starts, o_roi_m, d, ranges, met)
+        return ranges, met, int(count)
 
 
 def reachable(shapes: Floats, roi: Roi, sites_m: Floats, range_m: float = float("inf")) -> NDArray[np.bool_]:

@@ -113,8 +113,10 @@ class Foliage(TransmitScan[FoliageParameters]):
             )
             on = np.isinf(at_m)
             ends = np.where(on[:, None], scan.ends_m[rows], d[rows] * np.where(on, 0.0, at_m)[:, None])
+            face = None if scan.face is None else np.where(on, scan.face[rows], -1)
             return replace(
                 scan,
+                face=face,
                 beam=scan.beam[rows],
                 ends_m=ends,
                 returned=scan.returned[rows] | ~on,

@@ -1,0 +1,133 @@
+"""A body is closed, touches every face of its box and never leaves it; every vClass gets one."""
+
+from typing import get_args
+
+import numpy as np
+import pytest
+import trimesh
+
+from pipeline import load
+from pipeline.core.errors import InputError
+from pipeline.scenario.validation import BodyKind
+from pipeline.validation.clouds import bodies, surfaces
+
+
+@pytest.mark.parametrize("kind", sorted(bodies.own()))
+class TestOwn:
+    def test_it_touches_every_face_of_its_box_and_never_leaves_it(self, kind):
+        corners = np.concatenate([part.triangles for part in bodies.own()[kind]]).reshape(-1, 3)
+        np.testing.assert_array_equal(corners.min(axis=0), [-0.5] * 3)
+        np.testing.assert_array_equal(corners.max(axis=0), [0.5] * 3)
+
+    def test_each_part_is_closed_convex_and_faces_outwards(self, kind):
+        for part in bodies.own()[kind]:
+            mesh = trimesh.Trimesh(**trimesh.triangles.to_kwargs(part.triangles))
+            assert mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0
+            hull = mesh.convex_hull.volume
+            assert mesh.volume == pytest.approx(hull, rel=0.01)  # sides that lean in are warped a little
+
+    def test_it_is_small_and_one_piece(self, kind):
+        parts = bodies.own()[kind]
+        assert sum(len(part.triangles) for part in parts) <= 300
+        low, high = (np.array([getattr(p.triangles, of)(axis=(0, 1)) for p in parts]) for of in ("min", "max"))
+        joined = ((low[:, None] < high) & (low < high[:, None])).all(axis=2)
+        for _ in parts:
+            joined = joined @ joined
+        assert joined.all()
+
+    def test_its_surfaces_have_a_reflectivity(self, kind):
+        assert {part.surface for part in bodies.own()[kind]} <= set(surfaces.REFLECTIVITY)
+
+
+def test_the_kinds_that_a_scenario_may_name_are_those_that_there_are():
+    assert set(get_args(BodyKind)) == set(bodies.own())
+
+
+@pytest.mark.parametrize(
+    ("vclass", "size_m", "part", "jointed", "kind"),
+    [
+        ("passenger", (4.5, 1.75, 1.5), 0, False, "sedan"),
+        ("passenger", (3.4, 1.48, 1.78), 0, False, "kei"),
+        ("passenger", (3.4, 1.6, 1.5), 0, False, "sedan"),
+        ("passenger", (4.9, 1.9, 2.1), 0, False, "van"),
+        ("taxi", (4.4, 1.7, 1.75), 0, False, "taxi"),
+        ("delivery", (4.9, 1.9, 2.1), 0, False, "van"),
+        ("truck", (7.6, 2.3, 3.0), 0, False, "truck"),
+        ("truck", (3.8, 2.5, 3.8), 0, True, "tractor"),
+        ("trailer", (12.0, 2.5, 3.8), 1, True, "trailer"),
+        ("bus", (10.9, 2.5, 3.1), 0, False, "bus"),
+        ("bus", (7.0, 2.5, 3.1), 1, True, "bus"),
+        ("pedestrian", (0.8, 0.6, 1.73), 0, False, "pedestrian"),
+        ("bicycle", (1.76, 0.6, 1.73), 0, False, "bicycle"),
+        ("custom1", (5.9, 2.0, 2.5), 0, False, "van"),
+        ("custom1", (16.0, 2.5, 3.8), 0, False, "truck"),
+    ],
+)
+def test_which_body_a_box_gets(vclass, size_m, part, jointed, kind):
+    assert bodies.kind_of(vclass, list(size_m), part, jointed) == kind
+
+
+def test_every_vclass_of_the_table_gets_a_body_that_there_is():
+    for vclass in bodies._document()["classes"]:
+        assert bodies.kind_of(vclass, [4.5, 1.8, 1.5]) in bodies.own()
+
+
+def _scenario(mini, name):
+    return load(mini, [f'validation.bodies.truck="{name}"'])
+
+
+def test_a_mesh_of_the_users_is_stretched_to_the_unit_box(mini):
+    mesh = trimesh.creation.icosphere(subdivisions=2)
+    mesh.apply_scale([4.0, 1.0, 2.0])
+    mesh.apply_translation([100.0, -3.0, 7.0])
+    mesh.export(mini / "own.ply")
+    corners = np.concatenate([p.triangles for p in bodies.read(mini / "own.ply", "validation.bodies.truck")])
+    assert corners.shape == (len(mesh.faces), 3, 3)
+    np.testing.assert_array_equal(corners.min(axis=(0, 1)), [-0.5] * 3)
+    np.testing.assert_array_equal(corners.max(axis=(0, 1)), [0.5] * 3)
+    scenario = _scenario(mini, "own.ply")
+    made = bodies.of_scenario(scenario)
+    assert made.kinds == bodies.of_scenario(load(mini)).kinds
+    before = bodies.digests(scenario)
+    mesh.apply_scale([1.0, 1.0, 1.1])
+    mesh.export(mini / "own.ply")
+    assert bodies.digests(scenario) != before and set(before) == {"bodies.toml", "own.ply"}
+
+
+@pytest.mark.parametrize(
+    ("name", "write", "message"),
+    [
+        ("none.ply", None, r"validation\.bodies\.truck = 'none\.ply': no such file"),
+        ("text.ply", lambda p: p.write_text("no mesh"), r"validation\.bodies\.truck: .*text\.ply: cannot be loaded"),
+        (
+            "points.ply",
+            lambda p: trimesh.PointCloud([[0, 0, 0], [1, 1, 1]]).export(p),
+            r"points\.ply: holds no triangles; a closed mesh",
+        ),
+        (
+            "flat.ply",
+            lambda p: trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]).export(p),
+            r"flat\.ply: has no extent along z; a body with length, width and height",
+        ),
+        (
+            "fine.ply",
+            lambda p: trimesh.creation.icosphere(subdivisions=5).export(p),
+            r"fine\.ply: has 20,480 triangles; at most 5,000",
+        ),
+        (
+            "nan.ply",
+            lambda p: trimesh.Trimesh([[0, 0, 0], [1, 0, np.nan], [0, 1, 1]], [[0, 1, 2]], process=False).export(p),
+            r"nan\.ply: a triangle has a corner that is no number",
+        ),
+    ],
+)
+def test_what_is_no_body_is_refused(mini, name, write, message):
+    if write is not None:
+        write(mini / name)
+    with pytest.raises(InputError, match=message):
+        bodies.of_scenario(_scenario(mini, name))
+
+
+def test_an_unknown_kind_of_body_is_refused(mini):
+    with pytest.raises(InputError, match=r"validation\.bodies\.lorry"):
+        load(mini, ['validation.bodies.lorry="own.ply"'])
