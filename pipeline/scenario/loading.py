@@ -112,7 +112,7 @@ def _bases(folder: Path, extends: str, place: str) -> Iterator[Path]:
 
 def from_values(values: dict[str, Any], folder: Path, place: str) -> Scenario:
     """Check a scenario that is at hand as nested values (as ``run.json`` holds it)."""
-    values.setdefault("name", re.sub(r'[\s/\\:*?"<>|]+', "_", folder.resolve().name) or "scenario")
+    values.setdefault("name", re.sub(r'[\s\x00-\x1f\x7f/\\:*?"<>|]+', "_", folder.resolve().name)[:80] or "scenario")
     try:
         scenario = Scenario.of(values)
     except ValidationError as error:

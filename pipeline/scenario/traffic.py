@@ -25,12 +25,17 @@ class VehicleKind(StrictModel):
     )
 
 
+EdgeId = Annotated[str, Field(min_length=1)]
+
+
 class CountModel(StrictModel):
     """Vehicles an hour that were counted on an edge, or on their way from one edge to another."""
 
-    edge: str | None = Field(None, description="Id of an edge of the network; or from_edge and to_edge")
-    from_edge: str | None = Field(None, description="Id of the edge from which vehicles were counted")
-    to_edge: str | None = Field(None, description="Id of the edge to which they drove, at the next junction or beyond")
+    edge: EdgeId | None = Field(None, description="Id of an edge of the network; or from_edge and to_edge")
+    from_edge: EdgeId | None = Field(None, description="Id of the edge from which vehicles were counted")
+    to_edge: EdgeId | None = Field(
+        None, description="Id of the edge to which they drove, at the next junction or beyond"
+    )
     per_hour: float = Field(ge=0, le=1e5, description="Vehicles an hour")
     kind: str = Field("", description="The kind counted; not given: the whole fleet, its kinds by their shares")
 
@@ -216,7 +221,7 @@ class TrafficModel(StrictModel):
 
     @model_validator(mode="after")
     def _periods(self) -> TrafficModel:
-        names = [period.name for period in self.periods]
+        names = [period.name.casefold() for period in self.periods]  # folders that some systems do not tell apart
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"two periods have the same name: {', '.join(twice)}")
         for period in self.periods:
@@ -233,6 +238,16 @@ class TrafficModel(StrictModel):
         names = [kind.name for kind in self.kinds]
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"two kinds have the same name: {', '.join(twice)}")
+        return self
+
+    @model_validator(mode="after")
+    def _counted_once(self) -> TrafficModel:
+        places = [(count.title, count.kind) for count in self.counts]
+        if twice := sorted({place for place in places if places.count(place) > 1}):
+            told = ", ".join(f"{place} ({kind})" if kind else place for place, kind in twice)
+            raise ValueError(f"counts: given twice for {told}; one for each place and kind")
+        if self.counts and not any(count.per_hour for count in self.counts):
+            raise ValueError("counts: no vehicle was counted anywhere; at least one per_hour above 0")
         return self
 
     @model_validator(mode="after")

@@ -16,6 +16,9 @@ Longitude = Annotated[float, Field(ge=-180, le=180)]
 Latitude = Annotated[float, Field(ge=-90, le=90)]
 Point2 = tuple[Coordinate, Coordinate]
 Point3 = tuple[Coordinate, Coordinate, Coordinate]
-NAME_IN_WORDS = "a name without spaces and without any of / \\ : * ? \" < > |, for it may become a folder's"
+NAME_IN_WORDS = (
+    "a name without spaces and without any of / \\ : * ? \" < > |, and not of dots alone, for it may become a folder's"
+)
 """What :data:`Name` asks for; no other kind of text here has a pattern."""
-Name = Annotated[str, Field(min_length=1, pattern=r"^[^\s/\\:*?\"<>|]+$")]
+_IN_NAMES = r"[^\s\x00-\x1f\x7f/\\:*?\"<>|"
+Name = Annotated[str, Field(min_length=1, max_length=80, pattern=rf"^{_IN_NAMES}]*{_IN_NAMES}.]{_IN_NAMES}]*$")]

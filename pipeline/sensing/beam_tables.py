@@ -82,9 +82,15 @@ def read(path: Path) -> BeamTable:
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             rows = csv.DictReader(file, skipinitialspace=True)
-            if missing := [name for name in COLUMNS if name not in (rows.fieldnames or ())]:
-                raise InputError(path, f"has no column {missing[0]}", f"the columns {', '.join(COLUMNS)}")
+            names = list(rows.fieldnames or ())
+            for name in COLUMNS:
+                if (stands := names.count(name)) != 1:
+                    found = f"has {'two columns' if stands else 'no column'} {name}"
+                    raise InputError(path, found, f"the columns {', '.join(COLUMNS)}, with commas between them")
             for number, row in enumerate(rows):
+                if None in row:  # a comma inside a number would move all that follows into other columns
+                    what = f"has {len(names) + len(row[None])} values for {len(names)} columns"
+                    raise InputError(f"{path}: beam {number}", what, "one value a column, with decimal points")
                 elevation_deg, azimuth_deg = (_angle(path, number, name, row[name]) for name in COLUMNS)
                 angles.append((elevation_deg, azimuth_deg))
                 if len(angles) > MOST_BEAMS:

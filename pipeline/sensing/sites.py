@@ -37,6 +37,9 @@ _ANGLES = ("yaw_deg", "pitch_deg", "roll_deg")
 _AIM = ("aim_x_m", "aim_y_m", "aim_z_m")
 _TEXTS = ("sensor", "points", "aim")
 _KNOWN = (*_NEEDED, *_ANGLES, *_AIM, *_TEXTS)
+MOST_CANDIDATES = 100_000
+"""More are a mistake in a spacing or a list: each is a scan of its own."""
+
 _NAME = re.compile(r"[^/\\\x00-\x1f\ud800-\udfff]{1,80}")  # becomes part of file names
 
 
@@ -139,6 +142,7 @@ def of(scenario: Scenario) -> tuple[Site, ...]:
                 found[site.name] = site
         except InputError as error:
             refused.append(error)
+        _check_number(len(found), path, "each combination of place, height and pitch is one")
     if refused:
         raise FindingsError(_alike(refused))
     if not found:
@@ -155,6 +159,16 @@ def of(scenario: Scenario) -> tuple[Site, ...]:
                 f"{scenario.file}: score.keep_visibility", f"no site {name!r}", f"one of {', '.join(found)}, or 'all'"
             )
     return _with_points(tuple(found.values()), scenario)
+
+
+def _check_number(candidates: float, place: object, why: str) -> None:
+    """InputError where there are too many."""
+    if not candidates <= MOST_CANDIDATES:
+        what, right = (
+            f"more than {MOST_CANDIDATES:,} candidates ({why})",
+            "a wider spacing, or fewer heights and pitches",
+        )
+        raise InputError(place, what, right)
 
 
 def _alike(refused: list[InputError]) -> Iterator[Finding]:
@@ -336,8 +350,11 @@ def _feature(place: str, feature: Any, reading: Reading) -> dict[str, Any]:
 def _lattice(rule: SiteGrid) -> Iterator[_Row]:
     axes = []
     for low, high in zip(rule.low_m, rule.high_m, strict=True):
-        count = math.floor((high - low) / rule.spacing_m + 1e-9) + 1
+        steps = (high - low) / rule.spacing_m + 1e-9
+        _check_number(steps, "sites.grid", f"spacing_m = {rule.spacing_m:g}")
+        count = math.floor(steps) + 1
         axes.append([low + i * rule.spacing_m for i in range(count)])
+    _check_number(len(axes[0]) * len(axes[1]), "sites.grid", f"spacing_m = {rule.spacing_m:g}")
     yield from _named("g", [(x, y, rule.heights_m) for y in axes[1] for x in axes[0]], "sites.grid")
 
 
@@ -346,6 +363,7 @@ def _lines(rules: tuple[SiteLine, ...]) -> Iterator[_Row]:
     for rule in rules:
         line = np.asarray(rule.line_m)
         along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+        _check_number(along[-1] / rule.spacing_m, "sites.along", f"spacing_m = {rule.spacing_m:g}")
         where = np.arange(math.floor(along[-1] / rule.spacing_m + 1e-9) + 1) * rule.spacing_m
         xs, ys = np.interp(where, along, line[:, 0]), np.interp(where, along, line[:, 1])
         spots += [(float(x), float(y), rule.heights_m) for x, y in zip(xs, ys, strict=True)]

@@ -155,7 +155,9 @@ def _outlines(shapes: Sequence[Shape]) -> NDArray[Any]:
     import shapely
 
     rings = [shape.shape_m[:, :2] for shape in shapes]
-    outlines: NDArray[Any] = shapely.make_valid(np.array([shapely.Polygon(ring) for ring in rings], dtype=object))
+    polygons = np.array([shapely.Polygon(ring) for ring in rings], dtype=object)
+    # areas alone: GEOS subtracts no collection in which lines stand beside them
+    outlines: NDArray[Any] = shapely.make_valid(polygons, method="structure", keep_collapsed=False)
     return outlines
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import pipeline
@@ -12,10 +13,13 @@ from pipeline.checks import checking
 from pipeline.core.errors import InputError
 from pipeline.core.findings import FindingsError
 from pipeline.stages import check
-from pipeline.traffic import sumo_folder
+from pipeline.traffic import network, sumo_folder
+from pipeline.world.carriageway import Carriageway
 from tests.checks.conftest import LANES, net_xml
 from tests.conftest import collection, feature
 from tests.stages import inputs_of
+
+SCENARIOS = Path(__file__).resolve().parents[2] / "scenarios"
 
 
 def found(folder: Path, *settings: str) -> dict[str, list[str]]:
@@ -378,6 +382,13 @@ def test_counts_at_edges_and_of_kinds_that_are_not_there(street: Path) -> None:
 def test_a_count_on_a_way_that_nobody_can_drive_is_told_before_the_first_stage(street: Path) -> None:
     (told,) = found(street, 'traffic.counts=[{from_edge="east",to_edge="west",per_hour=9}]')["traffic"]
     assert told == "scenario.toml: traffic.counts (east to west): no way leads from 'east' to 'west'"
+
+
+def test_a_junction_whose_walking_areas_are_no_sound_outlines_sorts_out_places() -> None:
+    """Those of the hill, made valid, are areas with lines beside them, which GEOS subtracts from nothing."""
+    roads = Carriageway.of(network.read(SCENARIOS / "hill" / "network.net.xml"))
+    at_m = np.array([[0.0, 0.0], [2.0, -2.0], [15.0, 14.0], [60.0, 12.0]])
+    assert roads.in_junctions(at_m).tolist() == [True, True, False, False]
 
 
 def test_a_file_keeps_all_its_sites(street: Path) -> None:

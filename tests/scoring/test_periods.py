@@ -261,6 +261,14 @@ def test_the_world_frame_counts_where_a_period_alone_is_a_finished_file(
     ("old", "new", "message"),
     [
         ('name = "night"', 'name = "day"', "two periods have the same name: day"),
+        ('name = "night"', 'name = "Day"', "two periods have the same name: day"),
+        (
+            'name = "night"',
+            'name = ".."',
+            r"traffic\.periods\.1\.name: '\.\.'; a name without spaces and / .*not of dots",
+        ),
+        ('name = "night"', f'name = "{"n" * 81}"', r"traffic\.periods\.1\.name: 'n+'; string should have at most 80"),
+        ('name = "night"', 'name = "a\\u0000b"', r"traffic\.periods\.1\.name: 'a.*b'; a name without spaces"),
         ("length_s = 8", "length_s = 8.1", "period 'night': length_s = 8.1 is no whole number of 0.5 s"),
         ("length_s = 8", "length_s = 9", "tpog.blocks = 4 does not divide traffic.frames = 18 of the period 'night'"),
         ("weight = 2.5", "weight = 0", r"traffic\.periods\.0\.weight: 0; input should be greater than 0\n$"),

@@ -210,6 +210,12 @@ def test_scenes_and_sensors_can_be_sent_to_another_process(mini: Path) -> None:
         ("elevation_deg,azimuth_deg\n1\n", r"beam 0: azimuth_deg: None; a number"),
         ("elevation_deg,azimuth_deg\nnan,0\n", r"beam 0: elevation_deg: 'nan'"),
         ("elevation_deg,azimuth_deg\nup,0\n", r"beam 0: elevation_deg: 'up'"),
+        (
+            "elevation_deg,azimuth_deg\n-5,5,3,5\n",
+            "beam 0: has 4 values for 2 columns; one value a column, with decimal",
+        ),
+        ("elevation_deg,azimuth_deg,elevation_deg\n1,2,3\n", "has two columns elevation_deg; "),
+        ("elevation_deg;azimuth_deg\n1;2\n", "has no column elevation_deg; the columns .*, with commas between them"),
     ],
 )
 def test_what_is_wrong_with_a_table_is_said(mini: Path, text: str, message: str) -> None:

@@ -212,3 +212,36 @@ def test_a_line_beside_a_file_is_refused(mini: Path) -> None:
     path.write_text(path.read_text() + "[[sites.along]]\nline_m = [[0, 0], [1, 0]]\nspacing_m = 1\nheights_m = [3]\n")
     with pytest.raises(InputError, match="exactly one of file, grid and along is needed, found file and along"):
         pipeline.load(mini)
+
+
+# --- too many ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        (
+            "grid={low_m=[0,0],high_m=[100,100],spacing_m=1e-6,heights_m=[3]}",
+            r"sites\.grid: more than .*spacing_m = 1e-06",
+        ),
+        (
+            "grid={low_m=[0,0],high_m=[1,1],spacing_m=1e-308,heights_m=[3]}",
+            r"sites\.grid: more than .*spacing_m = 1e-308",
+        ),
+        ("grid={low_m=[0,0],high_m=[400,400],spacing_m=1,heights_m=[3]}", r"sites\.grid: more than 100,000 candidates"),
+        ("along=[{line_m=[[0,0],[100,0]],spacing_m=1e-7,heights_m=[3]}]", r"sites\.along: more than .*a wider spacing"),
+    ],
+)
+def test_a_rule_of_too_many_places_is_refused_at_once(mini: Path, setting: str, message: str) -> None:
+    key, _, rule = setting.partition("=")
+    with pytest.raises(InputError, match=message):
+        sites.of(pipeline.load(mini, [f"sites.{key}={rule}"]))
+
+
+def test_too_many_combinations_are_refused(mini: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sites, "MOST_CANDIDATES", 5)
+    rule = "sites.grid={low_m=[0,0],high_m=[1,0],spacing_m=1,heights_m=[3,4,5]}"
+    with pytest.raises(
+        InputError, match=r"more than 5 candidates \(each combination of place, height and pitch is one\)"
+    ):
+        sites.of(pipeline.load(mini, [rule]))

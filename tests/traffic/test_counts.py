@@ -156,6 +156,12 @@ def test_ways_over_a_place_are_no_detours(town):
         ([{"to_edge": "b", "per_hour": 1}], r"either edge, or both from_edge and to_edge are needed"),
         ([{"from_edge": "b", "to_edge": "b", "per_hour": 1}], r"from_edge and to_edge are both 'b'"),
         ([{"edge": "a", "per_hour": -1}], r"per_hour"),
+        ([{"edge": "", "per_hour": 1}], r"counts\.0\.edge: ''; string should have at least 1 character"),
+        (
+            [{"edge": "a", "per_hour": 1}, {"edge": "a", "per_hour": 9}],
+            r"counts: given twice for a; one for each place",
+        ),
+        ([{"edge": "a", "per_hour": 0}], r"counts: no vehicle was counted anywhere; at least one per_hour above 0"),
     ],
 )
 def test_a_wrong_count_is_named(cross, tmp_path, rows, message):
