@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from pipeline.studies.comparison import Row
     from pipeline.studies.seeds import Seeds
 
+_ENDLESS = 1e8
+"""Nobody simulates so many frames."""
+
 
 def print_study(study: AccuracyStudy, command: str) -> None:
     """What the study found: two tables, what was left out, the recommendation (``command`` and what it takes)."""
@@ -37,8 +40,8 @@ def print_study(study: AccuracyStudy, command: str) -> None:
     if study.seeds is not None:
         _print_seeds(out, study.seeds)
     for better, worse, chance, frames in study.neighbours[:3]:
-        known = math.isfinite(frames)
-        enough = f"about {frames:,.0f} frames tell them apart" if known else "no traffic would tell them apart"
+        known = f"about {frames:,.0f} frames tell them apart"
+        enough = known if frames < _ENDLESS else "no traffic that one could simulate would tell them apart"
         out.print(f"{better} above {worse}: chance {chance:.0%}; {enough}")
     out.print(_recommendation(study, command))
     for path in study.files:

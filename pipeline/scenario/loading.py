@@ -147,8 +147,22 @@ def _lay_over(values: dict[str, Any], override: str) -> dict[str, Any]:
         values = _making_way(values, {words[0]: {words[1]: value}})
     top = values
     for parent in parents:
-        values = values.setdefault(parent, {})
-        if not isinstance(values, dict):
+        values = _row_of(values, parent, override) if isinstance(values, list) else values.setdefault(parent, {})
+        if not isinstance(values, dict | list):
             raise InputError(f"--set {override}", f"'{parent}' is not a table", "a key that the scenario knows")
+    if isinstance(values, list):
+        raise InputError(f"--set {override}", f"{last!r} is a row, not a key", f"{key.strip()}.KEY=VALUE")
     values[last] = value
     return top
+
+
+def _row_of(rows: list[Any], wanted: str, override: str) -> Any:
+    """A row of a list of tables, by its name, else by its number from 0."""
+    for row in rows:
+        if isinstance(row, dict) and row.get("name") == wanted:
+            return row
+    if wanted.isdecimal() and int(wanted) < len(rows):
+        return rows[int(wanted)]
+    names = [str(row["name"]) for row in rows if isinstance(row, dict) and "name" in row]
+    right = f"one of {', '.join(names)}, or a number from 0" if names else f"a number from 0 to {len(rows) - 1}"
+    raise InputError(f"--set {override}", f"no row {wanted!r}", right)

@@ -26,7 +26,7 @@ from pipeline.runs.locking import alone
 from pipeline.runs.stages import RANKING
 from pipeline.runs.workflow import refresh_report
 from pipeline.scenario.models import Scenario
-from pipeline.studies import comparison, pareto_figure
+from pipeline.studies import comparison, lengths, pareto_figure
 from pipeline.studies import variants as study_settings
 from pipeline.studies.comparison import Row
 from pipeline.studies.measuring import SettingListener, SettingRunner, SettingScores, inputs_of
@@ -122,12 +122,12 @@ def study(
 
 
 def _check(scenario: Scenario, seeds: int) -> None:
-    if seeds and scenario.traffic.fcd is not None:
+    if seeds and lengths.is_finished(scenario):
         found = "the traffic is a finished file, the same for each seed"
         raise InputError("--seeds", found, "network or sumocfg in [traffic]")
     if seeds == 1:
         raise InputError("--seeds", "1", "at least 2")
-    if scenario.traffic.fcd is None and scenario.tpog.blocks == 1:
+    if not lengths.is_finished(scenario) and scenario.tpog.blocks == 1:
         found = "1, so that nothing tells how far a score may be off"
         raise InputError(f"{scenario.file}: tpog.blocks", found, "10, or another divisor of traffic.frames")
 
@@ -166,7 +166,7 @@ class _Work:
         settings = [s for s in settings if not longest or _is_shorter(runner, s, longest[0])]
         compared = self._run_all([*longest, *settings])
         repeated = self._repeat(compared)
-        could_last_longer = scenario.traffic.fcd is None
+        could_last_longer = not lengths.is_finished(scenario)
         rows = [comparison.compare(runner, s, scores, could_last_longer=could_last_longer) for s in compared]
         rows = comparison.judge(rows, tolerance)
         best = next((row for row in rows if row.recommended), None)
@@ -258,12 +258,12 @@ def _is_shorter(runner: SettingRunner, setting: Setting, longest: Setting) -> bo
 
 
 def _watched_s(scenario: Scenario) -> float:
-    return study_settings.counted_frames(scenario) * scenario.traffic.frame_period_s
+    return lengths.counted_frames(scenario) * scenario.traffic.frame_period_s
 
 
 def _times(runner: SettingRunner, scenario: Scenario, own: SettingScores, budget_s: float) -> int:
     """How long the reference watches: a power of two that fits a share of the budget; as before in a repeated study."""
-    if scenario.traffic.fcd is not None:
+    if lengths.is_finished(scenario):
         return 1
     kept = runner.note("study")
     if (kept.get("scenario"), kept.get("budget_s")) == (own.stages, budget_s):
@@ -290,7 +290,7 @@ class _Expected:
         other, own, took = self._runner.scenario(setting), self._scenario, self._took
         finer = own.roi.voxel_m / other.roi.voxel_m
         stepped = _steps(other) / _steps(own) if _traffic(other) != _traffic(own) else 0.0
-        frames, own_frames = (study_settings.counted_frames(scenario) for scenario in (other, own))
+        frames, own_frames = (lengths.counted_frames(scenario) for scenario in (other, own))
         watched = frames / own_frames * max(1.0, finer**3)
         counted = watched if stepped or finer != 1.0 else 0.0
         cast = 1.0 if other.sensors != own.sensors or other.effects != own.effects else 0.0

@@ -47,6 +47,7 @@ from pipeline.stages.base import Workspace
 from pipeline.stages.score import ScoredSite
 from pipeline.stages.shared.scans import scans
 from pipeline.stages.shared.scene import scene_of, site_digests
+from pipeline.studies.lengths import counted_frames
 from pipeline.studies.variants import Setting
 
 SettingListener = Callable[[str, str, dict[str, Any]], None]
@@ -321,7 +322,7 @@ def _scores(work: Workspace, keys: dict[str, str], weight: float, scored: list[S
     normal = Estimate.of(left_out / np.where(limits > 0, limits, 1.0), leave_out.groups)
     return SettingScores(
         names, shares.tolist(), normal.se.tolist(), scores.tolist(), raw.se.tolist(), raw.bias.tolist(),
-        raw.quantile(), _neighbours(raw, names, tpog.frames), keys,
+        raw.quantile(), _neighbours(raw, names, counted_frames(work.scenario)), keys,
     )  # fmt: skip
 
 

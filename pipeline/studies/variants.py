@@ -30,7 +30,7 @@ from pipeline.scenario.traffic import FRAMES as FRAMES_OF_A_SCENARIO
 from pipeline.scenario.traffic import TrafficModel
 from pipeline.sensing import sites
 from pipeline.sensing.sensors import Sensor, of_scenario
-from pipeline.traffic.finished.survey import recorded_frames
+from pipeline.studies import lengths
 
 APPROXIMATES, MEASURES, REFERENCE, SCENARIO = "approximates", "measures", "reference", "scenario"
 WITHOUT, WITH = "without ", "with "
@@ -86,21 +86,15 @@ OWN = Setting(SCENARIO, SCENARIO, "")
 
 def reference(scenario: Scenario, times: int) -> Setting:
     """The scenario with its traffic watched for ``times`` as long."""
-    frames = counted_frames(scenario) * times
-    return Setting(REFERENCE, REFERENCE, "frames", (f"traffic.frames={frames}",) if times > 1 else ())
-
-
-def counted_frames(scenario: Scenario) -> int:
-    """Frames that the TPOG counts: as the scenario says, or the whole blocks of a finished file."""
-    frames = recorded_frames(scenario)
-    return frames - frames % scenario.tpog.blocks
+    _, overrides = lengths.watched(scenario, times, scenario.traffic.frame_period_s)
+    return Setting(REFERENCE, REFERENCE, "frames", overrides if times > 1 else ())
 
 
 def is_default(scenario: Scenario, own: Scenario) -> bool:
     """Whether traffic is watched as a scenario that says nothing about it has it, and all else is as in ``own``."""
     defaults = {key: TrafficModel.model_fields[key].default for key in ("frame_period_s", "step_s")}
     defaults["frames"] = FRAMES_OF_A_SCENARIO
-    return own.traffic.fcd is None and scenario == own.model_copy(
+    return not lengths.is_finished(own) and scenario == own.model_copy(
         update={"traffic": own.traffic.model_copy(update=defaults)}
     )
 
@@ -116,13 +110,14 @@ def settings(scenario: Scenario) -> list[Setting]:
 
 def _watched(scenario: Scenario) -> Iterator[Setting]:
     """How long and how finely traffic is watched."""
-    own, blocks, own_frames = scenario.traffic, scenario.tpog.blocks, counted_frames(scenario)
-    for frames in FRAMES:
-        if frames < own_frames and frames % blocks == 0:
-            yield Setting(f"{frames} frames", APPROXIMATES, "frames", (f"traffic.frames={frames}",))
+    own, own_frames = scenario.traffic, lengths.counted_frames(scenario)
+    for few in FRAMES:
+        frames, overrides = lengths.watched(scenario, few / own_frames, own.frame_period_s)
+        if 0 < frames < own_frames and (frames == few or own.periods):
+            yield Setting(f"{frames} frames", APPROXIMATES, "frames", overrides)
     for period_s in PERIODS_S:
         yield from _traffic(scenario, "period", 1, None, period_s)
-    if own.fcd is not None:
+    if lengths.is_finished(scenario):
         return
     for step_s in STEPS_S:
         yield from _traffic(scenario, "step", 1, step_s, _period_with(step_s, own.frame_period_s))
@@ -144,14 +139,13 @@ def _traffic(
     scenario: Scenario, knob: str, times: int, step_s: float | None, period_s: float | None
 ) -> Iterator[Setting]:
     """Traffic ``times`` as long as the scenario's, so stepped and watched; nothing where times do not divide."""
-    own, blocks, own_frames = scenario.traffic, scenario.tpog.blocks, counted_frames(scenario)
+    own = scenario.traffic
     step, period = step_s or own.step_s, period_s or own.frame_period_s
-    frames = round(own_frames * own.frame_period_s * times / period / blocks) * blocks
-    if frames == 0 or (own.fcd is None and not (_divides(step, period) and _divides(step, own.warmup_s))):
+    frames, longer = lengths.watched(scenario, times, period)
+    simulated = not lengths.is_finished(scenario)
+    if frames == 0 or (simulated and not (_divides(step, period) and _divides(step, own.warmup_s))):
         return
-    name, overrides = f"{frames} frames", []
-    if frames != own_frames:
-        overrides.append(f"traffic.frames={frames}")
+    name, overrides = f"{frames} frames", list(longer)
     if period != own.frame_period_s:
         name += f" every {period:g} s"
         overrides.append(f"traffic.frame_period_s={float(f'{period:.6g}')}")

@@ -293,6 +293,11 @@ COMMANDS = {
     "no such folder": (["run", "nowhere"], r"nowhere: no scenario.toml there"),
     "--set without value": (["run", "{mini}", "--set", "roi.voxel_m"], r"--set roi.voxel_m: no key=value"),
     "--set unknown": (["run", "{mini}", "--set", "roi.voxel=1"], r"roi.voxel: unknown key; did you mean voxel_m"),
+    "--set of a row that is not there": (
+        ["run", "{mini}", "--set", "traffic.kinds.tram.share=1"],
+        r"--set traffic.kinds.tram.share=1: no row 'tram'; one of car, or a number from 0",
+    ),
+    "--set of a whole row": (["run", "{mini}", "--set", "traffic.kinds.car=1"], r"traffic.kinds.car.KEY=VALUE"),
     "--set through a value": (["run", "{mini}", "--set", "seed.x=1"], r"'seed' is not a table"),
     "--traci without port": (["traffic", "{mini}", "--traci", "here"], r"--traci: 'here'; HOST:PORT"),
     "--cloud unknown": (["scan", "{mini}", "--cloud", "xyz"], r"--cloud: 'xyz'; ply or pcd"),

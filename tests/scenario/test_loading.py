@@ -95,3 +95,10 @@ def test_two_sources_in_one_place_are_refused(tmp_path: Path) -> None:
         extended(tmp_path, '[traffic]\nfcd = "x.csv"\nnetwork = "b.net.xml"\n')
     with pytest.raises(InputError, match="vehicles would act on nothing beside fcd"):
         extended(tmp_path, '[traffic]\nfcd = "x.csv"\nvehicles = 5\n')
+
+
+@pytest.mark.parametrize("row", ["car", "0"])
+def test_a_row_of_a_table_is_set_by_its_name_or_its_number(mini: Path, row: str) -> None:
+    scenario = pipeline.load(mini, [f"traffic.kinds.{row}.length_m=6.5"])
+    assert scenario.traffic.kinds[0].length_m == 6.5
+    assert scenario.traffic.kinds[1:] == pipeline.load(mini).traffic.kinds[1:]
