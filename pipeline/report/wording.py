@@ -37,8 +37,8 @@ def lead(ranking: Ranking) -> str:
     by = f"{behind:.1%}" if behind >= 0.0005 else "less than 0.1%"
     subject, whose = ("It leads", "its") if len(ranking.best) == 1 else ("They lead", "their")
     text = f"{subject} {second.site}, the next, by {by} of {whose} score."
-    if not ranking.best[0].is_separable:
-        text += " With this much traffic the two cannot be told apart."
+    if not ranking.best[-1].is_separable:  # the last of the best is the one beside the next
+        text += " With this much traffic they cannot be told apart."
     if len(ranking.close) > 1:
         names = ", ".join(s.site for s in ranking.close[:4])
         more = f" and {len(ranking.close) - 4} more" if len(ranking.close) > 4 else ""
@@ -48,11 +48,12 @@ def lead(ranking: Ranking) -> str:
 
 def which_to_trust(ranking: Ranking) -> str:
     """What entropy seen says beside the score, and which of the two to trust where they disagree."""
-    top, most = ranking.best[0], max(ranking.sites, key=lambda site: site.entropy_seen)
+    top, most = (max(sites, key=lambda site: site.entropy_seen) for sites in (ranking.best, ranking.sites))
     if ranking.is_tie or not top.egvs > 0:
         return ""
     if most.entropy_seen - top.entropy_seen < 0.0005:
-        return f"It also sees most of the traffic’s uncertainty, {share(top.entropy_seen)}."
+        it = "It" if len(ranking.best) == 1 else top.site
+        return f"{it} also sees most of the traffic’s uncertainty, {share(top.entropy_seen)}."
     return (
         f"{most.site}, rank {most.rank}, sees more of the traffic’s uncertainty ({share(most.entropy_seen)} against "
         f"{share(top.entropy_seen)}), but with fewer beams on it: trust the score, which the ranking follows. A voxel "
