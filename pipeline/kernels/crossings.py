@@ -42,7 +42,7 @@ def crossings(o, d, shape, voxel_m, first, cells, enter_m, leave_m):  # type: ig
 
 @_kernel
 def accumulate(cells, weights, hits):  # type: ignore[no-untyped-def]
-    """Add whole-number weights (k,) int64 to ``hits`` at ``cells``."""
+    """Add whole-number weights (k,) to ``hits`` at ``cells``, flat, of the same dtype: uint32 or int64."""
     for i in range(cells.shape[0]):
         hits[cells[i]] += weights[i]
 

@@ -292,11 +292,11 @@ def tally(hits, cells, classes, gamma, capped, below, seen):  # type: ignore[no-
     Parameters
     ----------
     hits
-        Beams that cross each voxel, (nx * ny * nz,) uint32.
+        Beams that cross each voxel, (nx * ny * nz,) uint32, or int64 in smaller units.
     cells, classes
         Flat index and class of the voxels that matter, (n,) int64 each.
     gamma
-        Cap on the hits of a voxel, float64, may be infinite.
+        Cap on the hits of a voxel, in their unit, float64, may be infinite.
     capped, below, seen
         Added to, (classes,) int64: voxels with at least gamma hits; the hits of all others; voxels with any hit.
     """

@@ -94,7 +94,8 @@ def mounts(place: str, own: Wishes, scenario: Scenario, sensor: Callable[[], Sen
         aimed = None if aim_m is None else angles_to(place, at_m, aim_m, own.roll_deg, sensor())
         for pitch in pitches:
             if pitch == "aim" and aimed is None:
-                raise InputError(f"{place}: pitch_deg", "'aim', but nothing says at what", 'aim = "roi", or aim_m')
+                why = "nothing says at what" if own.yaw_deg is None else f"a yaw_deg of its own, {own.yaw_deg:g}"
+                raise InputError(f"{place}: pitch_deg", f"'aim', but {why}", 'aim = "roi", or aim_m')
             yaw_deg = aimed[0] if aimed else own.yaw_deg if own.yaw_deg is not None else model.yaw_deg or 0.0
             pitch_deg = aimed[1] if pitch == "aim" and aimed else float(pitch)
             mark = _mark(z_m if len(heights_m) > 1 else None, pitch if len(pitches) > 1 else None)

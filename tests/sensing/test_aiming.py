@@ -222,6 +222,11 @@ PLACE = "site,x_m,y_m\np,0,0\n"
         ("site,x_m,y_m,z_m,yaw_deg\np,0,0,6,0\n", {"aim": "roi"}, r"sites\.aim: acts on no site.*yaw_deg or aim from"),
         ("site,x_m,y_m,z_m,pitch_deg\np,0,0,6,0\n", {"pitch_deg": "-10"}, r"sites\.pitch_deg: acts on no site"),
         (ROW, {"pitch_deg": '"aim"'}, r"row p: pitch_deg: 'aim', but nothing says at what; aim = \"roi\", or aim_m"),
+        (
+            "site,x_m,y_m,z_m,yaw_deg\np,0,0,6,30\n",
+            {"aim": "roi", "pitch_deg": '"aim"'},
+            r"row p: pitch_deg: 'aim', but a yaw_deg of its own, 30; aim = ",
+        ),
         (ROW, {"aim_m": "[0, 0, 1]"}, r"row p: aim: \(0, 0, 1\) lies on the plumb line through the sensor; a point be"),
         (ROW, {"aim": "roi", "sensor": "VLP-33"}, r"row p: sensor: unknown sensor 'VLP-33'; did you mean VLP-32C"),
         ("site,x_m,y_m,z_m,aim_x_m\np,0,0,6,5\n", {}, r"row p: aim: one of aim_x_m and aim_y_m is missing; both"),
