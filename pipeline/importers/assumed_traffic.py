@@ -59,7 +59,7 @@ def flows(streets: Streets, roi: Region) -> list[CountModel]:
     for a, i in enumerate(gates_in):
         for b, o in enumerate(gates_out):
             may[a, b] = o in reached[a] and edges[o].to_node != edges[i].from_node
-    rates = balanced(may, [_flow_h(edges[i]) for i in gates_in], [_flow_h(edges[o]) for o in gates_out])
+    rates = balanced(may, [flow_h(edges[i]) for i in gates_in], [flow_h(edges[o]) for o in gates_out])
     return [
         _count(edges[i], edges[o], float(round(rates[a, b])))
         for a, i in enumerate(gates_in)
@@ -98,9 +98,14 @@ def _reached(start: int, after: dict[int, list[int]]) -> set[int]:
     return reached
 
 
-def _flow_h(edge: Edge) -> float:
-    road = edge.type.removeprefix("highway.").removesuffix("_link")
-    return PER_LANE_H.get(road, _OTHER_H) * edge.lanes_for(_CAR)
+def flow_h(edge: Edge) -> float:
+    """Vehicles an hour on all lanes of a street, by the class of its road.
+
+    netconvert calls a street with tracks in it "highway.secondary|railway.tram".
+    """
+    roads = [part.removeprefix("highway.") for part in edge.type.split("|") if part.startswith("highway.")]
+    rates = [PER_LANE_H.get(road.removesuffix("_link"), _OTHER_H) for road in roads]
+    return max(rates, default=_OTHER_H) * edge.lanes_for(_CAR)
 
 
 def _count(start: Edge, end: Edge, per_hour: float) -> CountModel:

@@ -11,6 +11,7 @@ from pipeline.formats.osm import Bounds, Extract, Way
 from pipeline.importers import assumed_traffic, surroundings
 from pipeline.importers import openstreetmap as osm
 from pipeline.scenario import loading
+from pipeline.traffic.network import Edge, Lane, Permission
 
 SMALL = Path(__file__).parent / "data" / "small.osm"
 MIDDLE = (52.0, 10.0)
@@ -81,6 +82,20 @@ def test_flows_are_balanced_by_hand() -> None:
     assert rates.sum(axis=1) == pytest.approx(wanted) and rates.sum(axis=0) == pytest.approx(wanted, rel=1e-3)
     assert np.diag(rates) == pytest.approx(0)
     assert rates[0, 2] > 500 and rates == pytest.approx(rates.T, rel=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("kind", "per_lane_h"),
+    [
+        ("highway.secondary", 200), ("highway.primary_link", 250), ("highway.secondary|railway.tram", 200),
+        ("cycleway.lane|highway.tertiary", 150), ("highway.track", 40), ("railway.tram", 40), ("", 40),
+    ],
+)  # fmt: skip
+def test_the_class_of_a_street_says_how_much_it_carries(kind: str, per_lane_h: float) -> None:
+    """Of its three lanes one is for people on foot."""
+    on_foot, cars = Permission(frozenset({"pedestrian"}), frozenset()), Permission(None, frozenset())
+    lanes = tuple(Lane("0,0 9,0", "lane", None, 9.0, permission) for permission in (on_foot, cars, cars))
+    assert assumed_traffic.flow_h(Edge("e", "", "a", "b", "", lanes, kind)) == 2 * per_lane_h
 
 
 def test_what_comes_in_is_met_even_where_it_cannot_leave_as_wished() -> None:
