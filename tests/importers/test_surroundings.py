@@ -2,10 +2,12 @@
 
 import math
 from pathlib import Path
+from typing import get_type_hints
 
 import numpy as np
 import pytest
 
+from pipeline.cli import app
 from pipeline.core.errors import InputError
 from pipeline.formats.osm import Bounds, Extract, Way
 from pipeline.importers import assumed_traffic, surroundings
@@ -113,6 +115,11 @@ def test_a_smaller_cut_changes_neither_sites_nor_flows(tmp_path: Path) -> None:
     assert flows[0] == flows[1] == flows[2] and len(flows[0]) == 12 and sum(flows[0]) > 500
     assert len({summary.roi for summary in made.values()}) == 1
     assert loading.load(tmp_path / "None").traffic.counts == made[None].flows
+
+
+def test_the_help_names_the_radius_that_is_taken() -> None:
+    (option,) = get_type_hints(app.new, include_extras=True)["surroundings"].__metadata__
+    assert f": {osm.SURROUNDINGS_M:g} by default" in option.help
 
 
 def test_surroundings_that_do_not_hold_the_junction_are_refused(tmp_path: Path) -> None:

@@ -143,6 +143,16 @@ def test_ways_over_a_place_are_no_detours(town):
     assert not ways.may_drive([place.edges[0], place.edges[0]])
 
 
+def test_a_place_that_nothing_leads_to_is_a_way_by_itself(tmp_path):
+    """A web of streets has no fringe; that no trip is to start there keeps no counted vehicle away."""
+    netgenerate(tmp_path, "--spider", "--spider.arm-number", "3", "--spider.circle-number", "1")
+    roads = network.read(tmp_path / "net.xml")
+    ways, edge = Ways(roads, "passenger"), roads.edges[0].id
+    place = ways.place(edge, None, "place")
+    for weights in ({}, {edge: 0.0}):
+        assert ways.candidates([place], drawn(edge_weights=weights), np.random.default_rng(1), "place") == [(edge,)]
+
+
 @pytest.mark.parametrize(
     ("rows", "message"),
     [

@@ -121,10 +121,7 @@ class Ways:
         from_s, before = (values[0] for values in self._fastest([last]))
         sources = _reached(self._sources, to_s, likely, first)
         sinks = _reached(self._sinks, from_s, likely, last)
-        starts, ends = (
-            np.asarray(ids)[np.searchsorted(np.cumsum(share := likely[ids]) / share.sum(), rng.random(_DRAWS))]
-            for ids in (sources, sinks)
-        )
+        starts, ends = (_drawn(ids, likely, rng) for ids in (sources, sinks))
         drawn = list(dict.fromkeys((int(s), int(t)) for s, t in zip(starts, ends, strict=True)))
         direct_s = self._direct_s(drawn)
         inner_s = sum(self._network.edges[i].seconds for i in place.indices[1:])
@@ -150,6 +147,13 @@ class Ways:
 def _reached(ends: Ints, seconds: Floats, likely: Floats, itself: int) -> list[int]:
     """Those of the fringe that are joined to a place and likely at all; the place itself where there is none."""
     return [int(i) for i in ends if np.isfinite(seconds[i]) and likely[i] > 0] or [itself]
+
+
+def _drawn(ends: Sequence[int], likely: Floats, rng: np.random.Generator) -> Ints:
+    """Ends by how likely they are; the place itself is taken even where no trip is to start or end."""
+    share = likely[ends] if likely[ends].any() else np.ones(len(ends))
+    drawn: Ints = np.asarray(ends)[np.searchsorted(np.cumsum(share) / share.sum(), rng.random(_DRAWS))]
+    return drawn
 
 
 def _walk(onward: Ints, start: int, end: int) -> list[int]:
