@@ -4,6 +4,8 @@ Evidence: processes whose memory is known, a plain twin of the sums, and the sca
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -59,6 +61,21 @@ def test_what_does_not_vary_or_alternates_has_no_memory(series: np.ndarray) -> N
 def test_errors_are_never_narrowed_and_long_records_are_left_alone(lasts: float, frames: int, groups: int) -> None:
     assert memory.widening(lasts, frames, groups) >= 1.0
     assert memory.widening(lasts, int(1000 * lasts * groups), groups) < 1.01
+
+
+@pytest.mark.parametrize(("lasts", "frames", "groups"), [(50, 1000, 10), (50, 2000, 4), (200, 1000, 4), (5, 1000, 10)])
+def test_widening_is_what_the_covariance_itself_says(
+    lasts: float, frames: int, groups: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a series that keeps a share of itself from frame to frame: the variance of its mean, and the scatter of the
+    means of groups that is to be expected, entry by entry of the covariance matrix."""
+    monkeypatch.setattr(memory, "upper", lambda memory, frames: memory)
+    at = np.arange(frames)
+    covariance = ((lasts - 1.0) / (lasts + 1.0)) ** np.abs(at[:, None] - at[None, :])
+    of_groups = covariance.reshape(groups, frames // groups, groups, frames // groups).mean(axis=(1, 3))
+    scatter = (np.trace(of_groups) - of_groups.sum() / groups) / (groups - 1) / groups
+    needed = math.sqrt(covariance.mean() / scatter)
+    assert memory.widening(lasts, frames, groups) == pytest.approx(needed, rel=1e-3)
 
 
 def test_groups_are_long_beside_the_memory_where_the_record_allows() -> None:
