@@ -183,7 +183,9 @@ def _grown(spare, needed):  # type: ignore[no-untyped-def]
     if needed <= spare.shape[0]:
         return spare
     larger = np.empty((2 * needed, 4), np.int64)
-    larger[: spare.shape[0]] = spare
+    for n in range(spare.shape[0]):  # an assignment of slices would take longer to compile than all the rest
+        for k in range(4):
+            larger[n, k] = spare[n, k]
     return larger
 
 

@@ -62,7 +62,8 @@ def planes(triangles, normals, found):  # type: ignore[no-untyped-def]
     """
     for m in range(triangles.shape[0]):
         n, a = normals[m], triangles[m, 0]
-        found[m, 0, :3], found[m, 0, 3] = n, n[0] * a[0] + n[1] * a[1] + n[2] * a[2]
+        own = found[m, 0]
+        own[0], own[1], own[2], own[3] = n[0], n[1], n[2], n[0] * a[0] + n[1] * a[1] + n[2] * a[2]
         for i in range(3):
             a, b = triangles[m, i], triangles[m, (i + 1) % 3]
             x, y, z = b[0] - a[0], b[1] - a[1], b[2] - a[2]

@@ -540,6 +540,7 @@ def test_the_accuracy_study_is_shown_where_there_is_one(mini, tmp_path, egvs, mo
     case."""
     monkeypatch.setattr(study_settings, "VOXELS_M", (1.0,))
     monkeypatch.setattr(study_settings, "GAMMAS", (2.0,))
+    monkeypatch.setattr(study_settings, "_others", lambda _: iter(()))
     monkeypatch.setattr(accuracy, "REPEATS", 1)
     own = comparison.judge
 
