@@ -33,7 +33,15 @@ from typing import TYPE_CHECKING, Any
 from pipeline.core.version import __version__
 
 if TYPE_CHECKING:
-    from pipeline.artefacts.readers import Tpog, read_scans, read_scores, read_tpog, read_trajectories, read_visibility
+    from pipeline.artefacts.readers import (
+        Tpog,
+        read_scans,
+        read_scores,
+        read_scores_by_period,
+        read_tpog,
+        read_trajectories,
+        read_visibility,
+    )
     from pipeline.core.errors import EgvsError, InputError, RunError
     from pipeline.effects.scene_building import build_scene
     from pipeline.runs.workflow import run, verify
@@ -63,6 +71,7 @@ _HOME = {
     "load": "scenario.loading",
     "read_scans": "artefacts.readers",
     "read_scores": "artefacts.readers",
+    "read_scores_by_period": "artefacts.readers",
     "read_tpog": "artefacts.readers",
     "read_trajectories": "artefacts.readers",
     "read_visibility": "artefacts.readers",
@@ -89,6 +98,7 @@ __all__ = [
     "load",
     "read_scans",
     "read_scores",
+    "read_scores_by_period",
     "read_tpog",
     "read_trajectories",
     "read_visibility",

@@ -150,6 +150,10 @@ USES = {
     "load": "load('mini').name == 'mini'",
     "read_scans": "len(read_scans('run/scans.parquet').to_pandas())",
     "read_scores": "list(read_scores('run/scores.parquet').to_pandas().site) == ['pole_a', 'pole_b']",
+    "read_scores_by_period": "from pipeline import load, run; "
+    'halves = \'[{name="a",length_s=12},{name="b",begin_s=12,length_s=8}]\'; '
+    "run(load('mini', ['traffic.periods=' + halves]), 'split'); "
+    "read_scores_by_period('split/scores_by_period.parquet').to_pandas().period.nunique() == 2",
     "read_tpog": "read_tpog('run/tpog.parquet').p.max() > 0",
     "read_trajectories": "len(read_trajectories('run/trajectories.parquet').to_pandas()) == 80",
     "read_visibility": "read_visibility('run/visibility.parquet', 'pole_a').sum() > 0",
