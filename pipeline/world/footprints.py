@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from shapely import Polygon
     from shapely.geometry.base import BaseGeometry
 
+CROSSED = "rings that cross themselves, each part that they enclose kept"
 _SLIVERS = 0.01  # of an area
 _QUARTER_SIDES = 4  # a disc is a regular polygon of four times as many sides
 
@@ -132,10 +133,16 @@ def _metres(properties: dict[str, Any], key: str, place: str, default: float | N
 
 
 def polygons_of(
-    geometry: Any, properties: dict[str, Any], place: str, mended: Counter[str], reading: Reading = IN_WORLD
+    geometry: Any,
+    properties: dict[str, Any],
+    place: str,
+    mended: Counter[str],
+    reading: Reading = IN_WORLD,
+    *,
+    mends_crossings: bool = False,
 ) -> list[Polygon]:
     """The polygons of one feature, in the world frame: lines and points buffered, dirt mended, multi-part geometries
-    taken apart."""
+    taken apart. Rings that cross themselves are refused, unless what comes from a map is to be taken as it is."""
     import shapely
 
     shape_place = f"{place}: geometry"
@@ -166,7 +173,7 @@ def polygons_of(
         raise InputError(shape_place, f"is a {shape.geom_type}", "a Polygon, LineString or Point, or their Multi forms")
     parts = [
         p
-        for p in shapely.get_parts(_sound(shape, shape_place, mended, reading.convert is not None))
+        for p in shapely.get_parts(_sound(shape, shape_place, mended, reading.convert is not None, mends_crossings))
         if "Polygon" in p.geom_type
     ]
     if not parts:
@@ -195,18 +202,25 @@ def _barely_crosses(shape: BaseGeometry) -> bool:
     return bool(abs(whole_m2 - shape.area) <= _SLIVERS * whole_m2)
 
 
-def _sound(shape: BaseGeometry, place: str, mended: Counter[str], may_be_rounded: bool) -> BaseGeometry:
+def _sound(shape: BaseGeometry, place: str, mended: Counter[str], may_be_rounded: bool, mends: bool) -> BaseGeometry:
     """Mend what has one meaning only (doubled points, rings that touch themselves, or that cross where degrees were
-    rounded); refuse what has two."""
+    rounded); what has two is refused, or ``mends`` keeps each part that is enclosed."""
     import shapely
 
     if not shapely.is_valid(shape):
         reason = shapely.is_valid_reason(shape)
         touches = reason.startswith("Ring Self-intersection")
-        if not touches and not (may_be_rounded and _barely_crosses(shape)):
+        rounded = may_be_rounded and _barely_crosses(shape)
+        if not (touches or rounded or mends):
             raise InputError(place, f"is not a sound polygon ({reason})", "rings that do not cross, holes inside")
         shape = shapely.make_valid(shape)
-        mended["rings that touched themselves" if touches else "rings that rounded degrees made cross"] += 1
+        mended[
+            "rings that touched themselves"
+            if touches
+            else "rings that rounded degrees made cross"
+            if rounded
+            else CROSSED
+        ] += 1
     clean = shapely.remove_repeated_points(shape)
     if doubled := len(shapely.get_coordinates(shape)) - len(shapely.get_coordinates(clean)):
         mended["doubled points"] += doubled

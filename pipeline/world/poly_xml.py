@@ -26,7 +26,7 @@ from pipeline.formats import safe_xml
 from pipeline.formats.crs import WGS84
 from pipeline.formats.georeference import Georeference, Reading
 from pipeline.traffic.network import location_of
-from pipeline.world.footprints import Footprint, FootprintFile, polygons_of
+from pipeline.world.footprints import CROSSED, Footprint, FootprintFile, polygons_of
 from pipeline.world.mapped_heights import extent_of, is_underground
 from pipeline.world.solid_types import TRUNK_RADIUS_M, SolidType, SolidTypes
 from pipeline.world.world_frame import located
@@ -58,6 +58,7 @@ class _Reader:
         self._readings = _readings(path, world)
         self._file = FootprintFile()
         self._unknown, self._open, self._polygons = Counter[str](), Counter[str](), 0
+        self._crossed: list[str] = []
         self._inner: list[Polygon] = []
         self._white: list[Footprint] = []
         self._seen = set[tuple[bytes, float, float]]()
@@ -132,8 +133,17 @@ class _Reader:
         return reading
 
     def _areas(self, place: str, points: list[tuple[float, float]], element: Element) -> list[Polygon]:
+        """What an outline encloses, each part where it crosses itself; nothing where it is flat."""
+        mended, kind = self._file.mended, element.get("type", "")
+        if np.isfinite(points).all() and shapely.make_valid(Polygon(points)).area == 0:
+            self._leave_out("outlines that enclose nothing", kind)
+            return []
         ring = {"type": "Polygon", "coordinates": [points if points[0] == points[-1] else [*points, points[0]]]}
-        return polygons_of(ring, {}, place, self._file.mended, self._reading(place, points, _is_geo(element)))
+        reading, before = self._reading(place, points, _is_geo(element)), mended[CROSSED]
+        areas = polygons_of(ring, {}, place, mended, reading, mends_crossings=True)
+        if mended[CROSSED] > before:
+            self._crossed.append(place.rpartition(" ")[2])
+        return areas
 
     def _strips(
         self, place: str, points: list[tuple[float, float]], element: Element, half_width_m: float
@@ -180,6 +190,14 @@ class _Reader:
             found = f"outlines of type {_listed(self._open)} are not closed: left out"
             cure = "close them; those of polyconvert that come in several ways are joined by --osm.merge-relations 1"
             file.warnings.append(Finding("open outlines", place, found, cure))
+        if self._crossed:
+            shown = ", ".join(self._crossed[:_SHOWN]) + (", ..." if self._crossed[_SHOWN:] else "")
+            found = (
+                f"outlines that cross themselves: {len(self._crossed)} ({shown}); each part that they enclose is kept"
+            )
+            file.warnings.append(
+                Finding("crossing outlines", place, found, "look at them on the map, and mend it there")
+            )
         if self._polygons and not file.footprints:
             found = f"none of its {self._polygons} polygons is solid"
             cure = "name the types that are in [statics.polygon_types], or leave the file out of statics.polygons"

@@ -135,8 +135,17 @@ def test_a_file_without_anything_solid_is_warned_of(tmp_path: Path) -> None:
 
 def test_a_shape_that_is_not_solid_need_not_be_sound(tmp_path: Path) -> None:
     assert not read(tmp_path, poly("landuse", "0,0 4,4 4,0 0,4"), poly("landuse", "")).footprints
-    with pytest.raises(InputError, match=r"poly x: geometry: is not a sound polygon \(Self-intersection"):
-        read(tmp_path, poly("building", "0,0 4,4 4,0 0,4"))
+
+
+def test_an_outline_that_crosses_itself_stops_no_file(tmp_path: Path) -> None:
+    """A bow tie: two triangles of 4 m2 that meet at (2, 2). What encloses nothing is left out."""
+    square = poly("building", "10,0 14,0 14,4 10,4")
+    file = read(tmp_path, poly("building", "0,0 4,4 4,0 0,4"), poly("building", "0,0 4,0 8,0"), square)
+    assert [footprint.polygon.area for footprint in file.footprints] == [4.0, 4.0, 16.0]
+    assert file.mended["rings that cross themselves, each part that they enclose kept"] == 1
+    assert file.left_out["outlines that enclose nothing of type building"] == 1
+    (warning,) = file.warnings
+    assert warning.found == "outlines that cross themselves: 1 (x); each part that they enclose is kept"
 
 
 # ---- the user's own table

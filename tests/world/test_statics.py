@@ -179,11 +179,13 @@ def test_poly_xml(tmp_path):
     world, counts = static_world.build(load(tmp_path, polygons=["s.poly.xml"]))
     assert volumes(world) == pytest.approx([48], rel=1e-12)
     assert sum(counts.left_out.values()) == 2
-    for name in "bd":
-        shape = f'<poly id="x" type="building" fill="1" shape="{shapes[name]}"/>'
-        (tmp_path / "s.poly.xml").write_text(f"<additional>{shape}</additional>")
-        with pytest.raises(InputError, match="poly x"):
-            static_world.build(load(tmp_path, polygons=["s.poly.xml"]))
+    crossed, broken = (f'<poly id="x" type="building" fill="1" shape="{shapes[name]}"/>' for name in "bd")
+    (tmp_path / "s.poly.xml").write_text(f"<additional>{crossed}</additional>")
+    world, counts = static_world.build(load(tmp_path, polygons=["s.poly.xml"]))
+    assert volumes(world) == pytest.approx([4 * 9, 4 * 9], rel=1e-12)
+    (tmp_path / "s.poly.xml").write_text(f"<additional>{broken}</additional>")
+    with pytest.raises(InputError, match="poly x"):
+        static_world.build(load(tmp_path, polygons=["s.poly.xml"]))
 
 
 BOX = trimesh.creation.box((4, 6, 8))
