@@ -146,6 +146,18 @@ def fetch_or_make(
     return entry.made, True
 
 
+def bring(work: Workspace, *names: str) -> dict[str, str]:
+    """The artefacts of some stages, in their order, into a workspace that is no run's folder: from the store, else
+    made, and kept there. Returns their keys."""
+    keys = {}
+    for name in names:
+        inputs = stage_keys.inputs(name, work)
+        read = inputs.read
+        fetch_or_make(name, work, inputs.key, Store.default(), lambda: stages.make(name, work, read), link=True)  # noqa: B023 - called at once
+        keys[name] = inputs.key
+    return keys
+
+
 @dataclass(frozen=True)
 class _Run:
     """One scenario in one folder."""

@@ -14,9 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.artefacts import tables
 from pipeline.core.progress import Progress, silent
-from pipeline.runs import stage_keys, stages
-from pipeline.runs.store import Store
-from pipeline.runs.workflow import fetch_or_make
+from pipeline.runs.workflow import bring
 from pipeline.scenario.models import Scenario
 from pipeline.sensing.scene import Scene
 from pipeline.stages.base import Workspace
@@ -81,15 +79,8 @@ def prepare(
     unseen = unseen_traffic.scenario_of(scenario, frames)
     folder.mkdir(parents=True, exist_ok=True)
     work = Workspace(unseen, folder, jobs=jobs, progress=progress)
-    keys = {name: _bring(name, work) for name in _STAGES}
+    keys = bring(work, *_STAGES)
     with tables.reader(work.path("trajectories.parquet"), "trajectories") as (_, about):
         recorded = int(about["frames"])
     numbers = unseen_traffic.numbers(unseen, recorded, frames)
     return UnseenRecord(unseen, scene_of(work), work.path("trajectories.parquet"), numbers, keys)
-
-
-def _bring(name: str, work: Workspace) -> str:
-    """A stage's artefacts into the folder, from the store where it has them; its key."""
-    inputs = stage_keys.inputs(name, work)
-    fetch_or_make(name, work, inputs.key, Store.default(), lambda: stages.make(name, work, inputs.read), link=True)
-    return inputs.key

@@ -57,7 +57,7 @@ def scores(folder: Path) -> list[float]:
     return list(pipeline.read_scores(folder / "scores.parquet").column("egvs").to_pylist())
 
 
-@pytest.mark.parametrize("heading", ["An effect", "A format of point clouds"])
+@pytest.mark.parametrize("heading", ["An effect", "A format of point clouds", "A score"])
 def test_the_example_is_short(heading: str) -> None:
     modules = [text for name, text in package(heading).items() if name.endswith(".py")]
     assert len(modules) == 1
@@ -126,3 +126,12 @@ assert dropped == 0 and read.tobytes() == points.tobytes()
 """
     done = processes.python(code, tmp_path / "scan.xyz", beside=beside)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.system
+def test_a_score_of_another_package_is_listed(tmp_path: Path) -> None:
+    beside = install(package("A score"), tmp_path / "installed")
+    code, text = egvs("scores", beside=beside)
+    assert code == 0 and "near_points" in text and "within_m 20, 50" in text and "package egvs-near-points" in text, (
+        text
+    )

@@ -15,7 +15,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import entr
 
 from pipeline.artefacts.readers import Tpog
 from pipeline.kernels.crossings import best_free
@@ -55,15 +54,14 @@ class Occupancy:
         return np.flatnonzero(self.tpog.counts.ravel() > 0)
 
     @cached_property
-    def p(self) -> Floats:
-        """Share of the frames in which each of ``cells`` is occupied, (n,)."""
-        return self.tpog.counts.ravel()[self.cells] / self.tpog.frames
+    def counts(self) -> NDArray[np.int64]:
+        """Frames in which each of ``cells`` is occupied, (n,)."""
+        return self.tpog.counts.ravel()[self.cells]
 
     @cached_property
-    def entropy_nat(self) -> Floats:
-        """Binary entropy of each of ``cells`` in nats, (n,); 0 where p = 1."""
-        entropy: Floats = entr(self.p) + entr(1.0 - self.p)
-        return entropy
+    def p(self) -> Floats:
+        """Share of the frames in which each of ``cells`` is occupied, (n,)."""
+        return self.counts / self.tpog.frames
 
     @cached_property
     def log_free(self) -> Floats:

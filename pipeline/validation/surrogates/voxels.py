@@ -14,6 +14,9 @@ from scipy.special import rel_entr
 from pipeline.validation.surrogates.base import GAMMA, OCCLUSION, VOXEL, Score
 from pipeline.validation.surrogates.evidence import SiteEvidence
 
+NAT = math.log(2.0)
+"""A bit in nats."""
+
 FLOOR = 1e-6
 """The least chance with which a voxel is taken to be observed: without it, one voxel that no beam crosses would make a
 divergence infinite, whatever else is seen."""
@@ -39,8 +42,8 @@ def coverage(evidence: SiteEvidence) -> float:
 
 def expected_visibility(evidence: SiteEvidence) -> float:
     r""":math:`\sum_v p(v) [hits(v) > 0] \,/ \sum_v p(v)`."""
-    p = evidence.occupancy.p
-    return math.fsum(p[evidence.hits > 0]) / math.fsum(p) if len(p) else 0.0
+    counts = evidence.occupancy.counts
+    return int(counts[evidence.hits > 0].sum()) / int(counts.sum()) if len(counts) else 0.0
 
 
 def s_mig(evidence: SiteEvidence) -> float:
@@ -50,8 +53,9 @@ def s_mig(evidence: SiteEvidence) -> float:
     constant this is EGVS with gamma = inf. Its authors maximise it, as information gained, although each further beam
     through an uncertain voxel lowers it.
     """
-    h = evidence.occupancy.entropy_nat
-    return math.fsum(h) - math.fsum(h * evidence.hits)
+    hits, unit = evidence.counted
+    field = evidence.occupancy.field
+    return (field.total_bit - field.score(hits, math.inf, unit).egvs) * NAT
 
 
 def m_sog(evidence: SiteEvidence) -> float:
@@ -60,8 +64,9 @@ def m_sog(evidence: SiteEvidence) -> float:
 
     Of the source's classes two are left, traffic and none.
     """
-    crossed = int(np.count_nonzero(evidence.counted[0]))
-    return -math.fsum(evidence.occupancy.entropy_nat[evidence.hits > 0]) / crossed if crossed else math.nan
+    hits, unit = evidence.counted
+    crossed = int(np.count_nonzero(hits))
+    return -evidence.occupancy.field.score(hits, 1.0, unit).egvs * NAT / crossed if crossed else math.nan
 
 
 def kl_obs(evidence: SiteEvidence) -> float:
@@ -73,7 +78,8 @@ def kl_obs(evidence: SiteEvidence) -> float:
     """
     p = evidence.occupancy.p
     q = np.minimum(np.maximum(p * np.exp(evidence.log_reach), FLOOR), p)
-    return math.fsum(rel_entr(p, q) + rel_entr(1.0 - p, 1.0 - q)) / len(p) if len(p) else 0.0
+    each = rel_entr(p, q) + rel_entr(1.0 - p, 1.0 - q)
+    return math.fsum(each.tolist()) / len(p) if len(p) else 0.0
 
 
 EGVS = Score(

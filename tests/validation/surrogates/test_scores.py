@@ -83,11 +83,12 @@ def test_s_mig_is_total_entropy_less_that_of_each_beam_s_voxels():
     assert value("s_mig", evidence(hits=(0, 0, 0))) == pytest.approx((H_QUARTER + 1.0) * LN2)
 
 
-def test_s_mig_is_egvs_without_a_cap_turned_round():
-    for hits in ((1, 5, 3), (0, 2, 9), (4, 0, 0)):
-        total = (H_QUARTER + 1.0) * LN2
-        uncapped = value("egvs", evidence(hits=hits), gamma=math.inf) * LN2
-        assert value("s_mig", evidence(hits=hits)) == pytest.approx(total - uncapped)
+def test_s_mig_counts_a_voxel_once_for_each_beam():
+    h = {1: H_QUARTER * LN2, 2: LN2}  # of the second and the third voxel
+    for beams in ([[0, 1, 2], [1]], [[2], [2], [2], [1]], [[0]]):  # the voxels that each crosses
+        hits = [sum(v in crossed for crossed in beams) for v in range(3)]
+        left = sum(h.values()) - sum(h.get(v, 0.0) for crossed in beams for v in crossed)
+        assert value("s_mig", evidence(hits=hits)) == pytest.approx(left)
 
 
 def test_m_sog_is_the_mean_over_crossed_voxels_with_traffic_or_without():
@@ -171,9 +172,11 @@ def test_perception_entropy():
     # none: AP = 0.001, sigma = 999
     sigmas = [0.341 / 0.659, 0.001 / 0.999, 999.0]
     right = sum(2 * math.log(s) + 1 + math.log(2 * math.pi) for s in sigmas) / 3
-    assert value("perception_entropy", evidence(alone=(1.0, math.exp(10), 0.0))) == pytest.approx(right)
+    points = (1.0, math.exp(10), 0.0)
+    assert value("perception_entropy", evidence(alone=points), in_traffic=False) == pytest.approx(right)
+    assert value("perception_entropy", evidence(seen=points), in_traffic=True) == pytest.approx(right)
     # less than a point is expected: AP = 0.152 ln(0.01) + 0.659 = -0.041, held at 0.001
-    assert value("perception_entropy", evidence(alone=(0.01,))) == pytest.approx(
+    assert value("perception_entropy", evidence(alone=(0.01,)), in_traffic=False) == pytest.approx(
         2 * math.log(999.0) + 1 + math.log(2 * math.pi)
     )
 
@@ -199,7 +202,7 @@ def test_points_on_target():
     ],
 )
 def test_without_traffic_and_without_beams_values_are_told_and_nothing_warns(name, nothing_there, nothing_seen):
-    parameters = {"gamma": 10.0} if name == "egvs" else {}
+    parameters = {"egvs": {"gamma": 10.0}, "perception_entropy": {"in_traffic": True}}.get(name, {})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         empty = value(name, evidence(counts=(0, 0, 0)), **parameters)

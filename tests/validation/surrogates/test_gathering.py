@@ -1,0 +1,154 @@
+"""All scores of all sites of a scenario: from stages and store, the same at any number of threads."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pipeline
+from pipeline.artefacts import tables
+from pipeline.core.errors import InputError, MissingBackendError, RunError
+from pipeline.scoring.visibility import Beams
+from pipeline.sensing.scanner import Scanner
+from pipeline.validation import frames
+from pipeline.validation.surrogates import registry
+from pipeline.validation.surrogates.gathering import surrogates_of
+from pipeline.validation.surrogates.vehicles import points_on_vehicles
+from tests.conftest import write_mini
+from tests.core.test_plugins import install, site  # noqa: F401  the fixture
+from tests.docs.test_extending import package
+
+GAMMAS = (1, 2, 4, 5, 10, 20, math.inf)  # 4 is the scenario's own
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A scenario, the folder where it was worked, and its scores."""
+    folder = tmp_path_factory.mktemp("scores")
+    scenario = pipeline.load(write_mini(folder / "mini"))
+    return scenario, folder / "work", surrogates_of(scenario, folder / "work", jobs=1)
+
+
+def values(found, score, **parameters):
+    """Of each site, of the rows with these parameters."""
+    rows = [row for row in found.rows if row.score == score and dict(row.parameters) == parameters]
+    return {row.site: row.value for row in rows}
+
+
+def test_there_is_a_row_for_each_site_score_and_choice_of_parameters(made):
+    scenario, _, found = made
+    tried = [(row.site, row.score, row.parameters_json) for row in found.rows]
+    assert len(set(tried)) == len(tried) == 2 * (len(GAMMAS) * 3 * 2 + 11)
+    assert list(dict.fromkeys(row.site for row in found.rows)) == ["pole_a", "pole_b"]
+    assert list(dict.fromkeys(row.score for row in found.rows)) == registry.names()
+    gammas = {row.parameters["gamma"] for row in found.rows if row.score == "egvs"}
+    assert gammas == set(GAMMAS) and found.skipped == () and scenario.score.gamma == 4
+    assert all(row.seconds >= 0 and math.isfinite(row.value) for row in found.rows)
+
+
+@pytest.mark.parametrize(
+    ("settings", "parameters"),
+    [
+        ([], {"gamma": 4.0, "voxel_m": 0.5, "moving_occlusion": False}),
+        (["roi.voxel_m=0.25", "score.gamma=inf"], {"gamma": math.inf, "voxel_m": 0.25, "moving_occlusion": False}),
+        (["effects.moving_occlusion={}"], {"gamma": 4.0, "voxel_m": 0.5, "moving_occlusion": True}),
+    ],
+)
+def test_egvs_is_what_a_run_scores_to_the_last_bit(made, tmp_path, settings, parameters):
+    scenario, _, found = made
+    pipeline.run(pipeline.load(scenario.folder, settings), tmp_path / "run")
+    table = pipeline.read_scores(tmp_path / "run" / "scores.parquet").to_pydict()
+    assert values(found, "egvs", **parameters) == dict(zip(table["site"], table["egvs"], strict=True))
+    if not settings:
+        assert values(found, "entropy_seen") == dict(zip(table["site"], table["entropy_seen"], strict=True))
+
+
+def test_points_are_those_of_the_record_that_the_tpog_was_counted_from(made):
+    scenario, work, found = made
+    record = list(frames.read(work / "trajectories.parquet", np.arange(40)))  # all of them: fewer than 250
+    scene = pipeline.build_scene(scenario)
+    for one in scene.sites:
+        beams = Beams.of(Scanner(scene).scan_site(one))
+        points = points_on_vehicles(record, scenario.roi.grid, beams)
+        mean = float(np.log1p(points.seen).mean())
+        assert points.seen.sum() > 0 and values(found, "points_on_target")[one.name] == pytest.approx(mean)
+
+
+def test_the_file_has_the_same_bytes_at_any_number_of_threads(made, tmp_path):
+    scenario, _, found = made
+    again = surrogates_of(scenario, tmp_path / "work", jobs=3)
+    for number, one in enumerate((found, again)):
+        one.write(tmp_path / f"{number}.parquet", scenario)
+    assert (tmp_path / "0.parquet").read_bytes() == (tmp_path / "1.parquet").read_bytes()
+    table, about = tables.read(tmp_path / "0.parquet", "surrogates")
+    assert about["inputs"] == found.inputs and len(table) == len(found.rows)
+    row = json.loads(table.column("parameters")[0].as_py())
+    assert row == {"gamma": 1.0, "moving_occlusion": False, "voxel_m": 0.25}
+    assert '"gamma":"inf"' in "".join(table.column("parameters").to_pylist())
+    assert set(found.costs_ms()) == set(registry.names())
+
+
+def test_voxels_that_do_not_fit_are_left_out_and_told(made, tmp_path):
+    scenario, _, _ = made
+    narrow = pipeline.load(scenario.folder, ["roi.size_m=[40, 20, 4.5]"])
+    found = surrogates_of(narrow, tmp_path / "work", ["egvs", "coverage"], jobs=1)
+    assert {row.parameters.get("voxel_m", 0.5) for row in found.rows} == {0.25, 0.5}
+    (told,) = found.skipped
+    assert "scores with voxels of 1 m are left out" in told.place and "4.5 m along z" in told.found
+
+
+def test_an_unknown_score_is_named(made, tmp_path):
+    with pytest.raises(InputError, match="unknown score 'egsv'; one of egvs, entropy_seen"):
+        surrogates_of(made[0], tmp_path, ["egsv"])
+
+
+def test_a_score_of_another_package_is_computed_beside_the_others(made, tmp_path, site: Path) -> None:  # noqa: F811
+    (source,) = (text for name, text in package("A score").items() if name.endswith(".py"))
+    install(site, "near-points", "near_points = plug_near:NEAR_POINTS", {"plug_near": source}, registry.GROUP)
+    scenario, _, _ = made
+    found = surrogates_of(scenario, tmp_path / "work", ["near_points"], jobs=1)
+    tried = {(row.site, row.parameters["within_m"]): row.value for row in found.rows}
+    assert len(tried) == 4 and all(0 < tried[s, 20.0] < tried[s, 50.0] for s in ("pole_a", "pole_b"))
+    assert "near_points" in registry.names()
+
+
+WRONG = "from pipeline.validation.surrogates.base import Score\nS = Score('wrong', 'f', 's', 1, lambda e: {})\n"
+
+
+@pytest.mark.parametrize(
+    ("source", "problem"),
+    [
+        ("S = dict", "it has no name, formula, source, sign, function; right is a Score"),
+        (WRONG + "from types import SimpleNamespace\nS = SimpleNamespace(**vars(S))", "it is no score; right is a"),
+        (WRONG.replace("'wrong'", "'good'"), "its name is 'good'; right is 'wrong', as its entry point has it"),
+        (WRONG.replace("1,", "2,"), "its sign is 2; right is 1 where more is better, or -1"),
+        (WRONG.replace("{})", "0.0, ('hits',))"), "it needs 'hits'; right are counted, log_reach, returns, vehicles"),
+        (WRONG.replace("{})", "0.0, (), {'a': ()})"), "its sweep of a has no value; right is one at least"),
+        ("import no_such_library", "No module named 'no_such_library'"),
+    ],
+)
+def test_what_is_no_score_is_refused_by_name_and_listed_as_broken(site: Path, source, problem):  # noqa: F811
+    install(site, "somebody-elses", "wrong = plug_wrong:S", {"plug_wrong": source}, registry.GROUP)
+    with pytest.raises(MissingBackendError, match=rf"^'wrong' of egvs\.scores cannot be loaded: {problem}"):
+        registry.score("wrong")
+    (entry,) = (entry for entry in registry.catalogue() if entry.name == "wrong")
+    assert entry.score is None and entry.package == "somebody-elses" and problem in entry.problem
+
+
+def test_one_that_nobody_named_and_that_cannot_be_loaded_is_left_out_and_told(made, tmp_path, site: Path):  # noqa: F811
+    install(site, "somebody-elses", "wrong = plug_wrong:S", {"plug_wrong": "raise RuntimeError"}, registry.GROUP)
+    scenario, work, found = made
+    again = surrogates_of(scenario, work, jobs=1)
+    assert [str(told).split(":")[0] for told in again.skipped] == ["score wrong is left out"]
+    assert [(row.site, row.score, row.value) for row in again.rows] == [(r.site, r.score, r.value) for r in found.rows]
+
+
+@pytest.mark.parametrize("given", ["'much'", "None", "[1.0]"])
+def test_a_score_that_gives_no_number_is_named(made, tmp_path, site: Path, given):  # noqa: F811
+    install(site, "somebody-elses", "wrong = plug_wrong:S", {"plug_wrong": WRONG.replace("{}", given)}, registry.GROUP)
+    with pytest.raises(RunError, match=r"score wrong: gives .* for the site pole_a; right is a number, or NaN"):
+        surrogates_of(made[0], tmp_path / "work", ["wrong"], jobs=1)
