@@ -152,9 +152,9 @@ def _surest(overlap, wanted, n, m, least, taken, scored):  # type: ignore[no-unt
 
 @_kernel
 def match_frames(  # type: ignore[no-untyped-def]
-    object_start, found_start, pair_start, overlap, wanted, score, least, scored, true_step, false_step
+    object_start, found_start, pair_start, overlap, wanted, least, scored, true_step, false_step
 ):
-    """Match the detections of every frame to its objects, at every threshold on the score.
+    """Match the detections of every frame, descending in score, to its objects, at every threshold on the score.
 
     Parameters
     ----------
@@ -162,15 +162,13 @@ def match_frames(  # type: ignore[no-untyped-def]
         As for :func:`overlap_frames`; of the overlaps one row, (pairs,).
     wanted
         Whether each object counts, (n,) bool; one that does not takes a detection out of the count.
-    score
-        Of the detections, (m,) float64, descending in each frame.
     least
         The overlap that a match must exceed.
     scored
         Filled: whether the first pass gives a detection to an object that counts, (m,) bool.
     true_step, false_step
-        Filled: by how much more true and false positives there are once the threshold falls to a detection's score,
-        (m,) int64; of equal scores in a frame the last has it.
+        Filled: how many more true and false positives there are once a detection is let in, after those before it in
+        its frame, (m,) int64. Of equal scores the sum counts.
     """
     most = 0
     for f in range(found_start.shape[0] - 1):
@@ -181,18 +179,16 @@ def match_frames(  # type: ignore[no-untyped-def]
         n = object_start[f + 1] - object_start[f]
         its, counts = overlap[pair_start[f] : pair_start[f + 1]], wanted[object_start[f] : object_start[f + 1]]
         _surest(its, counts, n, m, least, taken, scored[first : first + m])
-        true, false, fits, new = 0, 0, False, 0
+        true, false = 0, 0
         for j in range(m):
-            new += 1
+            fits = False
             for i in range(n):
                 fits = fits or its[i * m + j] > least + EXCEED
-            if j + 1 < m and score[first + j + 1] == score[first + j]:
-                continue
-            more_true, more_false = true, false + new  # what fits nothing changes no match
+            more_true, more_false = true, false + 1  # what fits nothing changes no match
             if fits:
                 more_true, more_false = _claim(its, counts, n, m, j + 1, least, taken)
             true_step[first + j], false_step[first + j] = more_true - true, more_false - false
-            true, false, fits, new = more_true, more_false, False, 0
+            true, false = more_true, more_false
 
 
 @_kernel

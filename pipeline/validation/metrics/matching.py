@@ -76,7 +76,8 @@ class Matches:
     scored
         Bool: taken in the first pass by an object that counts.
     true_step, false_step
-        Int64: how many more true and false positives there are in the frame once the threshold falls to this score.
+        Int64: how many more true and false positives there are in the frame once this detection is let in, after those
+        before it; of equal scores the sum counts.
     """
 
     scored: NDArray[np.bool_]
@@ -149,7 +150,6 @@ class Record:
             *self._starts,
             self._overlap[VIEWS.index(view)],
             wanted,
-            self.scores,
             iou,
             found.scored,
             found.true_step,

@@ -88,12 +88,15 @@ class Study:
 
     def __init__(self, junctions: Sequence[Junction], seed: int, resamples: int = RESAMPLES) -> None:
         self.junctions, self.seed, self.resamples = tuple(junctions), seed, resamples
+        self._kind: Kind | None = None
         self._draws: dict[tuple[str, bytes], Draws] = {}
         self._scores: dict[tuple[str, bytes, Kind, str], Form] = {}
         self._measure: dict[tuple[str, bytes, Kind], tuple[str, Form]] = {}  # the last one alone: forms are large
 
     def correlation(self, score: str, measure: str, kind: Kind) -> Correlation:
-        """How well a score goes with a measure. Quickest when all scores are asked for one measure, then the next."""
+        """How well a score goes with a measure.
+
+        Quickest when all scores are asked for one measure, then the next, and one kind after the other."""
         return self._compare([score], measure, kind)
 
     def difference(self, first: str, second: str, measure: str, kind: Kind) -> Correlation:
@@ -130,6 +133,10 @@ class Study:
     ) -> NDArray[np.float64]:
         """The coefficient of one junction in every resample, (resamples,)."""
         place = junction.name, known.tobytes(), kind
+        if kind != self._kind:  # forms of one kind are enough to hold
+            self._kind = kind
+            self._scores.clear()
+            self._measure.clear()
         if (key := (*place, score)) not in self._scores:
             values = self._draws_of(junction, known).of_score(junction.scores[score][known])
             self._scores[key] = Form.of(values, kind)

@@ -112,6 +112,8 @@ def test_an_overlap_must_exceed_the_bound():
         assert values(one_frame(objects([A]), (other, 0.9)), iou=50) == [0, 0, 0]
     assert values(one_frame(objects([A]), (box(1.33), 0.9)), iou=50) == [1, 1, 1]
     assert values(one_frame(objects([A]), (box(1.33), 0.9)), iou=70) == [0, 0, 0]
+    # Nor does it give a threshold: the only one is .5, and there 1 of 2 is true.
+    assert values(one_frame(objects([A]), (box(0.0, length=2.0), 0.9), (A, 0.5)), iou=50) == [0.5, 0.5, 1]
 
 
 def test_height_counts_in_space_alone():
@@ -248,6 +250,17 @@ def test_the_order_in_which_things_are_given_has_no_say():
     other = evaluate(Record.of([shuffled(its) for its in truth], [shuffled(its) for its in detections]))
     for name, its in plain.measures.items():
         assert (its.value, its.se) == (other.measures[name].value, other.measures[name].se), name
+
+
+@pytest.mark.parametrize("turned", [[0, 1], [1, 0]])
+@pytest.mark.parametrize("swapped", [[0, 1], [1, 0]])
+def test_who_comes_first_among_equals(turned, swapped):
+    """Objects at 0 and 1. The box at .5 overlaps both by 3.5 / 4.5; the one at -1 overlaps the object at 0 alone, by
+    3 / 5, and has the same score. First pass: the object at 0 takes the box at -1, which comes first, and that at 1 the other:
+    thresholds for all steps. Second pass: the object at 0 takes the box that fits best, and nothing is left: 1 of 2."""
+    scored, truth = [(box(-1.0), 0.9), (box(0.5), 0.9)], [box(0.0), box(1.0)]
+    evaluation = one_frame(objects([truth[k] for k in turned]), *(scored[k] for k in swapped))
+    assert values(evaluation, iou=50) == [0.5, 0.5, 0.5]
 
 
 def test_scores_matter_by_their_order_alone():
