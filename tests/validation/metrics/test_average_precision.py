@@ -256,8 +256,9 @@ def test_the_order_in_which_things_are_given_has_no_say():
 @pytest.mark.parametrize("swapped", [[0, 1], [1, 0]])
 def test_who_comes_first_among_equals(turned, swapped):
     """Objects at 0 and 1. The box at .5 overlaps both by 3.5 / 4.5; the one at -1 overlaps the object at 0 alone, by
-    3 / 5, and has the same score. First pass: the object at 0 takes the box at -1, which comes first, and that at 1 the other:
-    thresholds for all steps. Second pass: the object at 0 takes the box that fits best, and nothing is left: 1 of 2."""
+    3 / 5, and has the same score. First pass: the object at 0 takes the box at -1, which comes first, and that at 1 the
+    other: thresholds for all steps. Second pass: the object at 0 takes the box that fits best, and nothing is left: 1
+    of 2."""
     scored, truth = [(box(-1.0), 0.9), (box(0.5), 0.9)], [box(0.0), box(1.0)]
     evaluation = one_frame(objects([truth[k] for k in turned]), *(scored[k] for k in swapped))
     assert values(evaluation, iou=50) == [0.5, 0.5, 0.5]
