@@ -7,8 +7,8 @@ beam is brought into that box by the affine map that takes the vehicle's box the
 1. Beams lie in cells of azimuth and elevation, one degree wide. The cells that a box may cover follow from its
    footprint and its heights; a beam of another cell cannot meet it.
 2. A beam that misses the box is left out, then the parts whose own boxes it misses.
-3. The triangles of the other parts are met by Moeller and Trumbore (1997, "Fast, Minimum Storage Ray/Triangle
-   Intersection").
+3. The triangles of the other parts that face the sensor are met as Moeller and Trumbore do (1997, "Fast, Minimum
+   Storage Ray/Triangle Intersection"); what does not depend on the beam is worked out once a body.
 
 A point up to ``SLACK`` (1e-9 of the triangle's sides) outside a triangle is on it, so that no beam slips between two of
 them; a triangle seen at a sine below ``GRAZE`` in the unit box is not met, the one beside it is.
@@ -30,6 +30,8 @@ COLUMNS, ROWS = 360, 180
 
 _PAD = 1e-9
 """Boxes and cells are taken wider by this (of their size; radians)."""
+
+_LARGEST = 1e200  # stands for 1 / 0: times a length it is larger than any range
 
 _kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
 _inlined = numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -78,39 +80,77 @@ def _covered(c, axes, half):  # type: ignore[no-untyped-def]
 
 
 @_inlined
-def _crossed(box, ox, oy, oz, dx, dy, dz, most):  # type: ignore[no-untyped-def]
-    """Whether a ray crosses a box (low and high corner, (6,)) before ``most``."""
-    first, last = 0.0, most
-    for a in range(3):
-        o, d = (ox, dx) if a == 0 else (oy, dy) if a == 1 else (oz, dz)
-        if d == 0.0:
-            if o < box[a] or o > box[3 + a]:
-                return False
-        else:
-            t0, t1 = (box[a] - o) / d, (box[3 + a] - o) / d
-            first, last = max(first, min(t0, t1)), min(last, max(t0, t1))
-    return first <= last
+def _inverse(x):  # type: ignore[no-untyped-def]
+    return 1.0 / x if abs(x) > 1.0 / _LARGEST else _LARGEST
 
 
 @_inlined
-def _met(triangle, ox, oy, oz, dx, dy, dz, least):  # type: ignore[no-untyped-def]
-    """Range at which a ray meets a triangle (corner, two sides from it; (3, 3)), infinity when it does not."""
-    ax, ay, az = triangle[1, 0], triangle[1, 1], triangle[1, 2]
-    bx, by, bz = triangle[2, 0], triangle[2, 1], triangle[2, 2]
-    px, py, pz = dy * bz - dz * by, dz * bx - dx * bz, dx * by - dy * bx
-    det = ax * px + ay * py + az * pz
-    if abs(det) < least:
-        return np.inf
-    sx, sy, sz = ox - triangle[0, 0], oy - triangle[0, 1], oz - triangle[0, 2]
-    u = (sx * px + sy * py + sz * pz) / det
-    if u < -SLACK or u > 1.0 + SLACK:
-        return np.inf
-    qx, qy, qz = sy * az - sz * ay, sz * ax - sx * az, sx * ay - sy * ax
-    v = (dx * qx + dy * qy + dz * qz) / det
-    if v < -SLACK or u + v > 1.0 + SLACK:
-        return np.inf
-    t = (bx * qx + by * qy + bz * qz) / det
-    return t if t > 0.0 else np.inf
+def _crossed(box, per_x, per_y, per_z, most):  # type: ignore[no-untyped-def]
+    """Whether a ray crosses a box before ``most``: its low and high corner (6,) seen from the start, and what 1 is
+    divided by along each axis."""
+    x0, x1 = box[0] * per_x, box[3] * per_x
+    y0, y1 = box[1] * per_y, box[4] * per_y
+    z0, z1 = box[2] * per_z, box[5] * per_z
+    first = max(max(min(x0, x1), min(y0, y1)), max(min(z0, z1), 0.0))
+    return first <= min(min(max(x0, x1), max(y0, y1)), min(max(z0, z1), most))
+
+
+@_kernel
+def _prepare(kind, o, shapes, boxes, firsts, seen, which):  # type: ignore[no-untyped-def]
+    """Fill what all beams of one sensor ask of a body, o (3,) being the sensor in the unit box.
+
+    With a triangle's corner a and sides e, f from it, s = o - a and n = e x f, a ray o + t d meets its plane at
+    t = (s n) / (-d n), at the share d (f x s) / (-d n) along e and d (s x e) / (-d n) along f. What does not hold d is
+    the same for all beams: ``seen`` (m, 11) holds -n, f x s, s x e, s n and the smallest (-d n) that is no grazing, all
+    with the sign that makes s n positive. Of a closed part, the sides that face away are left out.
+
+    ``boxes`` are the parts' boxes seen from the sensor; triangles firsts[p] to firsts[p + 1] of ``seen`` are those of
+    the kind's part p, and ``which`` says which ones they are.
+    """
+    part_starts, part_boxes, closed, triangle_starts, triangles, crosses, _ = shapes
+    count, low = 0, part_starts[kind]
+    for part in range(low, part_starts[kind + 1]):
+        for a in range(3):
+            boxes[part - low, a], boxes[part - low, 3 + a] = part_boxes[part, a] - o[a], part_boxes[part, 3 + a] - o[a]
+        firsts[part - low] = count
+        for m in range(triangle_starts[part], triangle_starts[part + 1]):
+            a, e, f = triangles[m, 0], triangles[m, 1], triangles[m, 2]
+            x, y, z = o[0] - a[0], o[1] - a[1], o[2] - a[2]
+            nx, ny, nz = e[1] * f[2] - e[2] * f[1], e[2] * f[0] - e[0] * f[2], e[0] * f[1] - e[1] * f[0]
+            away = x * nx + y * ny + z * nz
+            if away == 0.0 or (away < 0.0 and closed[part]):
+                continue
+            sign = 1.0 if away > 0.0 else -1.0
+            row = seen[count]
+            row[0], row[1], row[2] = -sign * nx, -sign * ny, -sign * nz
+            row[3], row[4], row[5] = f[1] * z - f[2] * y, f[2] * x - f[0] * z, f[0] * y - f[1] * x
+            row[6], row[7], row[8] = y * e[2] - z * e[1], z * e[0] - x * e[2], x * e[1] - y * e[0]
+            for k in range(3, 9):
+                row[k] *= sign
+            row[9], row[10], which[count] = abs(away), GRAZE * crosses[m], m
+            count += 1
+    firsts[part_starts[kind + 1] - low] = count
+
+
+@_inlined
+def _nearest(parts, boxes, firsts, seen, dx, dy, dz, most):  # type: ignore[no-untyped-def]
+    """Range at which a ray meets a prepared body before ``most``, and the row of ``seen`` (-1 for none)."""
+    per_x, per_y, per_z = _inverse(dx), _inverse(dy), _inverse(dz)
+    length, nearest = math.sqrt(dx * dx + dy * dy + dz * dz), -1
+    for part in range(parts):
+        if not _crossed(boxes[part], per_x, per_y, per_z, most):
+            continue
+        for i in range(firsts[part], firsts[part + 1]):
+            row = seen[i]
+            det = dx * row[0] + dy * row[1] + dz * row[2]
+            if det <= row[10] * length or row[9] >= most * det:
+                continue
+            u = dx * row[3] + dy * row[4] + dz * row[5]
+            v = dx * row[6] + dy * row[7] + dz * row[8]
+            slack = SLACK * det
+            if u >= -slack and v >= -slack and u + v <= det + slack:
+                most, nearest = row[9] / det, i
+    return most, nearest
 
 
 @_inlined
@@ -138,30 +178,34 @@ def cast(d, row, starts, boxes, kinds, shapes, ranges, sent, owner):  # type: ig
     kinds
         The shape of each box's body, (b,) int64.
     shapes
-        Where each shape's parts start (shapes + 1,) int64; boxes of parts (p, 6); where each part's triangles start
-        (p + 1,) int64; triangles as a corner and two sides from it (m, 3, 3), length of each cross product (m,) and
-        reflectivity (m,), in the unit box, float64.
+        Where each shape's parts start (shapes + 1,) int64; boxes of parts (p, 6) float64, and whether each is closed
+        and faces outwards (p,) bool; where each part's triangles start (p + 1,) int64; triangles as a corner and two
+        sides from it (m, 3, 3), length of each cross product (m,) and reflectivity (m,), in the unit box, float64.
     ranges, sent, owner
         Of each row: range of the nearest surface so far (float64; nothing is nearer than a negative one), reflectivity
         times the cosine of the angle of incidence (float64), and the box that it lies on (int32); changed where a body
         is nearer.
     """
-    part_starts, part_boxes, triangle_starts, triangles, crosses, reflectivity = shapes
-    axes, half, c, size = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
-    whole = np.array([-0.5, -0.5, -0.5, 0.5, 0.5, 0.5]) * (1.0 + 2.0 * _PAD)
+    part_starts, _, _, triangle_starts, triangles, _, reflectivity = shapes
+    axes, half, c, o = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
+    room = 0
+    for kind in range(part_starts.shape[0] - 1):
+        room = max(room, triangle_starts[part_starts[kind + 1]] - triangle_starts[part_starts[kind]])
+    parts_m, firsts = np.empty((part_starts[-1], 6)), np.empty(part_starts[-1] + 1, np.int64)
+    seen, which, whole = np.empty((room, 11)), np.empty(room, np.int64), np.empty(6)
     for b in range(boxes.shape[0]):
         axes_of(boxes[b, 6], boxes[b, 7], axes)
-        inside = True
+        size, holds = boxes[b, 3:6], True
         for a in range(3):
-            c[a], size[a], half[a] = boxes[b, a], boxes[b, 3 + a], 0.5 * boxes[b, 3 + a]
-        o = np.empty(3)
+            c[a], half[a] = boxes[b, a], 0.5 * size[a]
         for a in range(3):
             o[a] = -(c[0] * axes[a, 0] + c[1] * axes[a, 1] + c[2] * axes[a, 2]) / size[a]
-            inside = inside and abs(o[a]) <= 0.5
-        if inside:
+            holds = holds and abs(o[a]) <= 0.5
+            whole[a], whole[3 + a] = -0.5 - _PAD - o[a], 0.5 + _PAD - o[a]
+        if holds:
             continue
-        ox, oy, oz = o[0], o[1], o[2]
         first_row, last_row, first_column, columns = _covered(c, axes, half)
+        parts, prepared = part_starts[kinds[b] + 1] - part_starts[kinds[b]], False
         for line in range(first_row, last_row + 1):
             for piece in range(2):  # a box that lies across azimuth 180 has two
                 low = first_column if piece == 0 else 0
@@ -169,24 +213,19 @@ def cast(d, row, starts, boxes, kinds, shapes, ranges, sent, owner):  # type: ig
                 if high <= low:
                     continue
                 for n in range(starts[line * COLUMNS + low], starts[line * COLUMNS + high]):
-                    best = ranges[row[n]]
                     fx = d[n, 0] * axes[0, 0] + d[n, 1] * axes[0, 1] + d[n, 2] * axes[0, 2]
                     fy = d[n, 0] * axes[1, 0] + d[n, 1] * axes[1, 1] + d[n, 2] * axes[1, 2]
                     fz = d[n, 0] * axes[2, 0] + d[n, 1] * axes[2, 1] + d[n, 2] * axes[2, 2]
                     dx, dy, dz = fx / size[0], fy / size[1], fz / size[2]
-                    if not _crossed(whole, ox, oy, oz, dx, dy, dz, best):
+                    if not _crossed(whole, _inverse(dx), _inverse(dy), _inverse(dz), ranges[row[n]]):
                         continue
-                    graze, nearest = GRAZE * math.sqrt(dx * dx + dy * dy + dz * dz), -1
-                    for part in range(part_starts[kinds[b]], part_starts[kinds[b] + 1]):
-                        if not _crossed(part_boxes[part], ox, oy, oz, dx, dy, dz, best):
-                            continue
-                        for m in range(triangle_starts[part], triangle_starts[part + 1]):
-                            t = _met(triangles[m], ox, oy, oz, dx, dy, dz, graze * crosses[m])
-                            if t < best:
-                                best, nearest = t, m
+                    if not prepared:
+                        _prepare(kinds[b], o, shapes, parts_m, firsts, seen, which)
+                        prepared = True
+                    best, nearest = _nearest(parts, parts_m, firsts, seen, dx, dy, dz, ranges[row[n]])
                     if nearest >= 0:
-                        ranges[row[n]], owner[row[n]] = best, b
-                        sent[row[n]] = reflectivity[nearest] * _cosine(triangles[nearest], size, fx, fy, fz)
+                        ranges[row[n]], owner[row[n]], m = best, b, which[nearest]
+                        sent[row[n]] = reflectivity[m] * _cosine(triangles[m], size, fx, fy, fz)
 
 
 @_kernel

@@ -49,10 +49,12 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class Part:
-    """A closed piece of a body, or some triangles of a user's mesh: corners (m, 3, 3) in the unit box round zero."""
+    """A piece of a body that is closed and faces outwards, or some triangles of a user's mesh: corners (m, 3, 3) in the
+    unit box round zero."""
 
     triangles: Floats
     surface: str
+    closed: bool = True
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,7 @@ class Bodies:
     """The bodies of all kinds, as :func:`pipeline.kernels.bodies.cast` takes them (``shapes``)."""
 
     kinds: tuple[str, ...]
-    shapes: tuple[NDArray[np.int64], Floats, NDArray[np.int64], Floats, Floats, Floats]
+    shapes: tuple[NDArray[np.int64], Floats, NDArray[np.bool_], NDArray[np.int64], Floats, Floats, Floats]
 
     @classmethod
     def of(cls, parts: Mapping[str, tuple[Part, ...]]) -> Bodies:
@@ -72,10 +74,11 @@ class Bodies:
         crosses = np.sqrt((np.cross(cornered[:, 1], cornered[:, 2]) ** 2).sum(axis=1))
         lengths = [len(part.triangles) for part in every]
         boxes = [np.append(part.triangles.min(axis=(0, 1)), part.triangles.max(axis=(0, 1))) for part in every]
+        closed = np.array([part.closed for part in every])
         pad = np.repeat([-_ROUNDING, _ROUNDING], 3)
         reflectivity = np.repeat([REFLECTIVITY[part.surface] for part in every], lengths)
         starts, ends = (np.cumsum([0, *counts]) for counts in ([len(several) for several in parts.values()], lengths))
-        return cls(tuple(parts), (starts, np.array(boxes) + pad, ends, cornered, crosses, reflectivity))
+        return cls(tuple(parts), (starts, np.array(boxes) + pad, closed, ends, cornered, crosses, reflectivity))
 
     def of_frame(self, frame: TrafficFrame) -> NDArray[np.int64]:
         """The kind of each box of a frame, (n,)."""
@@ -182,7 +185,7 @@ def read(path: Path, place: str) -> tuple[Part, ...]:
         raise InputError(place, f"has no extent along {', '.join(flat)}", "a body with length, width and height")
     unit = np.clip((triangles - low) / (high - low), 0.0, 1.0) - 0.5
     order = np.lexsort(np.floor(unit.mean(axis=1) * 4).T)
-    return tuple(Part(unit[order[i : i + _GROUP]], "paint") for i in range(0, len(order), _GROUP))
+    return tuple(Part(unit[order[i : i + _GROUP]], "paint", closed=False) for i in range(0, len(order), _GROUP))
 
 
 def _parts(entries: list[dict[str, Any]]) -> Iterator[Part]:

@@ -147,7 +147,7 @@ class CloudMaker:
         returned = (hits.owner >= 0) | self._returned
         kept = np.flatnonzero(returned) if rows is None else rows[returned[rows]]
         kept = self._noticed(kept, hits.range_m, random)
-        noise = self.view.sensor.range_sigma_m * random.standard_normal(len(kept))
+        noise = self.view.sensor.range_sigma_m * random.standard_normal(len(kept), dtype=np.float32)
         points = np.empty((len(kept), 4), dtype=np.float32)
         kernels.points(self._beam, kept, hits.range_m, noise, hits.intensity, self._nominal, points)
         return LabelledSweep(Sweep(points, self._beam[kept].astype(np.uint32)), hits.owner[kept])
