@@ -3,9 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
+import trimesh
 from scipy.spatial.transform import Rotation
 
 import pipeline
+from pipeline.scenario.sensors import SensorModel
+from pipeline.sensing import sensors
 from pipeline.sensing.scene import Scene
 from pipeline.validation.clouds import bodies
 from pipeline.validation.frames import TrafficFrame
@@ -74,10 +77,21 @@ def twin(scene, pose, sensor, frame):
     moving, triangle = cast.first_hits(np.zeros(3), directions, corners, edge_m=1e-9)
     in_front = moving < still
     ranges, owner = np.where(in_front, moving, still), np.where(in_front, box[triangle], -1)
-    lost = ranges > sensor.range_m
+    lost = ~(ranges <= sensor.range_m)
     return np.where(lost, np.inf, ranges), np.where(lost, -1, owner)
 
 
 def built(folder, *settings):
     """The scene of a scenario."""
     return pipeline.build_scene(pipeline.load(folder, settings))
+
+
+def own_sensor(**keys):
+    """A sensor from the keys of ``[sensors.own]``, without noise unless said."""
+    return sensors.resolve("own", {"own": SensorModel.of({"range_sigma_m": 0.0, "range_m": 100.0, **keys})}, "test")
+
+
+def cubes(folder, *kinds):
+    """Settings by which these kinds are boxes, so that points on them can be counted by hand."""
+    trimesh.creation.box((2.0, 1.0, 3.0)).export(folder / "cube.ply")
+    return [f'validation.bodies.{kind}="cube.ply"' for kind in kinds]
