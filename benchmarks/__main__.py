@@ -24,7 +24,7 @@ from rich.console import Console
 from rich.table import Table
 
 import pipeline
-from benchmarks import casting, detection, effects, others, savings, stability
+from benchmarks import casting, clouds, detection, effects, others, savings, stability
 from benchmarks.scenes import run_stage
 from pipeline.artefacts.readers import read_tpog
 from pipeline.core.parallel import in_order
@@ -172,6 +172,7 @@ def main() -> None:
         folder = Path(temporary)
         rows, sumo = whole_run(folder)
         rows += occupancy(folder, sumo) + sites(folder) + effects.rows(folder / "run") + detection.rows()
+        rows += clouds.rows(SCENARIO, folder / "run")
     for what, measured, bound, reached in rows:
         table.add_row(what, measured, bound, ("yes" if reached else "NO") if bound else "")
     console = Console(width=140, highlight=False)

@@ -1,8 +1,8 @@
 """Draws the pictures in README and docs.
 
-``make pictures`` runs the shipped scenarios and draws: the map of the README, taken from the report, and for each
-effect what the score (or, where an effect changes traffic, the occupancy) looks like from above before and after, on
-one colour scale.
+``make pictures`` draws the bodies of vehicles, runs the shipped scenarios and draws: the map of the README, taken from
+the report, and for each effect what the score (or, where an effect changes traffic, the occupancy) looks like from
+above before and after, on one colour scale.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 import pipeline
+from benchmarks import bodies_picture
 from pipeline.artefacts.readers import read_scores, read_tpog, read_trajectories
 from pipeline.effects import registry
 from pipeline.effects.on_traffic import SELF_ACTING
@@ -128,6 +129,7 @@ def main() -> None:
     """Draw the picture of the README and those of the effects."""
     assert set(SHOWN) == set(registry.names()) - set(SELF_ACTING)  # the slope cannot be left out where there is one
     (IMAGES / "effects").mkdir(parents=True, exist_ok=True)
+    bodies_picture.draw(IMAGES / "bodies.png")
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         pipeline.run(pipeline.load(ROOT / "scenarios" / "nishishinjuku"), folder / "report")
