@@ -36,7 +36,7 @@ from pipeline.sensing.sites import ScannedSite
 from pipeline.stages.base import StageInputs, Summary, Workspace
 from pipeline.stages.shared import period_scores
 from pipeline.stages.shared.scans import SiteBeams, scans
-from pipeline.stages.shared.scene import SCANS, scan_inputs, scene_of, sensor_digests
+from pipeline.stages.shared.scene import SCANS, scan_inputs, scene_of, sensor_digests, sensor_settings
 from pipeline.world import world_frame
 
 NAME = "score"
@@ -73,7 +73,7 @@ def inputs(work: Workspace) -> StageInputs:
     settings |= world_frame.key(scenario)
     if live:
         settings["effects"] = registry.settings(live)
-        settings["sensors"] = {name: model.model_dump(mode="json") for name, model in scenario.sensors.items()}
+        settings["sensors"] = sensor_settings(scenario)
     hashes = work.digests("tpog.parquet", *(name for effect in live for name in effect.reads))
     if live:
         hashes |= sensor_digests(scenario, scene_of(work).sites)

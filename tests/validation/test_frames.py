@@ -34,6 +34,14 @@ def test_frames_are_read_in_order_and_empty_ones_are_told(tmp_path):
     np.testing.assert_array_equal(read[0].pitch_rad, [0.1])
 
 
+def test_rear_parts_are_told_from_whole_vehicles():
+    boxes = np.zeros((4, 7))
+    whole = frames.TrafficFrame(0, ("a", "b", "b", "c"), ("bus",) * 4, boxes, np.zeros(4))
+    np.testing.assert_array_equal(whole.part, [0, 0, 0, 0])
+    jointed = frames.TrafficFrame(0, ("a", "b", "b", "c"), ("bus",) * 4, boxes, np.zeros(4), np.array([0, 0, 1, 0]))
+    np.testing.assert_array_equal(jointed.several_parts(), [False, True, True, False])
+
+
 def test_ground_truth_are_vehicles_whose_centre_is_in_the_region(tmp_path):
     rows = [(0, "in", "passenger", 0.0), (0, "on the far plane", "bus", 10.0), (0, "on foot", "pedestrian", 5.0)]
     rows += [(0, "before", "truck", -1e-9), (0, "within", "delivery", 10.0 - 1e-9)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from pipeline.core import files
 from pipeline.effects import registry, scene_resolving
@@ -34,7 +35,7 @@ def scan_inputs(work: Workspace) -> StageInputs:
         "roi": [scene.roi.origin_m, scene.roi.size_m],
         "ground": scenario.statics.ground,
         "sites": scenario.sites.model_dump(mode="json"),
-        "sensors": {name: model.model_dump(mode="json") for name, model in scenario.sensors.items()},
+        "sensors": sensor_settings(scenario),
     }
     settings |= world_frame.key(scenario)
     if scenario.crs.zero_height_m:
@@ -46,6 +47,12 @@ def scan_inputs(work: Workspace) -> StageInputs:
     hashes = work.digests(STATICS) | site_digests(scenario, scene.sites)
     readers = {point_clouds.reader_of(Path(s.points), f"site {s.name}: points") for s in scene.sites if s.points}
     return StageInputs(settings, hashes, modules=(*registry.modules(live), *sorted(readers)))
+
+
+def sensor_settings(scenario: Scenario) -> dict[str, Any]:
+    """The scenario's own sensors, by name, but for the noise of their ranges: empty scans and scores have none."""
+    noise = {"range_sigma_m"}
+    return {name: model.model_dump(mode="json", exclude=noise) for name, model in scenario.sensors.items()}
 
 
 def site_digests(scenario: Scenario, sites: Iterable[Site]) -> dict[str, str]:

@@ -8,8 +8,10 @@ import trimesh
 
 from pipeline import load
 from pipeline.core.errors import InputError
+from pipeline.runs import workflow
 from pipeline.scenario.validation import BodyKind
 from pipeline.validation.clouds import bodies, surfaces
+from tests.validation.clouds.scenes import frame_of
 
 
 @pytest.mark.parametrize("kind", sorted(bodies.own()))
@@ -131,3 +133,18 @@ def test_what_is_no_body_is_refused(mini, name, write, message):
 def test_an_unknown_kind_of_body_is_refused(mini):
     with pytest.raises(InputError, match=r"validation\.bodies\.lorry"):
         load(mini, ['validation.bodies.lorry="own.ply"'])
+
+
+def test_an_articulated_truck_is_a_tractor_with_trailers_and_a_bus_stays_a_bus():
+    rows = [(0.0, 0.0, 1.5, 5.0, 2.5, 3.0, 0.0, 0.0)] * 5
+    frame = frame_of(rows, ["trailer"] * 2 + ["bus"] * 2 + ["truck"], vehicles="aabbc", part=[0, 1, 0, 1, 0])
+    made = bodies.Bodies.of(bodies.own())
+    assert [made.kinds[k] for k in made.of_frame(frame)] == ["tractor", "trailer", "bus", "bus", "truck"]
+
+
+def test_nothing_of_a_run_depends_on_bodies_and_noise(mini, tmp_path):
+    """A body, or the noise of a range, makes no stage run again."""
+    given = ["sensors.small.range_sigma_m=0.1", 'validation.bodies.truck="own.ply"']
+    first, then = (workflow.run(load(mini, some), tmp_path / "run").stages for some in ([], given))
+    for name in ("traffic", "statics", "tpog", "scan", "score"):
+        assert then[name].inputs == first[name].inputs
