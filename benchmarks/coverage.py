@@ -3,7 +3,7 @@
 ``python -m benchmarks.coverage [STUDIES]`` makes up as many studies (1000) of each kind whose truth is known: 13 or 40
 sites drawn from a normal distribution of score and detection, detection measured with an error of 0.15 of its spread in
 10 blocks that all sites share. It prints in what share of them the 95 % interval holds the truth, and how wide the
-intervals are. The truth is that of all sites there could be, in endless traffic. Twenty minutes on one core.
+intervals are. The truth is that of all sites there could be, in endless traffic. Five minutes on one core.
 """
 
 from __future__ import annotations
