@@ -66,7 +66,7 @@ def m_sog(evidence: SiteEvidence) -> float:
     """
     hits, unit = evidence.counted
     crossed = int(np.count_nonzero(hits))
-    return -evidence.occupancy.field.score(hits, 1.0, unit).egvs * NAT / crossed if crossed else math.nan
+    return 0.0 - evidence.occupancy.field.score(hits, 1.0, unit).egvs * NAT / crossed if crossed else math.nan
 
 
 def kl_obs(evidence: SiteEvidence) -> float:
