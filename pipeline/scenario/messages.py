@@ -24,7 +24,7 @@ def explain(error: ValidationError, place: str) -> InputError:
 def _lines(error: ValidationError, model: type[BaseModel], above: tuple[str, ...]) -> Iterator[tuple[str, str, str]]:
     """Key, what stands there, and what would be right, of all that is wrong in ``model``, found under ``above``."""
     for item in error.errors():
-        key = ".".join(str(part) for part in (*above, *item["loc"]))
+        key = ".".join(str(part) for part in (*above, *item["loc"]) if part != "[key]")
         context = item.get("ctx", {})
         if item["type"] == "default_factory_not_called":
             continue  # follows from another key that is wrong, which is told

@@ -131,7 +131,7 @@ def test_what_is_no_body_is_refused(mini, name, write, message):
 
 
 def test_an_unknown_kind_of_body_is_refused(mini):
-    with pytest.raises(InputError, match=r"validation\.bodies\.lorry"):
+    with pytest.raises(InputError, match=r"validation\.bodies\.lorry: 'lorry'; input should be 'sedan', 'kei'"):
         load(mini, ['validation.bodies.lorry="own.ply"'])
 
 

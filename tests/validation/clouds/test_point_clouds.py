@@ -6,12 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 
 from pipeline.core.errors import InputError
 from pipeline.sensing.scanner import Scanner
 from pipeline.sensing.sites import Pose
+from pipeline.validation.clouds import bodies, surfaces
 from pipeline.validation.clouds.point_clouds import CloudMaker, random_of
-from tests.validation.clouds.scenes import built, cubes, frame_of, moved, own_sensor, random_frame, twin
+from tests.oracles import cast
+from tests.validation.clouds.scenes import built, cubes, frame_of, moved, own_sensor, placed, random_frame, twin
 
 POSES = {
     "upright": Pose(10.0, 12.0, 3.0),
@@ -192,3 +195,36 @@ def test_a_measured_scan_is_refused(mini):
         InputError, match=r"site pole_a: an empty scan that was measured \(scan\.pcd\).*; a site without"
     ):
         CloudMaker.of_site(scene, replace(scene.sites[0], points="scan.pcd"))
+
+
+def test_intensities_are_those_of_the_surface_that_is_met(mini):
+    """Reflectivity times the cosine between beam and normal, worked out triangle by triangle in metres."""
+    scene, pose, sensor = built(mini), POSES["tilted"], own_sensor(**SENSORS["rings"])
+    frame = random_frame(np.random.default_rng(8), np.array(pose.position_m) * (1, 1, 0), spread_m=12.0)
+    hits = CloudMaker(scene, pose, sensor, "here").first_hits(frame)
+    on = np.flatnonzero(hits.owner >= 0)
+    beams, (corners, _) = sensor.directions(*pose.angles_deg)[on], placed(frame, pose.position_m)
+    _, triangle = cast.first_hits(np.zeros(3), beams, corners, edge_m=1e-9)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[triangle]
+    cosine = np.abs((normals * beams).sum(axis=1)) / np.linalg.norm(normals, axis=1)
+    kinds = [bodies.kind_of(k, b[3:6].tolist()) for k, b in zip(frame.kinds, frame.boxes, strict=True)]
+    surface = [part.surface for kind in kinds for part in bodies.own()[kind] for _ in part.triangles]
+    share = np.array([surfaces.REFLECTIVITY[surface[t]] for t in triangle])
+    assert len(on) > 100 and len(set(share)) > 2
+    np.testing.assert_allclose(hits.intensity[on], share * cosine, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("inside_out", [False, True])
+def test_a_mesh_of_the_users_is_met_from_both_sides(mini, inside_out):
+    """A ball of the user's, whichever way its triangles face, stretched to a ball of radius 2 m: ranges by hand."""
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    if inside_out:
+        ball.invert()
+    ball.export(mini / "ball.ply")
+    scene = built(mini, 'validation.bodies.bus="ball.ply"')
+    sensor = own_sensor(elevations_deg=[-2, 2], channels=5, azimuth_deg=[-2, 2], azimuth_step_deg=1.0)
+    maker = CloudMaker(scene, Pose(10.0, -8.0, 3.0), sensor, "here")
+    hits = maker.first_hits(frame_of([(19.0, -8.0, 3.0, 4.0, 4.0, 4.0, 0.0, 0.0)], ["bus"]))
+    along = 9.0 * sensor.directions()[:, 0]
+    assert (hits.owner == 0).all()
+    np.testing.assert_allclose(hits.range_m, along - np.sqrt(along**2 - 81.0 + 4.0), atol=0.02)
