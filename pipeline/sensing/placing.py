@@ -18,7 +18,7 @@ from pipeline.world.mesh import World
 def check(scene: Scene, pose: Pose, sensor: Sensor, place: str) -> None:
     """InputError naming ``place`` where the sensor cannot stand or would see nothing of the region of interest."""
     roi, over = scene.roi, _faces_round(scene.world, pose)
-    ground_m = _ground_m(scene.world, pose, over) if scene.scenario.statics.ground else -np.inf
+    ground_m = _ground_under(scene.world, pose, over) if scene.scenario.statics.ground else -np.inf
     if not pose.z_m > ground_m + rays.EDGE_M:
         raise InputError(
             place,
@@ -53,7 +53,7 @@ def _faces_round(world: World, pose: Pose) -> NDArray[np.int64]:
     return np.flatnonzero(may)
 
 
-def _ground_m(world: World, pose: Pose, over: NDArray[np.int64]) -> float:
+def _ground_under(world: World, pose: Pose, over: NDArray[np.int64]) -> float:
     """The ground's z below a sensor: 0, or on the surface that a network with relief has."""
     at = np.array([pose.x_m, pose.y_m])
     of_ground = [i for i in over if world.solids[world.solid_of_face[i]] == ("ground", "ground")]
@@ -64,6 +64,11 @@ def _ground_m(world: World, pose: Pose, over: NDArray[np.int64]) -> float:
         if min(s, t, 1.0 - s - t) >= -rays.EDGE_M:
             return float(a[2] + s * (b[2] - a[2]) + t * (c[2] - a[2]))
     return 0.0
+
+
+def ground_m(world: World, pose: Pose) -> float:
+    """The ground's z below a pose: 0, or on the surface that a network with relief has."""
+    return _ground_under(world, pose, _faces_round(world, pose))
 
 
 def solid_round(world: World, pose: Pose) -> int | None:

@@ -1,0 +1,112 @@
+"""PointPillars without its network: pillars, windows, boxes to values and back, and models that are none."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from pipeline.core.errors import InputError
+from pipeline.core.grid import Roi
+from pipeline.validation.detectors.pointpillars import decoding, detector, encoding
+from pipeline.validation.detectors.pointpillars.encoding import POINTS, SeenPoints, Window
+
+
+def _seen(rows):
+    """Points of (x, y, height, intensity, new, range)."""
+    values = np.array(rows, dtype=np.float64)
+    return SeenPoints(
+        values[:, :2], values[:, 2], values[:, 3].astype(np.float32), values[:, 4].astype(bool), values[:, 5]
+    )
+
+
+def test_the_pillars_of_four_points_are_as_on_paper():
+    window = Window((0.0, 0.0), cells=4)  # 1.6 m wide, its first corner at (-0.8, -0.8)
+    rows = [(-0.7, -0.7, 1.0, 0.5, 1, 25.0), (-0.5, -0.6, 3.0, 0.1, 0, 50.0), (0.1, 0.3, 0.0, 0.2, 0, 10.0)]
+    rows += [(0.9, 0.0, 1.0, 0.5, 1, 25.0), (0.0, 0.0, 4.6, 0.5, 1, 25.0)]  # out of the window; too high
+    found = encoding.pillars(_seen(rows), window, "ground")
+    np.testing.assert_array_equal(found.cell, [0, 2 * 4 + 2])
+    np.testing.assert_array_equal(found.present.sum(axis=1), [2, 1])
+    # the first pillar's middle is (0.2, 0.2) from the corner, its points are at (0.1, 0.1) and (0.3, 0.2)
+    first = [-0.1, -0.1, 1.0, 0.5, -0.1, -0.05, -1.0, 1.0, 0.5]
+    second = [0.1, 0.0, 3.0, 0.1, 0.1, 0.05, 1.0, 0.0, 1.0]
+    np.testing.assert_allclose(found.features[0, :2], [first, second], atol=1e-6)
+    np.testing.assert_allclose(found.features[1, 0], [-0.1, 0.1, 0.0, 0.2, 0.0, 0.0, 0.0, 0.0, 0.2], atol=1e-6)
+    assert not found.features[0, 2:].any()
+
+
+def test_of_a_full_pillar_every_so_many_points_are_taken():
+    rows = [(0.1, 0.1, i / 100, 0.5, 1, 5.0) for i in range(2 * POINTS + 3)]
+    found = encoding.pillars(_seen(rows), Window((0.0, 0.0)), "ground")
+    assert found.present.sum() == POINTS
+    steps = np.diff(np.round(100 * found.features[0, :, 2]).astype(int))
+    assert set(steps.tolist()) <= {2, 3}  # 35 points to 16 places
+
+
+def test_the_order_of_pillars_does_not_depend_on_that_of_points_nor_do_heights_of_the_car_convention_reach_high():
+    random = np.random.default_rng(3)
+    rows = np.column_stack([random.uniform(-9, 9, (300, 2)), random.uniform(-4, 5, 300), random.random((300, 3))])
+    seen = _seen(rows)
+    found = encoding.pillars(seen, Window((0.0, 0.0)), "sensor")
+    heights = found.features[..., 2][found.present > 0]
+    assert heights.min() >= -3.0 and heights.max() <= 1.0 and len(heights) > 100
+    assert (np.diff(found.cell) > 0).all()
+    assert found.present.sum() == ((rows[:, 2] >= -3) & (rows[:, 2] <= 1)).sum()
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.7, -2.5])
+def test_a_window_leads_to_the_world_and_back(turn):
+    window, at = Window((10.0, -4.0), turn), np.random.default_rng(0).uniform(-50, 50, (20, 2))
+    np.testing.assert_allclose(window.to_world(window.to_window(at)), at, atol=1e-12)
+    ahead = window.to_world(np.array([[window.size_m / 2 + 1.0, window.size_m / 2]]))
+    np.testing.assert_allclose(ahead, [[10.0 + math.cos(turn), -4.0 + math.sin(turn)]], atol=1e-12)
+
+
+def test_boxes_come_back_from_their_values():
+    random = np.random.default_rng(1)
+    places = np.array([[10.0, 20.0], [30.3, 20.9], [60.1, 61.0]])
+    sizes = np.array([[4.5, 1.8, 1.5], [10.9, 2.5, 3.1], [3.4, 1.5, 1.7]])
+    yaw = random.uniform(-math.pi, math.pi, 3)
+    boxes = np.column_stack([places, [0.75, 1.55, 0.85], sizes, yaw])
+    cell, values = decoding.encode(boxes)
+    heat, maps = np.zeros((128, 128), np.float32), np.zeros((decoding.VALUES, 128, 128), np.float32)
+    heat[tuple(cell.T)] = [0.9, 0.6, 0.7]
+    maps[:, cell[:, 0], cell[:, 1]] = values.T
+    found, scores = decoding.decode(heat, maps)
+    np.testing.assert_allclose(scores, [0.9, 0.7, 0.6], atol=1e-6)
+    np.testing.assert_allclose(found[:, :6], boxes[[0, 2, 1], :6], atol=1e-5)
+    np.testing.assert_allclose(np.sin(found[:, 6] - boxes[[0, 2, 1], 6]), 0.0, atol=1e-5)  # up to half a turn
+
+
+def test_neighbours_of_a_peak_and_faint_ones_are_no_detections():
+    heat, maps = np.zeros((8, 8), np.float32), np.zeros((decoding.VALUES, 8, 8), np.float32)
+    heat[3, 3], heat[3, 4], heat[6, 6] = 0.8, 0.7, 0.04
+    _, scores = decoding.decode(heat, maps)
+    np.testing.assert_allclose(scores, [0.8], atol=1e-6)
+
+
+def test_of_two_boxes_that_overlap_the_surer_one_stays():
+    boxes = np.array([[0, 0, 1, 4, 2, 2, 0.0], [1, 0, 1, 4, 2, 2, 0.1], [3.9, 0, 1, 4, 2, 2, 0.0]])
+    assert detector.apart(boxes) == [0, 2]
+
+
+@pytest.mark.parametrize("size_m", [(100.0, 50.0), (102.4, 102.4), (150.0, 60.0), (400.0, 300.0)])
+def test_windows_cover_the_region_and_share_a_seam(size_m):
+    roi = Roi((5.0, -7.0, 0.0), (*size_m, 5.0))
+    found = detector.windows(roi)
+    at = np.asarray(roi.origin_m[:2]) + np.random.default_rng(0).uniform(0, 1, (500, 2)) * size_m
+    inside = [((w.to_window(at) >= 0) & (w.to_window(at) < w.size_m)).all(axis=1) for w in found]
+    assert np.any(inside, axis=0).all()
+    assert (len(found) == 1) == (max(size_m) <= 102.4)
+    for axis in (0, 1):
+        places = sorted({w.centre_m[axis] for w in found})
+        assert all(b - a <= 102.4 - 20.0 + 1e-9 for a, b in itertools.pairwise(places))
+
+
+def test_a_model_that_is_none_is_named(tmp_path):
+    path = tmp_path / "m.onnx"
+    path.write_bytes(b"no model")
+    with pytest.raises(InputError, match=r"m\.onnx: no ONNX model .*; a model that egvs train wrote"):
+        detector.Model.of(path)
+    with pytest.raises(InputError, match="No such file"):
+        detector.Model.of(tmp_path / "absent.onnx")
