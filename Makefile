@@ -4,13 +4,17 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: run test unit lint bench scaling numerics pictures schema docs clean
+.PHONY: run test test-train unit lint bench scaling numerics pictures schema docs clean
 
 run: $(VENV)/.installed
 	$(BIN)/egvs run scenarios/nishishinjuku
 
 test: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --ignore=tests/validation/training
+
+# PyTorch is large, and only those who train a detector need it.
+test-train: $(VENV)/.installed-train
+	$(BIN)/python -m pytest -n 0 tests/validation/training
 
 # The quick loop: no other program is started, nothing takes long.
 unit: $(VENV)/.installed-dev
@@ -49,6 +53,10 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 
 $(VENV)/.installed-dev: $(VENV)/.installed
 	$(INSTALL) --no-build-isolation --editable '.[dev]'
+	@touch $@
+
+$(VENV)/.installed-train: $(VENV)/.installed-dev
+	$(INSTALL) --no-build-isolation --editable '.[dev,train]'
 	@touch $@
 
 $(VENV)/.installed-docs: $(VENV)/.installed

@@ -38,6 +38,15 @@ def duration_s(text: str) -> float:
     return seconds
 
 
+def heights_m(text: str) -> tuple[float, float]:
+    """``--heights``: LOW,HIGH in metres."""
+    match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?),([0-9]+(?:\.[0-9]+)?)", text)
+    low, high = (float(match[1]), float(match[2])) if match else (0.0, 0.0)
+    if not 0 < low <= high <= 100:
+        raise InputError("--heights", repr(text), "LOW,HIGH in metres, for example 2,7")
+    return low, high
+
+
 def size_bytes(text: str) -> float:
     """``--max``: bytes from 500M or 2G."""
     units = {"": 1.0, "K": 1e3, "M": 1e6, "G": 1e9, "T": 1e12}

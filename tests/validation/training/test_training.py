@@ -1,0 +1,170 @@
+"""Training: samples, what the network should say of them, its loss, and a model that comes back as it was."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch", reason="PyTorch is not installed: make test-train")
+
+import onnx
+import torch
+
+from pipeline import load
+from pipeline.core.errors import InputError
+from pipeline.sensing.sensors import CATALOGUE
+from pipeline.sensing.sites import Pose
+from pipeline.validation.detectors.pointpillars import decoding
+from pipeline.validation.detectors.pointpillars.detector import ABOUT, Model, PointPillars
+from pipeline.validation.detectors.pointpillars.encoding import FEATURES, POINTS, HeightZero, Pillars, Window
+from pipeline.validation.frames import TrafficFrame
+from pipeline.validation.sweeps import SiteView
+from pipeline.validation.training import export, samples
+from pipeline.validation.training.loss import Batch, loss
+from pipeline.validation.training.network import PillarNet
+from pipeline.validation.training.samples import CROP_CELLS, Junction, Sample, Samples
+from pipeline.validation.training.train import Recipe, train
+from pipeline.validation.unseen_record import prepare
+
+SENSOR = CATALOGUE["VLP-16"]
+VIEW = SiteView("s", Pose(0.0, 0.0, 5.0), SENSOR, np.full(SENSOR.beams, np.inf))
+
+
+def _target(boxes, points, kinds=None):
+    frame = TrafficFrame(0, ("v",) * len(boxes), kinds or ("passenger",) * len(boxes), np.array(boxes), np.zeros(2))
+    zero = HeightZero("sensor", VIEW, None)  # heights from 5 m
+    motor = np.array([kind != "pedestrian" for kind in frame.kinds])
+    return samples.target(frame, motor, np.array(points), Window((0.0, 0.0), 0.0, CROP_CELLS), zero)
+
+
+def test_a_target_has_its_vehicles_and_lets_the_hardly_seen_pass():
+    seen, hardly = [1.0, 2.0, 4.25, 4.5, 1.8, 1.5, 0.3], [10.0, -12.0, 4.0, 4.5, 1.8, 1.5, 0.0]
+    its = _target([seen, hardly], [3, 2])
+    half = CROP_CELLS * 0.4 / 2
+    cell = tuple(np.floor((np.array(seen[:2]) + half) / 0.8).astype(int))
+    assert its.heat[cell] == 1.0 and (its.heat == 1.0).sum() == 1
+    np.testing.assert_array_equal(its.cell, [cell])
+    np.testing.assert_allclose(its.values[0, 2:], [-0.75, *np.log(seen[3:6]), math.sin(0.6), math.cos(0.6)], rtol=1e-6)
+    other = tuple(np.floor((np.array(hardly[:2]) + half) / 0.8).astype(int))
+    assert its.counts[other] == 0.0 and its.counts[cell] == 1.0
+    assert _target([seen, hardly], [3, 0]).counts.all()  # nobody can see it: an empty place
+
+
+def test_a_mirrored_sample_is_the_sample_of_the_mirrored_street():
+    seen = [1.0, 2.0, 0.75, 4.5, 1.8, 1.5, 0.3]
+    mirrored_box = [1.0, -2.0, 0.75, 4.5, 1.8, 1.5, -0.3]
+    features = np.random.default_rng(0).normal(size=(3, POINTS, FEATURES)).astype(np.float32)
+    pillars = Pillars(features, np.ones((3, POINTS), np.float32), np.array([5, 300, 301]))
+
+    class Tails:
+        def random(self):
+            return 0.9
+
+    was = Sample(pillars, _target([seen, seen], [5, 0]))
+    now = samples.mirrored(was, Tails())
+    want = _target([mirrored_box, mirrored_box], [5, 0])
+    np.testing.assert_allclose(now.target.heat, want.heat, atol=1e-6)
+    np.testing.assert_array_equal(now.target.cell, want.cell)
+    np.testing.assert_allclose(now.target.values, want.values, atol=1e-5)
+    np.testing.assert_array_equal(now.pillars.cell, sorted([127 - 5, 2 * 128 + 127 - 44, 2 * 128 + 127 - 45]))
+    back = samples.mirrored(now, Tails())
+    np.testing.assert_array_equal(back.pillars.features, pillars.features)
+
+
+def test_the_loss_is_as_on_paper():
+    its = _target([[1.0, 2.0, 5.0, 4.5, 1.8, 1.5, 0.0], [0, 0, 0, 1, 1, 1, 0.0]], [3, 0])
+    pillars = Pillars(np.zeros((1, POINTS, FEATURES), np.float32), np.ones((1, POINTS), np.float32), np.array([0]))
+    batch = Batch.of([Sample(pillars, its)])
+    odds = torch.full((1, 1, 64, 64), -20.0)  # surely nothing anywhere
+    values = torch.zeros((1, decoding.VALUES, 64, 64))
+    middles, boxes = loss(odds, values, batch)
+    assert middles.item() == pytest.approx(20.0, abs=1e-4)  # -(1 - 0)^2 log(e^-20)
+    assert boxes.item() == pytest.approx(0.5 * np.abs(its.values).sum(), rel=1e-5)
+    odds[0, 0, its.cell[0, 0], its.cell[0, 1]] = 20.0
+    values[0, :, its.cell[0, 0], its.cell[0, 1]] = torch.from_numpy(its.values[0])
+    middles, boxes = loss(odds, values, batch)
+    assert middles.item() == pytest.approx(0.0, abs=1e-6) and boxes.item() == 0.0
+
+
+def test_an_exported_model_says_what_the_network_says(tmp_path):
+    torch.manual_seed(0)
+    net = PillarNet()
+    path = tmp_path / "m.onnx"
+    path.write_bytes(export.to_bytes(net, {"convention": "ground", "note": "é"}))
+    model = Model.of(path)
+    assert model.about == {"convention": "ground", "note": "é"}
+    net.eval()
+    for pillars in (1, 37):
+        feed = {
+            "features": np.random.default_rng(1).normal(size=(pillars, POINTS, FEATURES)).astype(np.float32),
+            "present": np.ones((pillars, POINTS), np.float32),
+            "cell": np.arange(pillars) * 11,
+        }
+        heat, values = model.session.run(None, feed)
+        with torch.no_grad():
+            want_heat, want_values = net(*(torch.from_numpy(part) for part in feed.values()))
+        np.testing.assert_allclose(heat, want_heat.numpy(), atol=1e-4)
+        np.testing.assert_allclose(values, want_values.numpy(), atol=1e-4)
+    assert net.training is False
+
+
+def test_models_of_other_shapes_are_named(tmp_path):
+    path = tmp_path / "m.onnx"
+    value = onnx.helper.make_tensor_value_info("x", onnx.TensorProto.FLOAT, ["n", 3])
+    out = onnx.helper.make_tensor_value_info("y", onnx.TensorProto.FLOAT, ["n", 3])
+    graph = onnx.helper.make_graph([onnx.helper.make_node("Relu", ["x"], ["y"])], "g", [value], [out])
+    opset = [onnx.helper.make_opsetid("", 18)]
+    path.write_bytes(onnx.helper.make_model(graph, opset_imports=opset, ir_version=9).SerializeToString())
+    with pytest.raises(InputError, match=r"m\.onnx: a model with inputs .*'x': \[3\].*; inputs"):
+        Model.of(path)
+    good = onnx.load_from_string(export.to_bytes(PillarNet(), {"convention": "ground"}))
+    del good.metadata_props[:]
+    path.write_bytes(good.SerializeToString())
+    with pytest.raises(InputError, match="its metadata does not say how heights count"):
+        Model.of(path)
+
+
+def test_a_sample_is_a_function_of_its_number(mini, tmp_path):
+    scenario = load(mini, ["sensors.small.channels=32"])
+    junction = Junction(prepare(scenario, tmp_path / "r", 10), (3.0, 4.0))
+    first, again = (Samples([junction], ["small"], "ground", 5) for _ in range(2))
+    forward = [first.sample(i) for i in range(10)]
+    for i in reversed(range(10)):
+        sample = again.sample(i)
+        np.testing.assert_array_equal(sample.pillars.features, forward[i].pillars.features)
+        np.testing.assert_array_equal(sample.target.heat, forward[i].target.heat)
+    assert any(len(sample.target.cell) for sample in forward)
+
+
+@pytest.mark.filterwarnings("ignore")  # of PyTorch's exporter, about itself
+def test_training_learns_goes_on_after_a_stop_and_says_how_it_was_made(mini, tmp_path, monkeypatch):
+    scenario = load(mini, ["sensors.small.channels=32"])
+    recipe = Recipe(steps=4, frames=10, heights_m=(3.0, 4.0), sensors=("small",), look_every=4)
+    from pipeline.validation.training import train as module
+    from pipeline.validation.training.held_out import HeldOut
+
+    monkeypatch.setattr(HeldOut, "FRAMES", 10)
+    monkeypatch.setattr(module, "_KEEP_EVERY", 2)
+    whole = train([scenario], tmp_path / "whole.onnx", recipe)
+    assert [entry["step"] for entry in whole["curve"]] == [4]
+    assert whole["junctions"] == [scenario.name] and whole["recipe"]["steps"] == 4
+
+    class Stop(Exception):
+        pass
+
+    def stop(what, done, total):
+        if what == "steps learned" and done == 3:
+            raise Stop
+
+    with pytest.raises(Stop):
+        train([scenario], tmp_path / "part.onnx", recipe, progress=stop)
+    assert not (tmp_path / "part.onnx").exists() and (tmp_path / "part.onnx.partial").exists()
+    with pytest.raises(InputError, match="is of another training"):
+        train([scenario], tmp_path / "part.onnx", Recipe(steps=5, frames=10, sensors=("small",)))
+    train([scenario], tmp_path / "part.onnx", recipe)
+    assert not (tmp_path / "part.onnx.partial").exists()
+    assert (tmp_path / "part.onnx").read_bytes() == (tmp_path / "whole.onnx").read_bytes()
+    about = json.loads({p.key: p.value for p in onnx.load(tmp_path / "whole.onnx").metadata_props}[ABOUT])
+    assert about["parameters"] == 985785
+    assert PointPillars(tmp_path / "whole.onnx").settings["model"]
