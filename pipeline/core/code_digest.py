@@ -28,11 +28,13 @@ LIBRARIES = {
     "laspy": ("laspy", "lazrs"),
     "numba": ("numba", "llvmlite"),
     "numpy": ("numpy",),
+    "onnxruntime": ("onnxruntime",),
     "osmium": ("osmium",),
     "pyarrow": ("pyarrow",),
     "pyproj": ("pyproj",),
     "scipy": ("scipy",),
     "shapely": ("shapely",),
+    "sklearn": ("scikit-learn",),
     "trimesh": ("trimesh", "mapbox-earcut"),
 }
 """Libraries whose version may change a result: name in an import -> distributions."""

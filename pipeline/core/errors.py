@@ -33,6 +33,9 @@ class InputError(EgvsError):
         self.place, self.found, self.right = str(place), found, right
         super().__init__(f"{place}: {found}" + (f"; {right}" if right else ""))
 
+    def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
+        return InputError, (self.place, self.found, self.right)  # to be told in another process
+
 
 class RunError(EgvsError):
     """The input was accepted, but the run could not keep its promise (for example: N vehicles in every frame)."""

@@ -36,7 +36,10 @@ from pipeline.runs.stages import Made
 _ENTRY, _HASH = "entry.json", "sha256"
 """What the store notes of an entry, and the note's key for the hash of all else in it."""
 
-_NAME = re.compile(rf"({'|'.join(STAGES)})-[0-9a-f]{{32}}")
+KINDS = (*STAGES, "points", "detections")
+"""What entries are of: stages, and what was found from a site."""
+
+_NAME = re.compile(rf"({'|'.join(KINDS)})-[0-9a-f]{{32}}")
 """An entry's folder. A folder of any other name is not the store's own, and never touched."""
 
 _WORK_NAME = re.compile(rf"{_NAME.pattern}|removed-{_NAME.pattern}-[0-9]+-[0-9]+")

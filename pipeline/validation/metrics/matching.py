@@ -55,9 +55,14 @@ class Objects:
     @classmethod
     def of(cls, frame: TrafficFrame, points: NDArray[np.int64], roi: Roi) -> Objects:
         """The vehicles of a frame that a detector should find; ``points`` are those on each of the frame's boxes."""
+        return cls.of_wanted(frame, points[frame.wanted(roi)], roi)
+
+    @classmethod
+    def of_wanted(cls, frame: TrafficFrame, points: NDArray[np.int64], roi: Roi) -> Objects:
+        """The same from the points on these vehicles alone."""
         rows = frame.wanted(roi)
         cars = np.array([frame.kinds[row] in CARS for row in rows], dtype=np.bool_)
-        return cls(frame.boxes[rows], cars, points[rows])
+        return cls(frame.boxes[rows], cars, points)
 
 
 def within(found: Detections, roi: Roi) -> Detections:

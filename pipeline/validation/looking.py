@@ -1,0 +1,188 @@
+"""Looks at all frames from each site with each detector, on all cores; what the store has is not looked at again.
+
+A site is one task: its sweeps are made once for all detectors that miss. Random numbers belong to a site and a frame,
+so neither cores nor order matter.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+import tempfile
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from pipeline.artefacts import schemas
+from pipeline.core import code_digest, files, parallel
+from pipeline.core.cost import Cost, measured
+from pipeline.core.progress import Progress, silent
+from pipeline.effects import registry as effects
+from pipeline.effects.base import Effect
+from pipeline.runs.stages import Made
+from pipeline.runs.store import Store
+from pipeline.sensing.scanner import Scanner
+from pipeline.sensing.sites import Site
+from pipeline.stages.shared.scene import sensor_digests
+from pipeline.validation.clouds import bodies
+from pipeline.validation.clouds.point_clouds import CloudMaker, random_of
+from pipeline.validation.detectors.base import Detector
+from pipeline.validation.metrics.matching import within
+from pipeline.validation.site_findings import POINTS, Found, FoundBoxes, FoundPoints
+from pipeline.validation.sweeps import Detections
+from pipeline.validation.unseen_record import UnseenRecord
+
+_Task = tuple[Site, Sequence[str]]
+"""A site, and the detectors that look from it."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """A record seen from its sites by some detectors.
+
+    Attributes
+    ----------
+    detectors
+        By name; points on vehicles are always counted.
+    """
+
+    record: UnseenRecord
+    detectors: dict[str, Detector]
+
+    @cached_property
+    def scanner(self) -> Scanner:
+        """Scans of all beams."""
+        return Scanner(self.record.scene, whole=True)
+
+    def at(self, site: Site, names: Sequence[str]) -> dict[str, Found]:
+        """What some of the detectors find from a site."""
+        maker = CloudMaker.of_site(self.record.scene, site, self.scanner)
+        roi, seed = self.record.scene.roi, self.record.scenario.seed
+        ready = {name: self.detectors[name].at(maker.view, roi) for name in names if name != POINTS}
+        points, boxes = [], {name: list[Detections]() for name in ready}
+        for frame in self.record.read():
+            swept = maker.sweep(frame, random_of(seed, site.name, frame.number))
+            points.append(swept.points_on(len(frame.boxes))[frame.wanted(roi)])
+            for name, detector in ready.items():
+                boxes[name].append(within(detector.detect(swept.sweep), roi))
+        found: dict[str, Found] = {name: FoundBoxes(tuple(its)) for name, its in boxes.items()}
+        return found | ({POINTS: FoundPoints(tuple(points))} if POINTS in names else {})
+
+    def key(self, site: Site, name: str) -> str:
+        """Hash of everything that a detector's findings from a site depend on."""
+        scene, scenario = self.record.scene, self.record.scenario
+        detector = self.detectors.get(name)
+        own, acting = scenario.sensors.get(site.sensor), scene.acting(Effect)
+        modules = [__name__, *effects.modules(acting), *([type(detector).__module__] if detector else [])]
+        sources = [code_digest.of(module) for module in modules]
+        about = {
+            "detector": [name, detector.settings if detector else {}],
+            "record": [self.record.keys, self.record.numbers.tolist(), scenario.seed],
+            "site": [site.name, site.pose.position_m, site.pose.angles_deg],
+            "sensor": [site.sensor, own.model_dump(mode="json") if own else None, sensor_digests(scenario, [site])],
+            "bodies": bodies.digests(scenario),
+            "effects": effects.settings(acting),
+            "roi": [scene.roi.origin_m, scene.roi.size_m],
+            "program": [source.digest for source in sources],
+            "libraries": code_digest.versions(frozenset[str]().union(*(source.libraries for source in sources))),
+            "schema": schemas.VERSION,
+        }
+        return files.hash_of(about)
+
+
+_KIND = {FoundPoints: "points", FoundBoxes: "detections"}
+"""What the store calls them; the file has the same name."""
+
+
+def look_from(
+    sites: Sequence[Site], look: Look, *, jobs: int | None = None, progress: Progress = silent
+) -> dict[str, dict[str, Found]]:
+    """What every detector finds from each site, by site and detector, in their order.
+
+    Parameters
+    ----------
+    jobs
+        Processes; one a core when None.
+
+    Raises
+    ------
+    InputError
+        For a site where no sensor can stand, or whose scan was measured.
+    """
+    names = [POINTS, *look.detectors]
+    found: dict[str, dict[str, Found]] = {}
+    for site in sites:
+        known = {name: _taken(_kind_of(name), look.key(site, name)) for name in names}
+        found[site.name] = {name: its for name, its in known.items() if its is not None}
+    missing = {site.name: [name for name in names if name not in found[site.name]] for site in sites}
+    tasks = [(site, missing[site.name]) for site in sites if missing[site.name]]
+    done = len(sites) - len(tasks)
+    progress("sites looked from", done, len(sites))
+    for site, its, cost in _each(look, tasks, parallel.threads(jobs)):
+        for name, what in its.items():
+            _put(_kind_of(name), look.key(site, name), what, cost)
+        found[site.name] |= its
+        done += 1
+        progress("sites looked from", done, len(sites))
+    return {site.name: {name: found[site.name][name] for name in names} for site in sites}
+
+
+def _each(look: Look, tasks: Sequence[_Task], processes: int) -> Iterator[tuple[Site, dict[str, Found], Cost]]:
+    """Every task's findings, as they are ready; what is not begun when an error ends it is not begun any more."""
+    processes = min(processes, len(tasks))
+    if processes <= 1:
+        for task in tasks:
+            yield task[0], *_looked(look, task)
+        return
+    spawned = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(processes, spawned, _begin, (look,)) as pool:
+        waiting = {pool.submit(_work, task): task[0] for task in tasks}
+        try:
+            for future in as_completed(waiting):
+                yield waiting[future], *future.result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _looked(look: Look, task: _Task) -> tuple[dict[str, Found], Cost]:
+    with measured() as cost:
+        found = look.at(*task)
+    return found, cost
+
+
+_ready: Look | None = None
+"""In a process of the pool: what it looks with."""
+
+
+def _begin(look: Look) -> None:
+    global _ready
+    _ready = look
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that the user sees ends the pool
+
+
+def _work(task: _Task) -> tuple[dict[str, Found], Cost]:
+    assert _ready is not None
+    return _looked(_ready, task)
+
+
+def _kind_of(name: str) -> type[Found]:
+    return FoundPoints if name == POINTS else FoundBoxes
+
+
+def _taken(kind: type[Found], key: str) -> Found | None:
+    """From the store; None where it is not there."""
+    with tempfile.TemporaryDirectory(prefix="egvs-findings-") as folder:
+        if Store.default().take(_KIND[kind], key, Path(folder), link=True) is None:
+            return None
+        return kind.read(Path(folder) / f"{_KIND[kind]}.parquet")
+
+
+def _put(kind: type[Found], key: str, found: Found, cost: Cost) -> None:
+    """Into the store."""
+    name = f"{_KIND[kind]}.parquet"
+    with tempfile.TemporaryDirectory(prefix="egvs-findings-") as folder:
+        path = Path(folder) / name
+        found.write(path, {"inputs": key})
+        Store.default().put(_KIND[kind], key, Path(folder), Made({name: files.sha256_of(path)}, {}, {}, cost))
