@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from pipeline.cli.terminal import console, table
+from pipeline.validation.agreement import main_measure
+from pipeline.validation.detection import ALL
 
 if TYPE_CHECKING:
+    from pipeline.scenario.models import Scenario
+    from pipeline.validation.agreement import ScoreName, Validation
+    from pipeline.validation.statistics.correlation import Correlation
     from pipeline.validation.surrogates.base import Value
     from pipeline.validation.surrogates.registry import Entry
 
@@ -26,6 +33,59 @@ def print_scores(entries: Iterable[Entry]) -> None:
         source = score.source + (f" (package {entry.package})" if entry.package else "")
         rows.add_row(score.name, score.formula, "more" if score.sign > 0 else "less", _tried(score.sweep), source)
     console(_FILE_WIDTH, soft_wrap=False).print(rows, markup=False)
+
+
+def print_validation(scenario: Scenario, out: Path, done: Validation) -> None:
+    """What each detector finds from each site, and how well scores agree with it."""
+    own = done.own_score(scenario)
+    egvs = done.values_of(own)
+    order = sorted(egvs, key=lambda site: -egvs[site])
+    detectors = list(dict.fromkeys(row.detector for row in done.detections))
+    named = {(row.site, row.detector): row for row in done.detections if row.objects_of == ALL}
+    names = ("site", "EGVS, kbit", *(f"{name}: {_HEADS[main_measure(name)]}" for name in detectors))
+    rows = table(names, left=("site",), whole=("site",))
+    for site in order:
+        its = (named[site, name].measures[main_measure(name)] for name in detectors)
+        rows.add_row(site, f"{egvs[site] / 1e3:.1f}", *(f"{100 * m.value:.1f} ± {100 * m.se:.1f}" for m in its))
+    console(_FILE_WIDTH, soft_wrap=False).print(rows, markup=False)
+    some = next(iter(named.values()))
+    print(f"{some.objects} vehicles in {some.frames} frames of traffic that the TPOG never saw; ± is a standard error")
+    print()
+    _print_agreement(done, own, detectors)
+    for doubt in done.doubts:
+        print(f"warning: {doubt}")
+    print(f"{out}: detection.parquet, surrogates.parquet, correlation.parquet, validation.png")
+
+
+def _print_agreement(done: Validation, own: ScoreName, detectors: Sequence[str]) -> None:
+    """Of each score the choice of parameters that the scenario has; Spearman's rho with what detectors find."""
+    shown = [name for name in done.scores if name == own or name.score != own.score]
+    heads = ("Spearman's rho with detection", *detectors)
+    rows = table(heads, left=heads[:1], whole=heads)
+    for name in shown:
+        each = (done.agreement(name, detector, main_measure(detector)).by_kind["spearman"] for detector in detectors)
+        rows.add_row(str(name), *map(_interval, each))
+    console(_FILE_WIDTH, soft_wrap=False).print(rows, markup=False)
+
+
+def _interval(its: Correlation) -> str:
+    if not math.isfinite(its.value):
+        return "-"
+    between = f" ({its.interval.low:.2f} to {its.interval.high:.2f})" if math.isfinite(its.interval.low) else ""
+    return f"{its.value:.2f}{between}"
+
+
+_HEADS = {"ap_combined_r40_iou70": "AP from above + in space, %", "seen_20": "seen with 20 points, %"}
+
+
+def print_training(out: Path, about: Mapping[str, Any]) -> None:
+    """What a training came to: average precision on held-out frames as it went on."""
+    names = ("step", "ap_bev_r40_iou70", "ap_3d_r40_iou70", "ap_bev_r40_iou50", "recall_bev_iou50")
+    rows = table(names, left=(), whole=names)
+    for entry in about["curve"]:
+        rows.add_row(str(entry["step"]), *(f"{entry[name]:.1%}" for name in names[1:]))
+    console(_FILE_WIDTH, soft_wrap=False).print(rows, markup=False)
+    print(f"{out}: {about['parameters']:,} parameters, trained on {', '.join(about['junctions'])}")
 
 
 def _tried(sweep: Mapping[str, tuple[Value, ...]]) -> str:

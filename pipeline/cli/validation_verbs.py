@@ -2,6 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline.cli import arguments
+from pipeline.cli.arguments import Jobs, Out, ScenarioPath, Set
+from pipeline.core.errors import InputError, MissingBackendError
+
+DEFAULT_FRAMES = 1000
+"""Of validation: what brings the standard error of average precision to about a point."""
+
+_Scenarios = Annotated[list[Path], typer.Argument(metavar="SCENARIO...", help="Training junctions, one or more.")]
+
 
 def scores() -> None:
     """Print the scores that validation compares: formula, which way is better, source."""
@@ -11,5 +25,72 @@ def scores() -> None:
     validation_tables.print_scores(registry.catalogue())
 
 
-VERBS = (scores,)
+def validate(
+    scenario: ScenarioPath,
+    out: Out = None,
+    set_: Set = None,
+    frames: Annotated[
+        int, typer.Option(min=10, help="Of traffic that the TPOG never saw, at least 2 s apart.")
+    ] = DEFAULT_FRAMES,
+    detector: Annotated[
+        str, typer.Option(metavar="NAME,NAME", help="points, and detectors that are installed: cluster, pointpillars.")
+    ] = "points,cluster",
+    jobs: Jobs = None,
+) -> None:
+    """What would detectors find from each site, and which score foretells it?"""
+    from pipeline.cli import validation_tables
+    from pipeline.cli.progress import Screen
+    from pipeline.runs.workflow import default_folder
+    from pipeline.scenario.loading import load
+    from pipeline.validation import validating
+
+    loaded = load(scenario, set_ or ())
+    folder = out or default_folder(loaded)
+    names = [name.strip() for name in detector.split(",") if name.strip()]
+    with Screen("validate") as screen:
+        done = validating.validate(loaded, folder, frames=frames, detectors=names, jobs=jobs, progress=screen.progress)
+    validation_tables.print_validation(loaded, folder, done)
+
+
+def train(
+    scenarios: _Scenarios,
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The model to write, .onnx.")],
+    set_: Set = None,
+    steps: Annotated[int, typer.Option(min=10, help="Of learning, each from 8 crops of sweeps.")] = 3000,
+    frames: Annotated[int, typer.Option(min=10, help="Of traffic of each junction to learn from.")] = 400,
+    heights: Annotated[
+        str, typer.Option(metavar="LOW,HIGH", help="Mounting heights to learn from, metres above the ground.")
+    ] = "2,7",
+    convention: Annotated[
+        str, typer.Option(help="What heights of points count from: ground, or sensor as detectors for cars do.")
+    ] = "ground",
+    seed: Annotated[int, typer.Option(min=0, help="Of traffic, poses, samples and the network's first values.")] = 1,
+    jobs: Jobs = None,
+) -> None:
+    """Train the PointPillars detector on simulated sweeps of junctions (needs the extra `train`)."""
+    from pipeline.cli import validation_tables
+    from pipeline.cli.progress import Screen
+    from pipeline.scenario.loading import load
+
+    try:
+        from pipeline.validation.training import train as training
+    except ImportError as error:
+        raise MissingBackendError(f"egvs train needs {error.name}: pip install 'egvs[train]'") from None
+
+    if convention not in ("ground", "sensor"):
+        raise InputError("--convention", repr(convention), "ground or sensor")
+    recipe = training.Recipe(
+        steps=steps,
+        frames=frames,
+        heights_m=arguments.heights_m(heights),
+        seed=seed,
+        convention="sensor" if convention == "sensor" else "ground",
+    )
+    loaded = [load(path, set_ or ()) for path in scenarios]
+    with Screen("train") as screen:
+        about = training.train(loaded, out, recipe, jobs=jobs, progress=screen.progress)
+    validation_tables.print_training(out, about)
+
+
+VERBS = (validate, scores, train)
 """In the order of the help."""

@@ -12,8 +12,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from pipeline.core import files
 from pipeline.studies.comparison import Row
+from pipeline.studies.placed_names import PlacedNames
 from pipeline.studies.variants import APPROXIMATES, MEASURES, SCENARIO
 
 if TYPE_CHECKING:
@@ -129,22 +132,8 @@ def _places(settings: Sequence[Row]) -> tuple[list[float], list[float]]:
 
 def _name_settings(axes: Any, settings: Sequence[Row]) -> None:
     """Name the recommended setting, the default and the front, each where it covers no other name and no marker."""
-    renderer = axes.figure.canvas.get_renderer()
-    taken = [text.get_window_extent(renderer) for text in axes.texts]
-    markers = axes.transData.transform(list(zip(*_places(settings), strict=True)))
+    names = PlacedNames(axes, np.column_stack(_places(settings)))
     named = [s for s in settings if (s.front or s.recommended or s.default) and s.kind != SCENARIO]
     for s in sorted(named, key=lambda s: (not s.recommended, not s.default, s.seconds)):
         (seconds,), (error,) = _places([s])
-        text = "recommended: " * s.recommended + "the program's default: " * s.default + s.setting
-        for align, x, y in (("left", 6, -11), ("right", -8, -11), ("left", 6, 6), ("right", -8, 6)):
-            name = axes.annotate(
-                text, (seconds, error), xytext=(x, y), textcoords="offset points", fontsize=7.5,
-                ha=align, zorder=2,
-                bbox={"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.75},
-            )  # fmt: skip
-            box = name.get_window_extent(renderer)
-            hides = any(box.overlaps(other) for other in taken) or any(box.contains(*marker) for marker in markers)
-            if not hides and axes.bbox.containsx(box.x0) and axes.bbox.containsx(box.x1):
-                taken.append(box)
-                break
-            name.remove()
+        names.place("recommended: " * s.recommended + "the program's default: " * s.default + s.setting, seconds, error)

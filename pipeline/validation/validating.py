@@ -1,0 +1,176 @@
+"""Asks what detectors find from each site, and which score foretells it; the whole of ``egvs validate``.
+
+Steps: check the scenario; bring traffic that the TPOG never saw; look from each site with each detector; measure what
+was found; work out every score; correlate. ``detection.parquet``, ``surrogates.parquet``, ``correlation.parquet`` and
+``validation.png`` go into the run's folder. All of them are the same bytes whenever scenario and program are the same.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.artefacts import schemas, tables
+from pipeline.core import files
+from pipeline.core.errors import InputError
+from pipeline.core.findings import Finding, warnings_of
+from pipeline.core.progress import Progress, silent
+from pipeline.runs import stage_keys, stages
+from pipeline.runs.locking import alone
+from pipeline.runs.workflow import refresh_report
+from pipeline.scenario.models import Scenario
+from pipeline.stages.base import Workspace
+from pipeline.validation import detection, figure, unseen_traffic
+from pipeline.validation.agreement import BOXED, COUNTED, Agreement, ScoreName, Validation
+from pipeline.validation.detection import ALL, SiteDetection
+from pipeline.validation.detectors import registry
+from pipeline.validation.frames import TrafficFrame
+from pipeline.validation.looking import Look, look_from
+from pipeline.validation.site_findings import POINTS
+from pipeline.validation.statistics.coefficients import KINDS
+from pipeline.validation.statistics.correlation import Study
+from pipeline.validation.statistics.junctions import Junction, Measured
+from pipeline.validation.surrogates import gathering
+from pipeline.validation.surrogates.gathering import Surrogates
+from pipeline.validation.unseen_record import UnseenRecord, prepare
+
+CORRELATION = "correlation.parquet"
+
+
+def validate(
+    scenario: Scenario,
+    out: Path,
+    *,
+    frames: int,
+    detectors: Sequence[str] = (POINTS,),
+    jobs: int | None = None,
+    progress: Progress = silent,
+) -> Validation:
+    """Validate the scores of a scenario's sites.
+
+    Parameters
+    ----------
+    out
+        The run's folder.
+    frames
+        Of unseen traffic.
+    detectors
+        Names; points on vehicles are always counted.
+
+    Raises
+    ------
+    InputError
+        What the check refuses; an unknown detector; more frames than traffic has; no vehicle in the region of interest.
+    """
+    chosen = {name: registry.make(name) for name in dict.fromkeys(detectors) if name != POINTS}
+    with alone(out), tempfile.TemporaryDirectory(prefix=".work-", dir=_folder(out)) as folder:
+        doubts = _checked(scenario, Path(folder) / "check", progress)
+        record = prepare(scenario, Path(folder) / "unseen", frames, jobs=jobs, progress=progress)
+        watched = list(record.read())
+        _refuse_empty(scenario, record, watched)
+        found = look_from(record.scene.sites, Look(record, chosen), jobs=jobs, progress=progress)
+        rows, undefined = detection.measured(watched, record.scene.roi, found)
+        surrogates = gathering.surrogates_of(scenario, Path(folder) / "scores", jobs=jobs, progress=progress)
+        agreements = correlated(scenario, rows, surrogates)
+        told = (*doubts, *_not_unseen(scenario), *undefined, *surrogates.skipped)
+        done = Validation(tuple(rows), surrogates, tuple(agreements), told)
+        _write(out, scenario, record, done)
+        refresh_report(out)
+    return done
+
+
+def correlated(scenario: Scenario, rows: Sequence[SiteDetection], surrogates: Surrogates) -> list[Agreement]:
+    """Every score against every measure of every detector, over all vehicles."""
+    sites = tuple(dict.fromkeys(row.site for row in rows))
+    scores = _by_score(sites, surrogates)
+    found = []
+    for detector in dict.fromkeys(row.detector for row in rows):
+        mine = [row for row in rows if row.detector == detector and row.objects_of == ALL]
+        names = COUNTED if detector == POINTS else BOXED
+        measures = {name: Measured.of([row.measures[name] for row in mine]) for name in names}
+        junction = Junction(scenario.name, sites, {str(name): values for name, values in scores.items()}, measures)
+        study = Study([junction], scenario.seed)
+        by_kind = {
+            (kind, measure, name): study.correlation(str(name), measure, kind)
+            for kind in KINDS
+            for measure in names
+            for name in scores
+        }
+        found += [
+            Agreement(name, detector, measure, {kind: by_kind[kind, measure, name] for kind in KINDS})
+            for measure in names
+            for name in scores
+        ]
+    return found
+
+
+def _by_score(sites: Sequence[str], surrogates: Surrogates) -> dict[ScoreName, NDArray[np.float64]]:
+    """Each score's values over the sites, turned so that more is better."""
+    place = {site: number for number, site in enumerate(sites)}
+    found: dict[ScoreName, NDArray[np.float64]] = {}
+    for row in surrogates.rows:
+        name = ScoreName(row.score, row.parameters_json)
+        found.setdefault(name, np.full(len(sites), np.nan))[place[row.site]] = row.sign * row.value
+    return found
+
+
+def _folder(out: Path) -> Path:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(out, error.strerror or str(error), "a folder that can be written") from None
+    return out
+
+
+def _checked(scenario: Scenario, folder: Path, progress: Progress) -> list[Finding]:
+    """What the check warns of; its errors are raised."""
+    folder.mkdir()
+    work = Workspace(scenario, folder, progress=progress)
+    made = stages.make("check", work, stage_keys.inputs("check", work).read)
+    return list(warnings_of([made.summary]))
+
+
+def _refuse_empty(scenario: Scenario, record: UnseenRecord, watched: Sequence[TrafficFrame]) -> None:
+    if not any(len(frame.wanted(record.scene.roi)) for frame in watched):
+        found = f"no vehicle's centre is in it in any of {record.frames} frames of unseen traffic"
+        raise InputError(f"{scenario.file}: roi", found, "a region with traffic, or more --frames")
+
+
+def _not_unseen(scenario: Scenario) -> list[Finding]:
+    """A warning where the frames are those that the TPOG was counted from."""
+    if not scenario.is_recorded:
+        return []
+    what = "the traffic is a finished file: sites are judged by frames that the TPOG was counted from"
+    return [Finding("seen traffic", f"{scenario.file}: traffic.fcd", what, "a network or a sumocfg has traffic unseen")]
+
+
+def _write(out: Path, scenario: Scenario, record: UnseenRecord, done: Validation) -> None:
+    about: dict[str, Any] = {
+        "scenario": {"name": scenario.name, "hash": files.hash_of(scenario.model_dump(mode="json"))},
+        "seed": scenario.seed,
+        "unseen_seed": record.scenario.seed,
+        "frames": record.frames,
+        "apart_s": unseen_traffic.APART_S,
+        "inputs": files.hash_of([record.keys, done.surrogates.inputs]),
+    }
+    detection.write(out / detection.ARTEFACT, done.detections, about)
+    done.surrogates.write(out / gathering.ARTEFACT, scenario)
+    columns: dict[str, list[Any]] = {
+        "score": [its.score.score for its in done.agreements],
+        "parameters": [its.score.parameters for its in done.agreements],
+        "detector": [its.detector for its in done.agreements],
+        "measure": [its.measure for its in done.agreements],
+        "n": [its.by_kind[KINDS[0]].sites for its in done.agreements],
+    }
+    for kind in KINDS:
+        each = [its.by_kind[kind] for its in done.agreements]
+        columns[kind] = [its.value for its in each]
+        columns[f"{kind}_low"] = [its.interval.low for its in each]
+        columns[f"{kind}_high"] = [its.interval.high for its in each]
+    tables.write(out / CORRELATION, "correlation", columns, {"schema": schemas.VERSION, **about})
+    figure.draw(out / figure.ARTEFACT, scenario, done)
