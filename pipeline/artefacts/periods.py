@@ -67,7 +67,8 @@ def times(weights: Sequence[float], frames: Sequence[int], place: str) -> tuple[
     total = sum(count * number for count, number in zip(smallest, frames, strict=True))
     if total > MOST_FRAMES:
         found = f"weights {', '.join(f'{w:g}' for w in weights)} of {', '.join(map(str, frames))} frames"
-        raise InputError(f"{place}.periods", f"{found} make a mix of {total} frames", "weights with fewer digits")
+        what = f"{found} make a mix of more than {MOST_FRAMES:,} frames"
+        raise InputError(f"{place}.periods", what, "weights with fewer digits, nearer to each other")
     return smallest
 
 

@@ -17,6 +17,7 @@ from pipeline.sensing import placing
 from pipeline.sensing.sensors import Sensor
 from pipeline.sensing.sites import Site
 from pipeline.world import limits
+from pipeline.world.carriageway import Carriageway
 
 MOST_LISTED = 8
 """So many sites get a line of their own; the others share one."""
@@ -51,25 +52,31 @@ def poses(subject: Subject) -> Iterator[Finding]:
 
 
 def on_lanes(subject: Subject) -> Iterator[Finding]:
-    """A warning for each named site that stands in a lane, unless it hangs over the road."""
+    """A warning for each named site that stands in a lane, or amid a junction, unless it hangs over the road."""
     model = subject.scenario.sites
     if subject.carriageway is None or not subject.sites or (model.file is None and model.only_free):
         return
-    at_m = np.array([[site.pose.x_m, site.pose.y_m] for site in subject.sites])
-    found = []
-    for site, lane in zip(subject.sites, subject.carriageway.lanes_at(at_m), strict=True):
-        if lane is not None:
-            road_m = subject.carriageway.height_m(lane, np.array([site.pose.x_m, site.pose.y_m]))
-            if site.pose.z_m - road_m <= limits.CLEARANCE_M:
-                found.append((site, subject.carriageway.names[lane]))
+    found = list(_on_the_road(subject.sites, subject.carriageway))
     cure = f"a place beside the road, or more than {limits.CLEARANCE_M:g} m above it"
-    for site, name in found[:MOST_LISTED]:
-        what = f"({site.pose.x_m:g}, {site.pose.y_m:g}, {site.pose.z_m:g}) stands in lane {name}"
+    for site, where in found[:MOST_LISTED]:
+        what = f"({site.pose.x_m:g}, {site.pose.y_m:g}, {site.pose.z_m:g}) stands {where}"
         yield Finding("sites on lanes", subject.site_place(site), what, cure)
     if rest := found[MOST_LISTED:]:
         names = ", ".join(site.name for site, _ in rest)
-        what = f"{len(rest)} more of {len(subject.sites)} stand in lanes: {names}"
+        what = f"{len(rest)} more of {len(subject.sites)} stand in lanes or junctions: {names}"
         yield Finding("sites on lanes", subject.site_place(rest[0][0]).partition(":")[0], what, cure)
+
+
+def _on_the_road(sites: tuple[Site, ...], carriageway: Carriageway) -> Iterator[tuple[Site, str]]:
+    """The sites that stand in a lane or amid a junction, no higher than the clearance above the road, and where."""
+    at_m = np.array([[site.pose.x_m, site.pose.y_m] for site in sites])
+    lanes, amid = carriageway.lanes_at(at_m), carriageway.in_junctions(at_m)
+    for site, spot_m, lane, inside in zip(sites, at_m, lanes, amid, strict=True):
+        if lane is None and not inside:
+            continue
+        road_m = carriageway.height_m(carriageway.nearest(spot_m) if lane is None else lane, spot_m)
+        if site.pose.z_m - road_m <= limits.CLEARANCE_M:
+            yield site, "amid a junction" if lane is None else f"in lane {carriageway.names[lane]}"
 
 
 def dropped(subject: Subject) -> Iterator[Finding]:

@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial, wraps
+from pathlib import Path
 
+from pipeline.artefacts import periods
 from pipeline.checks.subject import Refusals, Subject
 from pipeline.core.errors import InputError
 from pipeline.core.findings import Finding
+from pipeline.effects import on_traffic
 from pipeline.scenario.models import Scenario
 from pipeline.traffic import fcd, sumo, sumo_folder
 from pipeline.traffic.demand import counts as demand
-from pipeline.traffic.demand import trips
+from pipeline.traffic.demand import given, trips
 from pipeline.traffic.finished import sizes, survey
 from pipeline.world import world_frame
 
@@ -40,6 +43,54 @@ def times(subject: Subject) -> Iterator[Finding]:
         begin_s = 0.0 if given is None else given.begin_s
         refusals.unless_refused("traffic", lambda: sumo_folder.timing(scenario.traffic, begin_s, place))
     yield from refusals.found
+
+
+def weights(subject: Subject) -> Iterator[Finding]:
+    """An error where periods' weights make a mix of too many frames."""
+    scenario, refusals = subject.scenario, Refusals()
+    shares = [period.weight for period in scenario.traffic.periods]
+    try:
+        frames = [_whole_frames(alone) for alone in scenario.by_period().values()]
+    except InputError:
+        return  # of a finished file that is wrong, which is told elsewhere
+    if shares and all(frames):
+        refusals.unless_refused("traffic", partial(periods.times, shares, frames, sumo_folder.place_of(scenario)))
+    yield from refusals.found
+
+
+def _whole_frames(alone: Scenario) -> int:
+    """Frames of one period that fill whole blocks; a finished file is looked through for them."""
+    frames = survey.recorded_frames(alone)
+    return frames - frames % alone.tpog.blocks
+
+
+def demand_there(subject: Subject) -> Iterator[Finding]:
+    """An error where a demand of the user's brings no vehicle, and no effect does."""
+    for period, alone in subject.scenario.by_period().items():
+        refusals = Refusals()
+        if refusals.unless_refused("traffic", partial(_is_demand_there, alone)) is not False:
+            continue  # or it cannot be read, which is told elsewhere
+        traffic = alone.traffic
+        named = f"sumocfg = {traffic.sumocfg!r}" if traffic.sumocfg else f"routes = {list(traffic.routes)}"
+        key = f"{sumo_folder.place_of(alone)}{f'.periods ({period})' if period else ''}.{named}"
+        files = ", ".join(path.name for path in _demand_files(alone)) or "no route file is named"
+        what = f"no vehicle, trip or flow in its files ({files})"
+        cure = "route files with vehicles, or a network alone: trips are drawn for it"
+        yield Finding("traffic", key, what, cure, is_error=True)
+
+
+def _is_demand_there(alone: Scenario) -> bool:
+    traffic = alone.traffic
+    if traffic.fcd is not None or not (traffic.sumocfg or traffic.routes):
+        return True
+    if any(effect.ADDS_TRAFFIC for effect in on_traffic.live(alone)[0]):
+        return True
+    return given.bring_vehicles(_demand_files(alone))
+
+
+def _demand_files(alone: Scenario) -> list[Path]:
+    files = sumo_folder.sources(alone).files
+    return [path for option in given.OPTIONS for path in files.get(option, ())]
 
 
 def recorded_places(subject: Subject) -> Iterator[Finding]:

@@ -29,6 +29,8 @@ def inputs(work: Workspace) -> StageInputs:
     hashes = files.digests(scenario, candidates) | _sensors(scenario, candidates)
     settings = scenario.model_dump(mode="json", exclude={**dict.fromkeys(UNREAD, True), "roi": {"voxel_m"}})
     settings["keep_visibility"] = scenario.score.keep_visibility
+    if scenario.traffic.periods:  # whose frames that fill no block have no weight
+        settings["blocks"] = scenario.tpog.blocks
     settings |= _world(scenario)
     return StageInputs(settings, hashes)
 

@@ -10,8 +10,11 @@ import pytest
 
 import pipeline
 from pipeline.checks import checking
+from pipeline.checks import sites as site_rules
+from pipeline.checks.subject import Subject
 from pipeline.core.errors import InputError
 from pipeline.core.findings import FindingsError
+from pipeline.sensing.sites import Pose, Site
 from pipeline.stages import check
 from pipeline.traffic import network, sumo_folder
 from pipeline.world.carriageway import Carriageway
@@ -76,6 +79,21 @@ def test_a_sensor_on_a_gantry_stands_in_nobodys_way(street: Path) -> None:
     ]
 
 
+def test_a_site_amid_a_junction_is_told_unless_it_hangs_over_the_road() -> None:
+    """Of the hill's junction (0, -2) is in no lane, and (60, 12) is beside the road."""
+    roads = Carriageway.of(network.read(SCENARIOS / "hill" / "network.net.xml"))
+    at_m = np.array([0.0, -2.0])
+    assert roads.lanes_at(at_m[None]) == [None]
+    road_m = roads.height_m(roads.nearest(at_m), at_m)
+    places = {"low": (0.0, -2.0, road_m + 2), "high": (0.0, -2.0, road_m + 4.6), "beside": (60.0, 12.0, road_m + 2)}
+    candidates = tuple(Site(name, Pose(*place), "VLP-32C") for name, place in places.items())
+    subject = Subject(pipeline.load(SCENARIOS / "hill"), carriageway=roads, sites=candidates)
+    assert [str(finding) for finding in site_rules.on_lanes(subject)] == [
+        f"sites.csv: site low: (0, -2, {road_m + 2:g}) stands amid a junction; "
+        "a place beside the road, or more than 4.5 m above it"
+    ]
+
+
 def test_the_height_over_the_road_counts(street: Path) -> None:
     lifted = LANES.replace("80,1.60 -40,1.60", "80,1.60,4.00 -40,1.60,4.00").replace(
         "-40,-1.60 80,-1.60", "-40,-1.60,4.00 80,-1.60,4.00"
@@ -90,7 +108,7 @@ def test_many_sites_in_lanes_share_a_line(street: Path) -> None:
     sites(street, *(f"s{i:02d},{i},1.6,3" for i in range(1, 13)))
     lines = found(street)["sites on lanes"]
     assert len(lines) == 9
-    assert lines[-1] == "[sites.csv: 4 more of 12 stand in lanes: s09, s10, s11, s12]"
+    assert lines[-1] == "[sites.csv: 4 more of 12 stand in lanes or junctions: s09, s10, s11, s12]"
 
 
 def rule(folder: Path, grid: str) -> None:
