@@ -27,7 +27,7 @@ from pipeline.validation.unseen_record import UnseenRecord
 
 CROP_CELLS = 128
 BATCH = 8
-_OF_A_POSE = 6
+_OF_A_POSE = 20
 _FEWEST, _UNSURE = 3, 1  # points of a vehicle that should be found; that may be found or not
 _JITTER_M, _ELSEWHERE = 20.0, 0.1
 _BEYOND_M = 15.0
