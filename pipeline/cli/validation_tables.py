@@ -1,4 +1,4 @@
-"""Tables of what validation has to tell: which scores there are."""
+"""Tables of what validation has to tell: which scores there are, what was exported."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from pipeline.validation.detection import ALL
 if TYPE_CHECKING:
     from pipeline.scenario.models import Scenario
     from pipeline.validation.agreement import ScoreName, Validation
+    from pipeline.validation.exports.exporting import Export
     from pipeline.validation.statistics.correlation import Correlation
     from pipeline.validation.surrogates.base import Value
     from pipeline.validation.surrogates.registry import Entry
@@ -86,6 +87,18 @@ def print_training(out: Path, about: Mapping[str, Any]) -> None:
         rows.add_row(str(entry["step"]), *(f"{entry[name]:.1%}" for name in names[1:]))
     console(_FILE_WIDTH, soft_wrap=False).print(rows, markup=False)
     print(f"{out}: {about['parameters']:,} parameters, trained on {', '.join(about['junctions'])}")
+
+
+def print_export(done: Export) -> None:
+    """What was written of each site, and where it says more."""
+    names = ("site", "sensor", "frames", "points", "labelled boxes", "vehicles in region", "of them seen")
+    rows = table(names, left=names[:2], whole=("site",))
+    for site in done.sites:
+        counts = (site.frames, site.points, site.labelled, site.in_roi, site.in_roi_labelled)
+        rows.add_row(site.site, site.sensor, *map(str, counts))
+    out = console(_FILE_WIDTH)
+    out.print(rows, markup=False)
+    out.print(f"{done.folder}/README.md says what is in there ({done.kind})")
 
 
 def _tried(sweep: Mapping[str, tuple[Value, ...]]) -> str:

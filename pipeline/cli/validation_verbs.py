@@ -17,6 +17,31 @@ DEFAULT_FRAMES = 1000
 _Scenarios = Annotated[list[Path], typer.Argument(metavar="SCENARIO...", help="Training junctions, one or more.")]
 
 
+def clouds(
+    scenario: ScenarioPath,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="A new folder, or an empty one.")],
+    site: Annotated[
+        list[str] | None, typer.Option(metavar="SITE", help="Of this site only; all by default. Repeatable.")
+    ] = None,
+    frames: Annotated[
+        int, typer.Option(min=1, help="Of traffic that the TPOG never saw, at least 2 s apart.")
+    ] = DEFAULT_FRAMES,
+    kind: Annotated[str, typer.Option("--format", metavar="FORMAT", help="kitti, openpcdet, ply or pcd.")] = "kitti",
+    set_: Set = None,
+    jobs: Jobs = None,
+) -> None:
+    """Write labelled point clouds with traffic, for anyone's detector."""
+    from pipeline.cli import validation_tables
+    from pipeline.cli.progress import Screen
+    from pipeline.scenario.loading import load
+    from pipeline.validation.exports.exporting import export
+
+    resolved = load(scenario, set_ or ())
+    with Screen("clouds") as screen:
+        done = export(resolved, out, sites=site or (), frames=frames, kind=kind, jobs=jobs, progress=screen.progress)
+    validation_tables.print_export(done)
+
+
 def scores() -> None:
     """Print the scores that validation compares: formula, which way is better, source."""
     from pipeline.cli import validation_tables
@@ -92,5 +117,5 @@ def train(
     validation_tables.print_training(out, about)
 
 
-VERBS = (validate, scores, train)
+VERBS = (validate, clouds, scores, train)
 """In the order of the help."""

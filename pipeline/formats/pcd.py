@@ -15,13 +15,14 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core.errors import InputError
-from pipeline.formats.point_records import RecordLayout, number, whole_number
+from pipeline.formats.point_records import AXES, RecordLayout, number, records_of, whole_number
 
 _IDENTITY = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 _UNIT = 1e-3  # how far a quaternion's length may be from 1: headers are often written with few digits
@@ -29,10 +30,10 @@ _UNIT = 1e-3  # how far a quaternion's length may be from 1: headers are often w
 _HEADER = """\
 # .PCD v0.7 - Point Cloud Data file format
 VERSION 0.7
-FIELDS x y z
-SIZE 8 8 8
-TYPE F F F
-COUNT 1 1 1
+FIELDS {names}
+SIZE {sizes}
+TYPE {types}
+COUNT {counts}
 WIDTH {n}
 HEIGHT 1
 VIEWPOINT 0 0 0 1 0 0 0
@@ -63,9 +64,23 @@ def read(path: Path, place: str) -> NDArray[np.float64]:
 
 def write(path: Path, points_m: NDArray[np.float64]) -> None:
     """Write world-frame points, (n, 3) float64, as DATA binary with the identity as VIEWPOINT."""
+    write_columns(path, dict(zip(AXES, np.asarray(points_m, dtype=np.float64).T, strict=True)))
+
+
+def write_columns(path: Path, columns: Mapping[str, NDArray[np.generic]]) -> None:
+    """Write points with any fields, each (n,), as DATA binary with the identity as VIEWPOINT; x, y, z among them."""
+    records = records_of(columns)
+    kinds = [records.dtype[name].str for name in columns]
+    header = _HEADER.format(
+        n=len(records),
+        names=" ".join(columns),
+        sizes=" ".join(kind[2:] for kind in kinds),
+        types=" ".join(kind[1].upper() for kind in kinds),
+        counts=" ".join("1" for _ in kinds),
+    )
     with path.open("wb") as file:
-        file.write(_HEADER.format(n=len(points_m)).encode("ascii"))
-        file.write(np.ascontiguousarray(points_m, dtype="<f8").data)
+        file.write(header.encode("ascii"))
+        file.write(records.data)
 
 
 def _header(place: str, data: bytes) -> tuple[dict[str, list[str]], int, int]:

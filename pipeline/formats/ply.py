@@ -7,6 +7,7 @@ points than its header says, and reads all faces only to have them thrown away.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,17 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core.errors import InputError
-from pipeline.formats.point_records import RecordLayout, whole_number
+from pipeline.formats.point_records import AXES, RecordLayout, records_of, whole_number
 
-_HEADER = """\
-ply
-format binary_little_endian 1.0
-element vertex {n}
-property double x
-property double y
-property double z
-end_header
-"""
+_HEADER = "ply\nformat binary_little_endian 1.0\nelement vertex {n}\n{properties}end_header\n"
 
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _TYPES = {
@@ -33,6 +26,7 @@ _TYPES = {
     "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
     "float32": "f4", "float64": "f8",
 }  # fmt: skip
+_NAMES = {numpy: ply for ply, numpy in _TYPES.items() if ply.isalpha()}
 
 
 @dataclass
@@ -64,9 +58,16 @@ def read(path: Path, place: str) -> NDArray[np.float64]:
 
 def write(path: Path, points_m: NDArray[np.float64]) -> None:
     """Write world-frame points, (n, 3) float64, binary, little endian."""
+    write_columns(path, dict(zip(AXES, np.asarray(points_m, dtype=np.float64).T, strict=True)))
+
+
+def write_columns(path: Path, columns: Mapping[str, NDArray[np.generic]]) -> None:
+    """Write points with any properties, each (n,) of one of PLY's types, binary, little endian; x, y, z among them."""
+    records = records_of(columns)
+    properties = "".join(f"property {_NAMES[records.dtype[name].str[1:]]} {name}\n" for name in columns)
     with path.open("wb") as file:
-        file.write(_HEADER.format(n=len(points_m)).encode("ascii"))
-        file.write(np.ascontiguousarray(points_m, dtype="<f8").data)
+        file.write(_HEADER.format(n=len(records), properties=properties).encode("ascii"))
+        file.write(records.data)
 
 
 def _formats(place: str, element: _Element, order: str) -> list[str]:

@@ -9,7 +9,7 @@ guessed.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import Self
@@ -98,6 +98,15 @@ def columns_of(columns: Sequence[NDArray[np.generic]]) -> NDArray[np.float64]:
         for axis, column in enumerate(columns):
             points[:, axis] = column
     return points
+
+
+def records_of(columns: Mapping[str, NDArray[np.generic]]) -> NDArray[np.void]:
+    """Columns (n,) as records, little endian, without gaps, in the columns' order."""
+    kinds = [(name, column.dtype.newbyteorder("<")) for name, column in columns.items()]
+    records = np.empty(len(next(iter(columns.values()))), dtype=kinds)
+    for name, column in columns.items():
+        records[name] = column
+    return records
 
 
 def number(text: str) -> float | None:

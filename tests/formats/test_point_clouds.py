@@ -15,6 +15,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from pipeline.core.errors import InputError
+from pipeline.formats import pcd as pcd_format
+from pipeline.formats import ply as ply_format
 from pipeline.formats.point_clouds import read_points, write_points
 
 needs_laspy = pytest.mark.skipif(importlib.util.find_spec("laspy") is None, reason="laspy is not installed (egvs[las])")
@@ -331,3 +333,22 @@ def test_laz_without_a_backend_says_how_to_get_it(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(laspy.LazBackend, "detect_available", lambda: ())
     with pytest.raises(InputError, match=r"needs lazrs, which is not installed; pip install egvs\[las\]"):
         read_points(path, "")
+
+
+# --- points with more than x, y, z ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["a.pcd", "a.ply"])
+def test_further_columns_stand_beside_the_points(tmp_path: Path, name: str) -> None:
+    columns = {axis: np.arange(3, dtype=np.float32) + at for at, axis in enumerate("xyz")}
+    columns |= {"intensity": np.array([0, 0.5, 1], dtype=np.float32), "object": np.array([-1, 0, 7], dtype=np.int32)}
+    {"pcd": pcd_format, "ply": ply_format}[name[2:]].write_columns(tmp_path / name, columns)
+    assert read_points(tmp_path / name, "")[0].tolist() == [[0, 1, 2], [1, 2, 3], [2, 3, 4]]
+    data = (tmp_path / name).read_bytes()
+    head = {
+        "a.pcd": b"FIELDS x y z intensity object\nSIZE 4 4 4 4 4\nTYPE F F F F I\nCOUNT 1 1 1 1 1\n",
+        "a.ply": b"property float z\nproperty float intensity\nproperty int object\nend_header\n",
+    }[name]
+    assert head in data
+    kind = np.dtype([(key, column.dtype.newbyteorder("<")) for key, column in columns.items()])
+    assert np.frombuffer(data[-3 * kind.itemsize :], dtype=kind)["object"].tolist() == [-1, 0, 7]

@@ -49,6 +49,13 @@ def random_of(seed: int, site: str, frame: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence((seed, zlib.crc32(site.encode()), frame)))
 
 
+def check(site: Site) -> None:
+    """InputError for a site with a measured scan, which does not tell what met nothing."""
+    if site.points is not None:
+        found = f"an empty scan that was measured ({site.points}), which does not tell beams that met nothing"
+        raise InputError(f"site {site.name}", found, "a site without points, whose empty scan is simulated")
+
+
 @dataclass(frozen=True)
 class FirstHits:
     """What beams meet first, one element a row of the empty scan (a beam, where no effect weights beams).
@@ -126,11 +133,8 @@ class CloudMaker:
         InputError
             Where no sensor can stand; or for a site with a measured scan, which does not tell what met nothing.
         """
-        place = f"site {site.name}"
-        if site.points is not None:
-            found = f"an empty scan that was measured ({site.points}), which does not tell beams that met nothing"
-            raise InputError(place, found, "a site without points, whose empty scan is simulated")
-        return cls(scene, site.pose, scene.sensor(site.sensor, place), site.name, scanner, shapes)
+        check(site)
+        return cls(scene, site.pose, scene.sensor(site.sensor, f"site {site.name}"), site.name, scanner, shapes)
 
     def sweep(self, frame: TrafficFrame, random: np.random.Generator) -> LabelledSweep:
         """The point cloud of one frame.

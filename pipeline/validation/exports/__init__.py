@@ -1,0 +1,1 @@
+"""Labelled point clouds as folders for anyone's detector: KITTI, OpenPCDet's custom format, PLY, PCD."""
