@@ -124,10 +124,10 @@ def _chosen(known: Sequence[Site], names: Sequence[str]) -> list[Site]:
     by_name = {site.name: site for site in known}
     for name in names:
         if name not in by_name:
-            near = difflib.get_close_matches(name, by_name, 3, 0.4)
+            near = difflib.get_close_matches(name, by_name, 1, 0.4)
             listed = [*by_name][:20]
             more = f" and {len(by_name) - len(listed)} more" if len(by_name) > len(listed) else ""
-            right = f"did you mean {' or '.join(near)}?" if near else f"one of {', '.join(listed)}{more}"
+            right = f"did you mean {near[0]}?" if near else f"one of {', '.join(listed)}{more}"
             raise InputError("--site", f"no site {name!r}", right)
     chosen = [site for site in known if not names or site.name in names]
     for site in chosen:
