@@ -91,6 +91,8 @@ def _print_seeds(out: Console, seeds: Seeds) -> None:
 
 
 def _recommendation(study: AccuracyStudy, command: str) -> str:
+    from pipeline.studies.comparison import WORTH
+
     if study.empty:
         nothing = "every score is 0, so that there is nothing to choose by"
         return f"{nothing}: look where the region of interest and the traffic are"
@@ -103,7 +105,9 @@ def _recommendation(study: AccuracyStudy, command: str) -> str:
         return f"no setting is within {study.tolerance:.2%}; the nearest is {least.setting!r}, with {least.judged:.2%}"
     best = study.best
     known = "unknown" if math.isnan(best.error_se) else f"{best.error_se:.2%}"
+    cheaper = any(row.judged <= study.tolerance and row.seconds < best.seconds for row in rivals)
+    others = f" (what is cheaper saves less than {WORTH:.0%})" if cheaper else ""
     return (
-        f"the cheapest setting within {study.tolerance:.2%}: {best.setting}, {best.seconds:.2f} s, "
+        f"recommended within {study.tolerance:.2%}: {best.setting}, {best.seconds:.2f} s{others}, "
         f"error {best.error:.2%}, standard error {known}\n  {command} {best.overrides}".rstrip()
     )

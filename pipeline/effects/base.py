@@ -164,8 +164,9 @@ class Detect(Effect[P]):
             return error
         return None
 
-    def seen(self, scene: Scene) -> str:
-        """The share of returns from the region of interest that is noticed, by the effect's own formula."""
+    def noticed(self, scene: Scene) -> tuple[float, float]:
+        """Share of returns from the region of interest that is noticed, by the effect's own formula: at the site where
+        it is least, and where it is most."""
         low, size = np.asarray(scene.roi.origin_m), np.asarray(scene.roi.size_m)
         parts = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
         places = low + size * np.stack(np.meshgrid(parts, parts, parts), axis=-1).reshape(-1, 3)
@@ -173,7 +174,11 @@ class Detect(Effect[P]):
             self.detect(np.sqrt(((places - site.pose.position_m) ** 2).sum(axis=1)), scene.sensor(site.sensor)).mean()
             for site in scene.sites
         ]
-        worst, best = (f"{share:.0%}" for share in (min(shares), max(shares)))
+        return float(min(shares)), float(max(shares))
+
+    def seen(self, scene: Scene) -> str:
+        """The share of returns from the region of interest that is noticed."""
+        worst, best = (f"{share:.0%}" for share in self.noticed(scene))
         spread = best if worst == best else f"{worst} to {best}"
         return f"by its formula, {spread} of returns from the region are noticed"
 

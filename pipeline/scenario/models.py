@@ -256,6 +256,7 @@ class Scenario(StrictModel):
     validation: ValidationModel = ValidationModel()
 
     _folders: tuple[Path, ...] = PrivateAttr(default=(Path(),))
+    _period: str = PrivateAttr(default="")
 
     @model_validator(mode="after")
     def _across(self) -> Scenario:
@@ -288,7 +289,7 @@ class Scenario(StrictModel):
         for number, (name, traffic) in enumerate(self._traffic_by_period()):
             drawn = int(np.random.SeedSequence((self.seed, number)).generate_state(1, np.uint64)[0])
             alone = self.model_copy(update={"traffic": traffic, "seed": drawn >> 1})
-            alone._folders = self._folders
+            alone._folders, alone._period = self._folders, name
             scenarios[name] = alone
         return scenarios
 
@@ -296,6 +297,11 @@ class Scenario(StrictModel):
     def is_recorded(self) -> bool:
         """Whether its traffic, or that of a period, is a finished file."""
         return any(traffic.fcd is not None for _, traffic in self._traffic_by_period())
+
+    @property
+    def period(self) -> str:
+        """The period whose traffic alone this is; empty for the whole scenario."""
+        return self._period
 
     @property
     def folder(self) -> Path:
@@ -310,7 +316,7 @@ class Scenario(StrictModel):
     def with_effects(self, effects: EffectsModel) -> Scenario:
         """The same scenario with these effects instead of its own."""
         other = self.model_copy(update={"effects": effects})
-        other._folders = self._folders
+        other._folders, other._period = self._folders, self._period
         return other
 
     def find(self, name: str, key: str) -> Path:

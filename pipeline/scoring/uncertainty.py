@@ -24,7 +24,7 @@ Groups shorter than the window that the memory itself is estimated in, and group
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -250,24 +250,33 @@ def _groups_in_words(part: Stratum) -> str:
     return each + joined + widened
 
 
-def doubts(estimate: Estimate, place: str, frame_period_s: float, names: Sequence[str] = ("",)) -> list[Finding]:
+def doubts(
+    estimate: Estimate,
+    place: str,
+    frame_period_s: float,
+    names: Sequence[str] = ("",),
+    own_lengths: Mapping[str, str] | None = None,
+) -> list[Finding]:
     """Why standard errors cannot be trusted: a warning for each record that is short beside its memory.
 
     Parameters
     ----------
     place
-        The key that says how long the traffic lasts.
+        The key that says how many frames the traffic lasts.
     names
         Of the periods, one a record.
+    own_lengths
+        Period -> the key that says how many seconds it lasts, for those that have one.
     """
+    own = own_lengths or {}
     return [
-        _doubt(part, f"{place} ({name})" if name else place, frame_period_s)
+        _doubt(part, own.get(name, f"{place} ({name})" if name else place), frame_period_s, in_seconds=name in own)
         for part, name in zip(estimate.strata, names, strict=True)
         if part.is_short or part.still_alike
     ]
 
 
-def _doubt(part: Stratum, place: str, frame_period_s: float) -> Finding:
+def _doubt(part: Stratum, place: str, frame_period_s: float, *, in_seconds: bool) -> Finding:
     frames, lasts = part.groups.total, part.groups.memory
     wide = f", though widened by {part.widening - 1.0:.0%}," if part.widening >= 1.005 else ""
     found = (
@@ -279,6 +288,8 @@ def _doubt(part: Stratum, place: str, frame_period_s: float) -> Finding:
             f"neighbouring groups of {frames // len(part.pseudo)} frames are alike: standard errors may be too small"
         )
     enough = max(2 * frames if part.still_alike else 0, math.ceil(FEWEST * memory.WINDOW * lasts))
-    return Finding(
-        "traffic's memory", place, found, f"at least {enough} frames, better {round(LONG / memory.WINDOW) * enough}"
-    )
+    better = round(LONG / memory.WINDOW) * enough
+    cure = f"at least {enough} frames, better {better}"
+    if in_seconds:
+        cure = f"length_s of at least {enough * frame_period_s:g}, better {better * frame_period_s:g}"
+    return Finding("traffic's memory", place, found, cure)

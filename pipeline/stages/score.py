@@ -140,8 +140,12 @@ def run(
     if estimate is not None:
         records = [period.name for period in periods] or [""]
         summary |= uncertainty.in_words(estimate, records)
-        place, period_s = f"{FILE}: traffic.frames", work.scenario.traffic.frame_period_s
-        doubts = uncertainty.doubts(estimate, place, period_s, records) + doubts
+        traffic = work.scenario.traffic
+        place, period_s = f"{FILE}: traffic.frames", traffic.frame_period_s
+        own = {
+            p.name: f"{FILE}: traffic.periods ({p.name}).length_s" for p in traffic.periods if p.length_s is not None
+        }
+        doubts = uncertainty.doubts(estimate, place, period_s, records, own) + doubts
     if audit:
         summary["audit"] = _worst([d.audit for d in done if d.audit is not None])
     if work.scenario.is_recorded:  # without a network, the record alone knows the road

@@ -6,16 +6,17 @@ Scores are compared as shares of ``egvs_limit``. With r_i of the reference and s
 
 where b is the setting's best site. A setting of little traffic may be right by luck: it is *judged* by the larger of
 its error and its own standard error (:mod:`pipeline.scoring.uncertainty`), and the recommendation is the cheapest
-setting that is judged to be within the tolerance. Where the traffic is a finished file, nothing longer is to be had,
-and the error alone is judged. A setting that measures something else (voxel, gamma, effects) has no error: it is
-compared with the scenario itself, on the same traffic, by ranking and regret.
+setting that is judged to be within the tolerance; but the scenario's own setting, or else the program's default, where
+that is within it too and the cheapest saves less than :data:`WORTH` of its time. Where the traffic is a finished file,
+nothing longer is to be had, and the error alone is judged. A setting that measures something else (voxel, gamma,
+effects) has no error: it is compared with the scenario itself, on the same traffic, by ranking and regret.
 """
 
 from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
 
@@ -25,6 +26,9 @@ from numpy.typing import NDArray
 from pipeline.runs.stages import RANKING
 from pipeline.studies.measuring import SettingRunner, SettingScores
 from pipeline.studies.variants import APPROXIMATES, MEASURES, OWN, REFERENCE, SCENARIO, Setting, is_default
+
+WORTH = 0.2
+"""Share of the seconds that another setting has to save to be recommended in place of one that nobody has to type."""
 
 
 @dataclass(frozen=True)
@@ -146,11 +150,21 @@ def judge(rows: list[Row], tolerance: float) -> list[Row]:
     """Mark the front and the recommended setting; sort."""
     rivals = [row for row in rows if row.kind in (APPROXIMATES, SCENARIO)]
     front = {row.setting for row in rivals if not any(_beats(other, row) for other in rivals)}
-    within = [row for row in rivals if row.judged <= tolerance]
-    chosen = min(within, key=lambda row: (row.seconds, row.setting)).setting if within else None
+    within = sorted((row for row in rivals if row.judged <= tolerance), key=lambda row: (row.seconds, row.setting))
+    chosen = _recommended(within).setting if within else None
     marked = [replace(row, front=row.setting in front, recommended=row.setting == chosen) for row in rows]
     places = {SCENARIO: 0, REFERENCE: 1, APPROXIMATES: 2, MEASURES: 3}
     return sorted(marked, key=lambda row: (places[row.kind], row.seconds, row.setting))
+
+
+def _recommended(within: Sequence[Row]) -> Row:
+    """Of the settings within the tolerance, cheapest first: that one, unless the scenario's own or else the program's
+    default is nearly as cheap."""
+    cheapest = within[0]
+    familiar = sorted(
+        (row for row in within if row.kind == SCENARIO or row.default), key=lambda row: row.kind != SCENARIO
+    )
+    return next((row for row in familiar if cheapest.seconds > (1.0 - WORTH) * row.seconds), cheapest)
 
 
 def _beats(one: Row, other: Row) -> bool:

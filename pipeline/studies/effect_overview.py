@@ -18,7 +18,7 @@ from pipeline.core import files, plugins
 from pipeline.core.errors import MissingBackendError
 from pipeline.core.progress import Progress, silent
 from pipeline.effects import registry
-from pipeline.effects.base import Effect, Traffic
+from pipeline.effects.base import Detect, Effect, Traffic
 from pipeline.effects.scene_building import build_scene
 from pipeline.effects.traffic.articulated import Articulated
 from pipeline.scenario.effects import GROUP
@@ -30,8 +30,8 @@ from pipeline.studies.variants import SCENARIO, WITH, WITHOUT
 
 UNTRIED = "not known before a run"
 SMALL, LEAST_SHOWN = 0.01, 0.001
-"""An effect that changes no score by more than the first share, and no order, is of little effect; what is below the
-second is not told apart."""
+"""An effect that changes no score by more than the first share, and no order, is of little effect; before a run, one by
+whose formula less than the first share of returns is missed. What is below the second is not told apart."""
 
 
 @dataclass(frozen=True)
@@ -153,6 +153,8 @@ def _advised(kind: type[Effect[Any]], scene: Scene, trials: Trials | None) -> Ca
     seen, small, change = effect.seen(scene), False, UNTRIED
     if trials is not None:
         small, change = _tried(effect, trials)
+    elif isinstance(effect, Detect):
+        small = 1.0 - min(effect.noticed(scene)) < SMALL
     if kind.UNTOLD:
         values = ", ".join(f"{key} = {value:g}" for key, value in kind.TRIAL.items())
         tried = f"; tried with {values}" if trials is not None and not isinstance(effect, Traffic) else ""

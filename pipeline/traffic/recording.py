@@ -6,6 +6,7 @@ running; a finished file, of which nothing is promised.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import AbstractContextManager, contextmanager
@@ -42,6 +43,7 @@ from pipeline.traffic.sumo_folder import (
     Prepared,
     as_flags,
 )
+from pipeline.traffic.tally import beside
 
 _LEAST_PATIENCE_S = 180.0
 _MOST_WAITING = 0.02
@@ -220,24 +222,40 @@ def type_sizes(prepared: Prepared) -> dict[str, Size]:
         return {name: live.ask_size(connection, name) for name in connection.vehicletype.getIDList()}
 
 
-def _collisions(prepared: Prepared) -> dict[tuple[str, str], str]:
-    """Pairs of vehicles that SUMO saw collide while frames were recorded, and the lane where they did so first."""
-    pairs: dict[tuple[str, str], str] = {}
+@dataclass(frozen=True)
+class Crash:
+    """Where two vehicles collided first: the lane, and the point in the world frame; None where SUMO names none."""
+
+    lane: str
+    at_m: tuple[float, float] | None
+
+    @property
+    def place(self) -> str:
+        """The junction or the edge."""
+        lane = self.lane
+        return f"junction {lane[1:].rsplit('_', 2)[0]}" if lane.startswith(":") else f"edge {lane.rpartition('_')[0]}"
+
+
+def _collisions(prepared: Prepared) -> dict[tuple[str, str], Crash]:
+    """Pairs of vehicles that SUMO saw collide while frames were recorded, and where they did so first."""
+    pairs: dict[tuple[str, str], Crash] = {}
     for c in safe_xml.children(prepared.folder / COLLISIONS, "collisions"):
         if float(c.get("time", "0")) * 1000.0 >= prepared.timing.first_ms:
-            pairs.setdefault((c.get("collider", ""), c.get("victim", "")), c.get("lane", ""))
+            x_m, y_m = [*map(float, c.get("colliderFront", "nan,nan").split(","))][:2]
+            crash = Crash(c.get("lane", ""), (x_m, y_m) if math.isfinite(x_m + y_m) else None)
+            pairs.setdefault((c.get("collider", ""), c.get("victim", "")), crash)
     return pairs
 
 
-def _crashed(crashes: dict[tuple[str, str], str], scenario: Scenario) -> list[Finding]:
-    """A warning that vehicles collided, with the junctions and edges where most did."""
+def _crashed(crashes: dict[tuple[str, str], Crash], scenario: Scenario) -> list[Finding]:
+    """A warning that vehicles collided, with the junctions and edges where most did, and how far these are."""
     if not crashes:
         return []
-    places = Counter(
-        f"junction {lane[1:].rsplit('_', 2)[0]}" if lane.startswith(":") else f"edge {lane.rpartition('_')[0]}"
-        for lane in crashes.values()
+    places, at_m = Counter(crash.place for crash in crashes.values()), {c.place: c.at_m for c in crashes.values()}
+    shown = ", ".join(
+        f"{n} at {place}" + (f" ({beside(spot_m, scenario.roi.box)})" if (spot_m := at_m[place]) is not None else "")
+        for place, n in places.most_common(3)
     )
-    shown = ", ".join(f"{n} at {place}" for place, n in places.most_common(3))
     pairs = f"{len(crashes)} pairs" if len(crashes) > 1 else "a pair"
     found = f"{pairs} of vehicles collided, and drove on through each other: {shown}"
     cure = "look at these places in sumo-gui: right of way, signals, how long the waiting room on a junction is"

@@ -5,6 +5,7 @@ World frame, metres, metres per second. Vehicles that stand are followed from gr
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Set
 from dataclasses import dataclass, field
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.core.grid import Roi
 from pipeline.traffic.boxes import Ints, VehicleBoxes
 
 STANDING_M_S = 0.1
@@ -24,6 +26,18 @@ SQUARE_M = 20.0
 _SHRINK_M = 1e-3
 _MOST_CELLS = 2**20
 """Along x and along y, so that the number of a cell in a frame of a group fits 64 bits."""
+
+
+def where(at_m: tuple[float, float], roi: Roi) -> str:
+    """A place in the world frame, and how far from the region of interest it lies."""
+    return f"x {at_m[0]:.0f} m, y {at_m[1]:.0f} m ({beside(at_m, roi)})"
+
+
+def beside(at_m: tuple[float, float], roi: Roi) -> str:
+    """How far from the region of interest a place lies, in words."""
+    low, size = roi.origin_m, roi.size_m
+    off_m = math.hypot(*(max(low[i] - at_m[i], at_m[i] - low[i] - size[i], 0.0) for i in (0, 1)))
+    return f"{off_m:.0f} m from the region of interest" if off_m else "in the region of interest"
 
 
 def overlapping(boxes: VehicleBoxes) -> NDArray[np.int64]:

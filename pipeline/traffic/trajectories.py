@@ -7,7 +7,6 @@ metres, radians.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -17,12 +16,11 @@ from pipeline.core.findings import Finding
 from pipeline.core.grid import Roi
 from pipeline.core.progress import Progress
 from pipeline.scenario.models import Scenario
-from pipeline.scenario.traffic import TrafficModel
 from pipeline.traffic import boxes, frames
 from pipeline.traffic.extensions import BoxChange, TrafficExtension
 from pipeline.traffic.frames import FrameGroup
 from pipeline.traffic.recording import Recording
-from pipeline.traffic.tally import SQUARE_M, TrafficTally
+from pipeline.traffic.tally import SQUARE_M, TrafficTally, where
 
 LONG_STAND_S = 120.0
 """A common signal comes round within 90 to 120 s."""
@@ -63,7 +61,7 @@ def write(
             file.write(made.columns(first_frame))
         tally.add(made)
         progress("frames written", group.first_frame + group.frames, tally.frames)
-    _check(scenario.traffic, tally, recording)
+    _check(scenario, tally, recording)
     return tally, {key: value for change in changes or () for key, value in change.summary().items()}
 
 
@@ -76,11 +74,15 @@ def _groups(recording: Recording) -> Iterator[FrameGroup]:
     return (frames.together(some, others) for some, others in zip(groups, persons, strict=True))
 
 
-def _check(traffic: TrafficModel, tally: TrafficTally, recording: Recording) -> None:
+def _check(scenario: Scenario, tally: TrafficTally, recording: Recording) -> None:
     """Whether a simulated recording keeps the scenario's promises."""
+    traffic = scenario.traffic
     if not tally.rows:
+        source = traffic.fcd or traffic.sumocfg or ", ".join(traffic.routes) or traffic.network
+        of = f" of the period {scenario.period!r}" if scenario.period else ""
         raise RunError(
-            f"{recording.place}: no vehicle is in any of {tally.frames} frames; check the demand and warmup_s"
+            f"{recording.place}: no vehicle of {source} is in any of {tally.frames} frames{of};"
+            " check the demand, begin_s and warmup_s"
         )
     if recording.vehicles is not None and traffic.hold == "exactly":
         _check_held(recording.vehicles, tally, recording.place)
@@ -104,14 +106,6 @@ def doubts(tally: TrafficTally, recording: Recording, roi: Roi) -> list[Finding]
         cure = "a larger junction, or signals in place of a right of way that vehicles take on it"
         found.append(Finding("overlaps", f"{recording.place}: {where(at_m, roi)}", what, cure))
     return found
-
-
-def where(at_m: tuple[float, float], roi: Roi) -> str:
-    """A place in the world frame, and how far from the region of interest it lies."""
-    low, size = roi.origin_m, roi.size_m
-    off_m = math.hypot(*(max(low[i] - at_m[i], at_m[i] - low[i] - size[i], 0.0) for i in (0, 1)))
-    beside = f"{off_m:.0f} m from the region of interest" if off_m else "in the region of interest"
-    return f"x {at_m[0]:.0f} m, y {at_m[1]:.0f} m ({beside})"
 
 
 def _check_held(vehicles: int, tally: TrafficTally, place: str) -> None:

@@ -190,9 +190,12 @@ def test_errors_of_a_mix_and_of_its_periods_are_told(split: Path, tmp_path: Path
     day, night = summary["standard_errors_from"].split("; ")
     assert day.startswith("day: 4 groups of 6 frames")
     assert night.startswith("night: 4 groups of 4 frames")
-    places = [finding.place for finding in warnings_of([summary]) if finding.rule == "traffic's memory"]
-    assert places
-    assert set(places) <= {"scenario.toml: traffic.frames (day)", "scenario.toml: traffic.frames (night)"}
+    doubts = [finding for finding in warnings_of([summary]) if finding.rule == "traffic's memory"]
+    assert doubts
+    assert {finding.place for finding in doubts} <= {
+        f"scenario.toml: traffic.periods ({name}).length_s" for name in ("day", "night")
+    }
+    assert all(finding.cure.startswith("length_s of at least ") for finding in doubts)
 
 
 def test_a_period_whose_best_site_is_another_is_told() -> None:

@@ -149,6 +149,11 @@ def test_groups_too_short_for_the_traffic_are_joined_or_warned_of() -> None:
     doubts = [uncertainty.doubts(e, "scenario.toml: traffic.frames", 0.5) for e in warned]
     assert all("neighbouring groups of 10 frames are alike" in doubt.found for (doubt,) in doubts)
     assert {doubt.cure for (doubt,) in doubts} == {"at least 140 frames, better 560"}
+    own = {"night": "scenario.toml: traffic.periods (night).length_s"}
+    (doubt,) = uncertainty.doubts(warned[0], "scenario.toml: traffic.frames", 0.5, ["night"], own)
+    assert (doubt.place, doubt.cure) == (own["night"], "length_s of at least 70, better 280")
+    (doubt,) = uncertainty.doubts(warned[0], "scenario.toml: traffic.frames", 0.5, ["day"], own)
+    assert (doubt.place, doubt.cure) == ("scenario.toml: traffic.frames (day)", "at least 140 frames, better 560")
     honest = [Estimate.of(wandering(16, 0.0, seed), record(np.full(16, 10))) for seed in range(200)]
     assert np.mean([e.strata[0].joined > 1 for e in honest]) < 0.1
 

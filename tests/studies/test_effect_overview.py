@@ -54,6 +54,14 @@ def test_a_plain_scene_is_told_what_it_has_and_what_only_its_user_knows(mini: Pa
     assert "flat" in found["slope"][1] or "no network" in found["slope"][1] or "relief" in found["slope"][1]
 
 
+def test_a_limit_beyond_the_region_is_of_little_effect_before_a_run_too(mini: Path) -> None:
+    """Noticed to 3000 m and to 30 m, the region being 50 m wide."""
+    for rated_m, state in ((3000, "little"), (30, "called for")):
+        found = states(mini, f"sensors.small.rated_range_m={rated_m}")["range_limit"]
+        assert found[0] == state
+        assert ("100% of returns" in found[1]) == (state == "little")
+
+
 def test_the_change_that_is_expected_is_the_one_that_a_run_finds(mini: Path, tmp_path: Path) -> None:
     plain = tmp_path / "plain"
     pipeline.run(pipeline.load(mini), plain)

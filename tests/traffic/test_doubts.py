@@ -6,7 +6,7 @@ import pytest
 
 from pipeline.core.grid import Roi
 from pipeline.stages import traffic
-from pipeline.traffic import boxes, network, recording, sumo_folder, trajectories
+from pipeline.traffic import boxes, network, recording, sumo_folder, tally, trajectories
 from pipeline.traffic.recording import Recording
 from pipeline.traffic.tally import TrafficTally
 from tests.stages import run_stage
@@ -52,21 +52,25 @@ def test_overlaps_in_many_frames_are_told_where_most_are():
     assert found.found == "vehicles overlap in 7% of the frames; 20 of 25 pairs do so there"
 
 
-COLLISION = '<collision time="{}" lane="{}" collider="{}" victim="{}"/>'
+COLLISION = '<collision time="{}" lane="{}" collider="{}" victim="{}"{}/>'
 
 
 def test_collisions_are_told_with_junction_and_edge(tmp_path):
     seen = [
-        ("9", ":J_1_0", "x", "y"), ("10", ":J_1_2_0", "a", "b"), ("11", "out_0", "a", "b"),
-        ("12", ":J_1_3_0", "c", "d"), ("13", "out_1", "e", "f"),
+        ("9", ":J_1_0", "x", "y", ""), ("10", ":J_1_2_0", "a", "b", ' colliderFront="1,2"'),
+        ("11", "out_0", "a", "b", ""), ("12", ":J_1_3_0", "c", "d", ' colliderFront="2,2"'),
+        ("13", "out_1", "e", "f", ' colliderFront="325,0,3"'), ("14", "old_1", "g", "h", ""),
     ]  # fmt: skip
     text = "".join(COLLISION.format(*one) for one in seen)
     (tmp_path / sumo_folder.COLLISIONS).write_text(f"<collisions>{text}</collisions>")
     prepared = SimpleNamespace(folder=tmp_path, timing=SimpleNamespace(first_ms=10_000))
     crashes = recording._collisions(prepared)
-    assert len(crashes) == 3
+    assert len(crashes) == 4
     (found,) = recording._crashed(crashes, scenario(tmp_path, network="net.xml"))
-    assert "3 pairs of vehicles collided" in found.found and "2 at junction J_1, 1 at edge out" in found.found
+    assert found.found == (
+        "4 pairs of vehicles collided, and drove on through each other: 2 at junction J_1 (in the region of interest), "
+        "1 at edge out (300 m from the region of interest), 1 at edge old"
+    )
     assert recording._crashed({}, scenario(tmp_path, network="net.xml")) == []
 
 
@@ -91,4 +95,4 @@ def test_a_demand_that_does_not_fit_is_told(town, tmp_path):
     ],
 )
 def test_a_place_is_told_with_its_distance(at_m, words):
-    assert trajectories.where(at_m, ROI) == words
+    assert tally.where(at_m, ROI) == words

@@ -264,7 +264,7 @@ def test_no_vehicle_at_all_fails(town, tmp_path):
     keys = SMALL | {"routes": ["none.rou.xml"], "hold": "at_most"}
     keys.pop("trips_per_s")
     shutil.copy(town / "net.xml", tmp_path)
-    with pytest.raises(RunError, match="no vehicle is in any of 240 frames"):
+    with pytest.raises(RunError, match=r"no vehicle of none\.rou\.xml is in any of 240 frames"):
         run_stage(traffic, scenario(tmp_path, network="net.xml", **keys), tmp_path / "out")
 
 
