@@ -593,7 +593,7 @@ def test_a_site_with_a_measured_scan_is_not_thinned(mini: Path) -> None:
     assert not {"azimuth", "channels"} & {s.knob for s in study_settings.settings(pipeline.load(mini))}
 
 
-@pytest.mark.parametrize("name", ["nishishinjuku", "ingolstadt"])
+@pytest.mark.parametrize("name", ["nishishinjuku", "ingolstadt", "roundabout"])
 def test_settings_are_sound_scenarios(name: str) -> None:
     folder = ROOT / "scenarios" / name
     found = study_settings.settings(pipeline.load(folder))

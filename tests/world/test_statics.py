@@ -397,7 +397,7 @@ def test_closed_means_each_side_met_by_its_opposite():
 
 
 def test_shipped_statics_are_closed_and_clean():
-    for name in ("nishishinjuku", "ingolstadt"):
+    for name in ("nishishinjuku", "ingolstadt", "roundabout"):
         world, counts = static_world.build(loading.load(f"scenarios/{name}"))
         kinds = [kind for _, kind in world.solids]
         assert [k for k, closed in zip(kinds, world.closed, strict=True) if not closed] == ["ground"]
