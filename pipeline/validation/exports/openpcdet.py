@@ -1,7 +1,8 @@
 """The dataset configuration with which OpenPCDet takes a site's folder as its custom dataset.
 
 The grid follows OpenPCDet's tutorial on custom datasets: along x and y a multiple of 16 voxels of 0.1 m, along z 40
-voxels. It holds all labelled boxes in the region of interest.
+voxels. It holds all labelled boxes in the region of interest. What a model's own configuration should say, its classes
+and the anchor of each, stands at the top as a comment.
 """
 
 from __future__ import annotations
@@ -28,7 +29,11 @@ _KITTI = {
 
 _TEXT = """\
 # For OpenPCDet's CustomDataset; in tools/cfgs/dataset_configs/. The grid holds all labelled boxes in the region.
+#
+# For the model's configuration, from the labels here (0 is the sensor's height, so the ground lies below it):
 # CLASS_NAMES: [{present}]
+# ANCHOR_GENERATOR_CONFIG: [
+{anchors}# ]
 DATASET: 'CustomDataset'
 DATA_PATH: '../data/custom'
 
@@ -85,6 +90,15 @@ DATA_PROCESSOR:
       }}
 """
 
+_ANCHOR = """\
+#     {{'class_name': '{name}', 'anchor_sizes': [[{size}]], 'anchor_rotations': [0, 1.57],
+#      'anchor_bottom_heights': [{bottom:g}], 'align_center': False, 'feature_map_stride': 8,
+#      'matched_threshold': {matched:g}, 'unmatched_threshold': {unmatched:g}}},
+"""
+
+_LONG_M = 3.0
+"""Classes of this mean length and more get the thresholds that OpenPCDet gives vehicles, others those of people."""
+
 _PASTING = """\
         - NAME: gt_sampling
           USE_ROAD_PLANE: False
@@ -127,7 +141,16 @@ def configuration(about: SiteSummary) -> str:
     return _TEXT.format(
         present=", ".join(f"'{name}'" for name in names),
         grid=", ".join(f"{value:g}" for value in grid),
+        anchors="".join(_anchor(about, name) for name in names),
         map=",\n".join(f"    '{name}': '{_KITTI[name]}'" for name in CLASSES),
         pasting=pasting if well else "",
         voxel=f"{VOXEL_M:g}, {VOXEL_M:g}, {(grid[5] - grid[2]) / _LEVELS:g}",
     )
+
+
+def _anchor(about: SiteSummary, name: str) -> str:
+    """The lines of a class in the model's list of anchors."""
+    *size, bottom = about.anchors[name]
+    matched, unmatched = (0.55, 0.4) if size[0] >= _LONG_M else (0.5, 0.35)
+    sizes = ", ".join(f"{value:g}" for value in size)
+    return _ANCHOR.format(name=name, size=sizes, bottom=bottom, matched=matched, unmatched=unmatched)

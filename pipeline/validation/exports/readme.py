@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.core.version import __version__
-from pipeline.effects import registry
+from pipeline.effects import on_traffic
 from pipeline.validation.classes import CLASSES
 from pipeline.validation.exports import openpcdet
 from pipeline.validation.exports.layouts import LAYOUTS, Layout
@@ -117,7 +117,7 @@ def _labels(sites: Sequence[SiteSummary]) -> str:
 
 def _making(record: UnseenRecord, sites: Sequence[SiteSummary]) -> str:
     scenario, scene = record.scenario, record.scene
-    traffic = [effect.NAME for effect in registry.named(scenario, "traffic")]
+    traffic = [effect.NAME for effect in on_traffic.live(scenario)[0]]
     beams = [effect.NAME for effect in scene.effects if effect.NAME != _IDLE]
     noise = {about.sensor: about.range_sigma_m for about in sites}
     numbers = record.numbers
@@ -155,8 +155,9 @@ cp HERE/{first.site}/{openpcdet.FILE} tools/cfgs/dataset_configs/
 python -m pcdet.datasets.custom.custom_dataset create_custom_infos tools/cfgs/dataset_configs/{openpcdet.FILE}
 ```
 
-The list of classes stands in two files of OpenPCDet: `class_names` at the end of `custom_dataset.py`, `CLASS_NAMES` in
-the model's configuration (with an anchor for each). Here it is
+The list of classes stands in two files of OpenPCDet: `class_names` at the end of `custom_dataset.py`, and
+`CLASS_NAMES` in the model's configuration, with an anchor for each; both stand ready in the first lines of
+`{openpcdet.FILE}`. The classes here are
 
 ```
 [{names}]

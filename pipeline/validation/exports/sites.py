@@ -56,6 +56,8 @@ class SiteSummary:
         Labelled boxes by class.
     pasted
         Of the frames for training, those with at least :data:`WELL_SEEN` points by class.
+    anchors
+        Length, width, height and z of the bottom in the level frame by class, means over the labelled boxes.
     low_m, high_m
         The smallest box round all labelled boxes in the region of interest, in the level frame; of all labelled ones
         where none is in it, of nothing where there are none.
@@ -76,6 +78,7 @@ class SiteSummary:
     in_roi_labelled: int = 0
     classes: Counter[str] = field(default_factory=Counter)
     pasted: Counter[str] = field(default_factory=Counter)
+    anchors: dict[str, list[float]] = field(default_factory=dict)
     low_m: list[float] = field(default_factory=list)
     high_m: list[float] = field(default_factory=list)
 
@@ -137,7 +140,7 @@ def write_site(
         return _Written(frame, name, len(points), kinds, on_box, boxes, wanted)
 
     training = set(record.numbers[: max(1, int(TRAINING * record.frames + 1e-9))].tolist())
-    within, around = _Extent(), _Extent()
+    within, around, sums = _Extent(), _Extent(), dict[str, NDArray[np.float64]]()
     with (folder / "objects.csv").open("w", encoding="utf-8", newline="") as file:
         rows = csv.writer(file, lineterminator="\n")
         rows.writerow(COLUMNS)
@@ -147,8 +150,10 @@ def write_site(
             seen = written.on_box > 0
             around.add(written.level[seen])
             within.add(written.level[seen & written.wanted])
+            _add_sizes(sums, written, seen)
             progress("frames", done, record.frames)
     about.low_m, about.high_m = within.bounds() or around.bounds() or ([], [])
+    about.anchors = {name: (sums[name] / about.classes[name]).round(2).tolist() for name in sorted(sums)}
     for name in ("train", "val", "empty"):
         _write_lines(folder / "ImageSets" / f"{name}.txt", getattr(about, name))
     files.write_text(folder / "about.json", json.dumps(about.to_json(), indent=2, sort_keys=True) + "\n")
@@ -197,6 +202,13 @@ def _count(about: SiteSummary, written: _Written, *, in_training: bool) -> None:
     about.classes.update(written.classes[i] for i in np.flatnonzero(seen))
     if in_training:
         about.pasted.update(written.classes[i] for i in np.flatnonzero(written.on_box >= WELL_SEEN))
+
+
+def _add_sizes(sums: dict[str, NDArray[np.float64]], written: _Written, seen: NDArray[np.bool_]) -> None:
+    """Sums of length, width, height and z of the bottom by class grow by the boxes that are seen."""
+    for at in np.flatnonzero(seen):
+        box, name = written.level[at], written.classes[at]
+        sums[name] = sums.get(name, np.zeros(4)) + np.append(box[3:6], box[2] - box[5] / 2)
 
 
 def _write_lines(path: Path, lines: Sequence[str]) -> None:

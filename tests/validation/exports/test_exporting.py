@@ -210,6 +210,9 @@ def test_openpcdet_gets_a_grid_that_holds_the_labels(four, tmp_path):
             assert (np.array(about.low_m) >= grid[:3]).all() and (np.array(about.high_m) <= grid[3:]).all()
         assert ("gt_sampling" in text) == bool(about.pasted)
         assert text.count("{") == text.count("}")
+        ground = -{"level": 3, "tilted": 4, "rolled": 5, "behind": 6.2}[about.site]
+        anchor = "'Car', 'anchor_sizes': [[4.5, 1.8, 1.5]]", f"'anchor_bottom_heights': [{ground}]"
+        assert all((words in text) == bool(about.labelled) for words in anchor)
 
 
 # ---- bad input
