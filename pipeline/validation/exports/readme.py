@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections import Counter
 from collections.abc import Sequence
 
@@ -141,7 +142,7 @@ def _making(record: UnseenRecord, sites: Sequence[SiteSummary]) -> str:
 
 
 def _openpcdet(sites: Sequence[SiteSummary]) -> str:
-    first = sites[0]
+    first = shlex.quote(sites[0].site)
     names = ", ".join(f"'{name}'" for name in CLASSES if any(about.classes[name] for about in sites))
     return f"""\
 ## Training with OpenPCDet
@@ -150,8 +151,8 @@ Each site's folder is a custom dataset, and `{openpcdet.FILE}` in it the configu
 labelled boxes in the region of interest). From OpenPCDet's folder, with this one as HERE:
 
 ```
-cp -r HERE/{first.site}/. data/custom/
-cp HERE/{first.site}/{openpcdet.FILE} tools/cfgs/dataset_configs/
+cp -r HERE/{first}/. data/custom/
+cp HERE/{first}/{openpcdet.FILE} tools/cfgs/dataset_configs/
 python -m pcdet.datasets.custom.custom_dataset create_custom_infos tools/cfgs/dataset_configs/{openpcdet.FILE}
 ```
 
@@ -162,4 +163,7 @@ The list of classes stands in two files of OpenPCDet: `class_names` at the end o
 ```
 [{names}]
 ```
+
+Frames have the same names at all sites. To learn from several at once, put the site's name before those of its files
+and lists; a grid and anchors for all follow from the ranges and heights in each `{openpcdet.FILE}`.
 """
