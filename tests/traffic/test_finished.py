@@ -14,7 +14,7 @@ from pipeline.runs import stage_keys
 from pipeline.scenario.traffic import TrafficModel
 from pipeline.stages import traffic
 from pipeline.stages.base import Workspace
-from pipeline.studies.variants import counted_frames
+from pipeline.studies.lengths import counted_frames
 from tests.checks.conftest import net_xml
 from tests.conftest import fcd
 from tests.stages import inputs_of
