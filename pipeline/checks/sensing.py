@@ -10,8 +10,11 @@ from pipeline.core.errors import InputError
 from pipeline.core.findings import Finding
 from pipeline.effects import registry
 from pipeline.effects.base import Effect
-from pipeline.sensing import sensors
+from pipeline.sensing import beam_tables, sensors
 from pipeline.sensing.scene import Scene
+
+MOST_LISTED = 5
+"""So many repeated beams of a table are named."""
 
 
 def known(subject: Subject) -> Iterator[Finding]:
@@ -25,6 +28,27 @@ def known(subject: Subject) -> Iterator[Finding]:
             sensors.of_scenario(sensor, subject.scenario, f"site {of[0]}{more}")
         except InputError as error:
             yield Finding.of("sensors", error)
+
+
+def repeated(subject: Subject) -> Iterator[Finding]:
+    """A warning for each table of beams that names a direction twice."""
+    scenario = subject.scenario
+    for name in dict.fromkeys(site.sensor for site in subject.sites):
+        model = scenario.sensors.get(name)
+        if model is None or model.beams is None:
+            continue
+        try:
+            table = sensors.of_scenario(name, scenario, name).table
+        except InputError:
+            continue  # told elsewhere
+        if table is not None and (twice := beam_tables.repeated(table)):
+            listed = ", ".join(f"beam {beam} as beam {first}" for beam, first in twice[:MOST_LISTED])
+            more = ", ..." if twice[MOST_LISTED:] else ""
+            what = (
+                f"{len(twice)} of {len(table)} beams point where an earlier one does ({listed}{more}) and count again"
+            )
+            cure = "each direction once (azimuths of 0 and 360 degrees are the same)"
+            yield Finding("repeated beams", model.beams, what, cure)
 
 
 def complete(subject: Subject) -> Iterator[Finding]:

@@ -101,6 +101,7 @@ class Georeference:
         if declared is not None and declared != WORLD:
             reading = self._declared(xy, place, declared)
         elif declared == WORLD or not len(xy):
+            self.metres(xy, place, right)
             reading = IN_WORLD
         else:
             reading = self._judged(xy, place, right)
@@ -162,6 +163,10 @@ class Georeference:
     def _judged(self, xy: Floats, place: str, right: str) -> Reading:
         """The reading of coordinates that nobody has declared."""
         if not _may_be_degrees(xy):
+            if (odd := _no_degrees_among_degrees(xy)) is not None:
+                found = f"{_span(xy)} are no metres (most lie within {_CLOSE_M:g} m of the next),"
+                found += f" and ({odd[0]:.10g}, {odd[1]:.10g}) is no longitude and latitude beside the others"
+                raise InputError(place, found, right)
             return IN_WORLD
         if self.frame is not None:
             believed_m = COUNTRY_M if _is_one_place(xy) else NEAR_M
@@ -242,14 +247,28 @@ def _is_one_place(xy: Floats) -> bool:
     1e-4."""
     if np.ptp(xy, axis=0).max() >= _SMALL_M:
         return False
+    return _is_close_together(xy) or not np.diff(xy, axis=0).any()
+
+
+def _is_close_together(xy: Floats) -> bool:
+    """Whether most numbers, as metres, are within a centimetre of the next; not where all are the same."""
     steps = np.hypot(*np.diff(xy, axis=0).T)
     steps = steps[steps > 0]
-    return not len(steps) or bool(np.median(steps) < _CLOSE_M)
+    return bool(len(steps)) and bool(np.median(steps) < _CLOSE_M)
 
 
 def _is_collapsed(xy: Floats) -> bool:
     """Whether numbers, as metres, would all be at one place although they differ."""
     return _is_one_place(xy) and bool(np.ptp(xy, axis=0).max() > 0)
+
+
+def _no_degrees_among_degrees(xy: Floats) -> Floats | None:
+    """Of numbers that differ as degrees of buildings do, but cannot all be degrees of one place, one that is none."""
+    middle = np.median(xy, axis=0)
+    if not _is_close_together(xy) or (np.abs(middle) > (540.0, 90.0)).any():
+        return None
+    beyond = xy[(np.abs(xy) > (180.0, 90.0)).any(axis=1)]
+    return beyond[0] if len(beyond) else xy[np.argmax(np.abs(xy - middle).max(axis=1))]
 
 
 def _span(xy: Floats) -> str:

@@ -17,6 +17,8 @@ _OF_RINGS = ("channels", "azimuth_offsets_deg", "azimuth_step_deg", "azimuth_deg
 
 Elevation = Annotated[float, Field(ge=-90, le=90)]
 Azimuth = Annotated[float, Field(ge=-360, le=360)]
+Turns = Annotated[float, Field(ge=-1e6, le=1e6)]
+"""Of more, no digit after the whole turns is left."""
 
 
 class PatternModel(StrictModel):
@@ -28,7 +30,7 @@ class PatternModel(StrictModel):
     samples: int = Field(ge=1, le=MOST_BEAMS, description="Beams of one frame")
     azimuth_deg: tuple[Azimuth, Azimuth] = Field(description="From where to where")
     elevation_deg: tuple[Elevation, Elevation] = Field(description="From where to where")
-    turns: tuple[float, float] | None = Field(None, description="Of the two prisms in one frame, for a rosette")
+    turns: tuple[Turns, Turns] | None = Field(None, description="Of the two prisms in one frame, for a rosette")
 
     @model_validator(mode="after")
     def _consistent(self) -> PatternModel:
@@ -49,7 +51,7 @@ class SensorModel(StrictModel):
         (), description="One a ring; or the first and the last of `channels` uniform ones"
     )
     channels: int | None = Field(None, ge=1, description="Rings, uniform between two elevations_deg")
-    azimuth_offsets_deg: tuple[float, ...] = Field((), description="One a ring, added to each azimuth; none: all 0")
+    azimuth_offsets_deg: tuple[Azimuth, ...] = Field((), description="One a ring, added to each azimuth; none: all 0")
     azimuth_step_deg: Positive | None = Field(
         None, description="Between two beams of a ring; divides 360, or the width of azimuth_deg"
     )

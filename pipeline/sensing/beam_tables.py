@@ -70,6 +70,15 @@ class BeamTable:
         return first, first + 360.0 - float(gaps[widest])
 
 
+def repeated(table: BeamTable) -> list[tuple[int, int]]:
+    """Beams that point where an earlier one does, to 1e-6 degree: (beam, the earlier one), by beam."""
+    elevation, azimuth = np.round(table.elevation_deg, _DIGITS), np.round(np.mod(table.azimuth_deg, 360.0), _DIGITS)
+    azimuth = np.where(np.abs(elevation) == 90.0, 0.0, np.mod(azimuth, 360.0))
+    _, first, which = np.unique(np.column_stack([elevation, azimuth]), axis=0, return_index=True, return_inverse=True)
+    earlier = first[which.ravel()]
+    return [(int(beam), int(earlier[beam])) for beam in np.flatnonzero(earlier != np.arange(len(table)))]
+
+
 def read(path: Path) -> BeamTable:
     """Read a CSV with the columns ``elevation_deg`` and ``azimuth_deg``, one row a beam; others are not read.
 

@@ -296,6 +296,9 @@ def _csv(path: Path, world: Georeference) -> Iterator[_Row]:
         with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.DictReader(file, skipinitialspace=True)
             names = list(reader.fieldnames or ())
+            if len(names) == 1 and (other := next((mark for mark in (";", "\t", "|") if mark in names[0]), None)):
+                right = "commas, and decimal points in the numbers"
+                raise InputError(path, f"its columns are separated by {other!r}", right)
             if twice := sorted({name for name in names if names.count(name) > 1}):
                 raise InputError(path, f"the column {twice[0]!r} stands there twice", "each column once")
             for row in reader:

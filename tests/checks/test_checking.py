@@ -324,6 +324,17 @@ def test_findings_errors_are_errors_of_input(street: Path) -> None:
     assert len(str(caught.value).splitlines()) == 2
 
 
+def test_a_table_with_beams_twice_is_told_with_the_beams(street: Path) -> None:
+    """They count twice, since a table is taken as it is."""
+    (street / "beams.csv").write_text("elevation_deg,azimuth_deg\n-5,0\n-5,90\n-5,360\n-9,0\n")
+    told = found(street, 'sensors.own={beams="beams.csv",range_m=90}', 'sites.sensor="own"', 'sites.aim="roi"')
+    assert told == {
+        "repeated beams": [
+            "[beams.csv: 1 of 4 beams point where an earlier one does (beam 2 as beam 0) and count again]"
+        ]
+    }
+
+
 # ---- files, and the keys of the stage
 
 

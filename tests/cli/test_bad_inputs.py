@@ -190,6 +190,11 @@ BAD: dict[str, tuple[Change, str]] = {
         r"row a: unknown column 'yaw_dge'; did you mean yaw_deg\?",
     ),
     "sites with a column without a name": (sites("0,a,1,12,3", head=",site,x_m,y_m,z_m"), r"a column is named ''"),
+    "sites with semicolons": (
+        put("sites.csv", "site;x_m;y_m;z_m\na;1,5;12;3\n"),
+        r"sites.csv: its columns are separated by ';'; commas, and decimal points in the numbers",
+    ),
+    "sites with tabs": (put("sites.csv", "site\tx_m\ty_m\tz_m\n"), r"sites.csv: its columns are separated by '\\t'"),
     "sites ragged": (sites("a,1,12"), r"row a: has more or fewer values"),
     "site twice": (sites("a,1,12,3", "a,2,12,3"), r"site 'a' stands there twice"),
     "site NaN": (sites("a,nan,12,3"), r"row a: x_m: 'nan'"),

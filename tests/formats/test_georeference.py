@@ -80,6 +80,11 @@ def test_a_projection_of_the_world_itself_is_taken_where_nothing_says_what_the_w
         (HERE, CORNERS, "EPSG:25832", "they would lie beside it as metres of the world frame"),
         (HERE, CORNERS + 1e5, WORLD, r"\(141 km\) as metres of the world frame"),
         (NOWHERE, CORNERS + 1e5, None, r"\(141 km\) as metres of the world frame"),
+        (HERE, np.add(DEGREES, (361.28, 0.0)), None, r"are no metres .*, and \(371.* is no longitude and latitude"),
+        (HERE, [*DEGREES, [371.0, 50.86], *DEGREES], None, r"are no metres .*, and \(371, 50.86\) is no longitude"),
+        (HERE, [*DEGREES, [97.2, 50.86], *DEGREES], None, r"are no metres .*, and \(97.2, 50.86\) is no longitude"),
+        (NOWHERE, np.add(DEGREES, (361.28, 0.0)), None, r"are no metres .*, and \(371.* is no longitude and latitude"),
+        (HERE, DEGREES, WORLD, "are longitude and latitude: 0 m from the region of interest as such"),
         (HERE, CORNERS, "EPSG:999999", "'EPSG:999999' is none that is known"),
     ],
 )  # fmt: skip
@@ -89,6 +94,14 @@ def test_what_is_in_neither_is_refused_by_name(
     with pytest.raises(InputError, match=message) as caught:
         taken(world, np.asarray(xy), declared)
     assert str(caught.value).startswith("a.geojson: ")
+
+
+def test_what_is_drawn_in_centimetres_beside_metres_is_taken_as_it_is() -> None:
+    """A thin pole, whether its file says metres itself or nothing."""
+    turn = np.linspace(0.0, 2 * np.pi, 65)
+    pole = np.add([700.0, 1230.0], 0.05 * np.column_stack([np.cos(turn), np.sin(turn)]))
+    assert taken(HERE, pole, WORLD) is pole
+    assert taken(HERE, pole) is pole
 
 
 def test_columns_that_say_metres_may_not_hold_degrees() -> None:

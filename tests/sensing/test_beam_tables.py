@@ -44,6 +44,14 @@ def test_a_coarse_table_of_a_whole_turn_looks_to_no_side(
     assert table.azimuth_span_deg == span
 
 
+def test_beams_that_repeat_an_earlier_one_are_found() -> None:
+    """0, 360 and -360 degrees are one azimuth; straight up, every azimuth is the same."""
+    beams = [(0, 0), (0, 90), (0, 360), (90, 10), (5, 0), (0, -360), (90, 200), (0, 1e-7), (0, -270)]
+    table = BeamTable(*np.array(beams, dtype=np.float64).T)
+    assert beam_tables.repeated(table) == [(2, 0), (5, 0), (6, 3), (7, 0), (8, 1)]
+    assert beam_tables.repeated(BeamTable(np.zeros(2), np.array([0.0, 1.0]))) == []
+
+
 # --- fields of view ---------------------------------------------------------------------------------------------------
 
 

@@ -202,6 +202,16 @@ def test_own_sensors():
         {"beams": "table.csv", "azimuth_deg": (-60.0, 60.0)},
         {"beams": "table.csv", "channels": 3},
         {"pattern": {"kind": "rosette", "samples": 9, "azimuth_deg": (-1, 1), "elevation_deg": (-1, 1)}},
+        {"elevations_deg": (0.0,), "azimuth_offsets_deg": (1e300,), "azimuth_step_deg": 1.0},
+        {
+            "pattern": {
+                "kind": "rosette",
+                "turns": (1e300, 2),
+                "samples": 9,
+                "azimuth_deg": (-1, 1),
+                "elevation_deg": (-1, 1),
+            }
+        },
         {"pattern": {"kind": "even", "samples": 9, "azimuth_deg": (1, -1), "elevation_deg": (-1, 1)}},
     ],
 )
