@@ -23,8 +23,8 @@ def keep_beside(kernels: Path) -> None:
     import numba
 
     every = hashlib.sha256()
-    for path in sorted(kernels.glob("*.py")):
-        every.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
+    for path in sorted(kernels.rglob("*.py")):
+        every.update(path.relative_to(kernels).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
     name = f"numba-{every.hexdigest()[:12]}"
     for parent in _parents(kernels):
         try:

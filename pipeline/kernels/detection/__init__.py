@@ -1,0 +1,1 @@
+"""Kernels of detectors, which find vehicles in point clouds."""
