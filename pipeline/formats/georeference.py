@@ -267,8 +267,9 @@ def _no_degrees_among_degrees(xy: Floats) -> Floats | None:
     middle = np.median(xy, axis=0)
     if not _is_close_together(xy) or (np.abs(middle) > (540.0, 90.0)).any():
         return None
-    beyond = xy[(np.abs(xy) > (180.0, 90.0)).any(axis=1)]
-    return beyond[0] if len(beyond) else xy[np.argmax(np.abs(xy - middle).max(axis=1))]
+    beyond = (np.abs(xy) > (180.0, 90.0)).any(axis=1)
+    found: Floats = xy[np.argmax(beyond if beyond.any() else np.abs(xy - middle).max(axis=1))]
+    return found
 
 
 def _span(xy: Floats) -> str:
