@@ -126,6 +126,8 @@ _PROMISED: dict[str, tuple[str, ...]] = {
     "scans": ("sites",),
     "visibility": ("grid", "sites"),
     "accuracy": ("inputs", "tolerance", "stages"),
+    "detection": ("inputs", "frames", "stages"),
+    "correlation": ("inputs", "frames", "stages", "own_score", "shown"),
 }
 """What the metadata of an artefact must hold for those who read it."""
 
@@ -165,7 +167,7 @@ def _is_sound(key: str, value: Any) -> bool:
         return periods.are_sound(value)
     if key == "inputs":
         return isinstance(value, str)
-    if key == "stages":
+    if key in ("stages", "own_score", "shown"):
         return isinstance(value, dict)
     if key in ("tolerance", "memory_frames"):
         return isinstance(value, float) and 0 < value < math.inf

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.artefacts import schemas, tables
+from pipeline.artefacts import tables
 from pipeline.core.findings import Finding
 from pipeline.core.grid import Roi
 from pipeline.validation.frames import TrafficFrame
@@ -99,7 +99,7 @@ def write(path: Path, rows: Sequence[SiteDetection], metadata: Mapping[str, Any]
     for name in MEASURES:
         columns[name] = [row.measures[name].value for row in rows]
         columns[f"{name}_se"] = [row.measures[name].se for row in rows]
-    tables.write(path, "detection", columns, {"schema": schemas.VERSION, **metadata})
+    tables.write(path, "detection", columns, dict(metadata))
 
 
 PRECISION = tuple(

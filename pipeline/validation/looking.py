@@ -7,10 +7,14 @@ so neither cores nor order matter.
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
 import tempfile
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+import threading
+from collections.abc import Generator, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,6 +22,7 @@ from pathlib import Path
 from pipeline.artefacts import schemas
 from pipeline.core import code_digest, files, parallel
 from pipeline.core.cost import Cost, measured
+from pipeline.core.errors import RunError
 from pipeline.core.progress import Progress, silent
 from pipeline.effects import registry as effects
 from pipeline.effects.base import Effect
@@ -36,6 +41,16 @@ from pipeline.validation.unseen_record import UnseenRecord
 
 _Task = tuple[Site, Sequence[str]]
 """A site, and the detectors that look from it."""
+
+
+class LookListener:
+    """Hears how far the looking is; this one does nothing with it."""
+
+    def begins(self, missing: Mapping[str, Sequence[str]], frames: int, processes: int) -> None:
+        """Once: the detectors that have to look from each site; none where all was kept."""
+
+    def looked(self, site: str, detectors: Sequence[str], cost: Cost) -> None:
+        """A site is done, for these detectors."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +112,12 @@ _KIND = {FoundPoints: "points", FoundBoxes: "detections"}
 
 
 def look_from(
-    sites: Sequence[Site], look: Look, *, jobs: int | None = None, progress: Progress = silent
+    sites: Sequence[Site],
+    look: Look,
+    *,
+    jobs: int | None = None,
+    progress: Progress = silent,
+    listener: LookListener | None = None,
 ) -> dict[str, dict[str, Found]]:
     """What every detector finds from each site, by site and detector, in their order.
 
@@ -110,40 +130,62 @@ def look_from(
     ------
     InputError
         For a site where no sensor can stand, or whose scan was measured.
+    RunError
+        Where a process was ended from outside.
     """
-    names = [POINTS, *look.detectors]
+    names, told = [POINTS, *look.detectors], listener or LookListener()
     found: dict[str, dict[str, Found]] = {}
     for site in sites:
         known = {name: _taken(_kind_of(name), look.key(site, name)) for name in names}
         found[site.name] = {name: its for name, its in known.items() if its is not None}
     missing = {site.name: [name for name in names if name not in found[site.name]] for site in sites}
     tasks = [(site, missing[site.name]) for site in sites if missing[site.name]]
-    done = len(sites) - len(tasks)
+    done, processes = len(sites) - len(tasks), min(parallel.threads(jobs), len(tasks))
+    told.begins(missing, look.record.frames, processes)
     progress("sites looked from", done, len(sites))
-    for site, its, cost in _each(look, tasks, parallel.threads(jobs)):
-        for name, what in its.items():
-            _put(_kind_of(name), look.key(site, name), what, cost)
-        found[site.name] |= its
-        done += 1
-        progress("sites looked from", done, len(sites))
+    with closing(_each(look, tasks, processes)) as each:
+        for site, its, cost in each:
+            for name, what in its.items():
+                _put(_kind_of(name), look.key(site, name), what, cost)
+            found[site.name] |= its
+            done += 1
+            told.looked(site.name, missing[site.name], cost)
+            progress("sites looked from", done, len(sites))
     return {site.name: {name: found[site.name][name] for name in names} for site in sites}
 
 
-def _each(look: Look, tasks: Sequence[_Task], processes: int) -> Iterator[tuple[Site, dict[str, Found], Cost]]:
-    """Every task's findings, as they are ready; what is not begun when an error ends it is not begun any more."""
-    processes = min(processes, len(tasks))
+def _each(
+    look: Look, tasks: Sequence[_Task], processes: int
+) -> Generator[tuple[Site, dict[str, Found], Cost], None, None]:
+    """Every task's findings, as they are ready; when an error or an interrupt ends it, what is at work ends too."""
     if processes <= 1:
         for task in tasks:
             yield task[0], *_looked(look, task)
         return
-    spawned = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(processes, spawned, _begin, (look,)) as pool:
-        waiting = {pool.submit(_work, task): task[0] for task in tasks}
-        try:
-            for future in as_completed(waiting):
-                yield waiting[future], *future.result()
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+    others = set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _begin, (look,))
+    try:
+        waiting = _submitted(pool, tasks)
+        for future in as_completed(waiting):
+            yield waiting[future], *future.result()
+        pool.shutdown()
+    except BrokenProcessPool:
+        cure = "was memory short? fewer --jobs need less, and what is done is kept"
+        raise RunError(f"a process that looked from a site was ended from outside; {cure}") from None
+    finally:
+        for process in set(multiprocessing.active_children()) - others:
+            process.terminate()
+        pool.shutdown(cancel_futures=True)
+
+
+def _submitted(pool: ProcessPoolExecutor, tasks: Sequence[_Task]) -> dict[Future[tuple[dict[str, Found], Cost]], Site]:
+    """All tasks, begun. Processes begin with the signals that are blocked here, and keep to that: an interrupt at the
+    terminal reaches all, and is answered by the one that the user sees."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        return {pool.submit(_work, task): task[0] for task in tasks}
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _looked(look: Look, task: _Task) -> tuple[dict[str, Found], Cost]:
@@ -159,7 +201,15 @@ _ready: Look | None = None
 def _begin(look: Look) -> None:
     global _ready
     _ready = look
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that the user sees ends the pool
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """A pool's process would wait for work for ever where its parent was killed."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 def _work(task: _Task) -> tuple[dict[str, Found], Cost]:
@@ -185,4 +235,7 @@ def _put(kind: type[Found], key: str, found: Found, cost: Cost) -> None:
     with tempfile.TemporaryDirectory(prefix="egvs-findings-") as folder:
         path = Path(folder) / name
         found.write(path, {"inputs": key})
-        Store.default().put(_KIND[kind], key, Path(folder), Made({name: files.sha256_of(path)}, {}, {}, cost))
+        store = Store.default()
+        with store.maker(_KIND[kind], key, wait=False) as mine:
+            if mine:  # else another process is putting the same
+                store.put(_KIND[kind], key, Path(folder), Made({name: files.sha256_of(path)}, {}, {}, cost))

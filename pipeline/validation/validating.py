@@ -18,19 +18,20 @@ from numpy.typing import NDArray
 from pipeline.artefacts import schemas, tables
 from pipeline.core import files
 from pipeline.core.errors import InputError
-from pipeline.core.findings import Finding, warnings_of
+from pipeline.core.findings import WARNINGS, Finding, seen_from, warnings_of
 from pipeline.core.progress import Progress, silent
 from pipeline.runs import stage_keys, stages
 from pipeline.runs.locking import alone
-from pipeline.runs.workflow import refresh_report
+from pipeline.runs.stages import RANKING
+from pipeline.runs.workflow import bring, refresh_report
 from pipeline.scenario.models import Scenario
 from pipeline.stages.base import Workspace
 from pipeline.validation import detection, figure, unseen_traffic
-from pipeline.validation.agreement import BOXED, COUNTED, Agreement, ScoreName, Validation
+from pipeline.validation.agreement import BOXED, COUNTED, Agreement, ScoreName, Validation, main_measure
 from pipeline.validation.detection import ALL, SiteDetection
 from pipeline.validation.detectors import registry
 from pipeline.validation.frames import TrafficFrame
-from pipeline.validation.looking import Look, look_from
+from pipeline.validation.looking import Look, LookListener, look_from
 from pipeline.validation.site_findings import POINTS
 from pipeline.validation.statistics.coefficients import KINDS
 from pipeline.validation.statistics.correlation import Study
@@ -50,6 +51,7 @@ def validate(
     detectors: Sequence[str] = (POINTS,),
     jobs: int | None = None,
     progress: Progress = silent,
+    listener: LookListener | None = None,
 ) -> Validation:
     """Validate the scores of a scenario's sites.
 
@@ -59,6 +61,8 @@ def validate(
         The run's folder.
     frames
         Of unseen traffic.
+    listener
+        Hears how far the looking is.
     detectors
         Names; points on vehicles are always counted.
 
@@ -73,13 +77,14 @@ def validate(
         record = prepare(scenario, Path(folder) / "unseen", frames, jobs=jobs, progress=progress)
         watched = list(record.read())
         _refuse_empty(scenario, record, watched)
-        found = look_from(record.scene.sites, Look(record, chosen), jobs=jobs, progress=progress)
+        look = Look(record, chosen)
+        found = look_from(record.scene.sites, look, jobs=jobs, progress=progress, listener=listener)
         rows, undefined = detection.measured(watched, record.scene.roi, found)
         surrogates = gathering.surrogates_of(scenario, Path(folder) / "scores", jobs=jobs, progress=progress)
         agreements = correlated(scenario, rows, surrogates)
         told = (*doubts, *_not_unseen(scenario), *undefined, *surrogates.skipped)
         done = Validation(tuple(rows), surrogates, tuple(agreements), told)
-        _write(out, scenario, record, done)
+        _write(out, Path(folder), scenario, record, done)
         refresh_report(out)
     return done
 
@@ -149,17 +154,46 @@ def _not_unseen(scenario: Scenario) -> list[Finding]:
     return [Finding("seen traffic", f"{scenario.file}: traffic.fcd", what, "a network or a sumocfg has traffic unseen")]
 
 
-def _write(out: Path, scenario: Scenario, record: UnseenRecord, done: Validation) -> None:
-    about: dict[str, Any] = {
+def _write(out: Path, folder: Path, scenario: Scenario, record: UnseenRecord, done: Validation) -> None:
+    """All artefacts or none: they are made aside, then renamed."""
+    aside = folder / "done"
+    aside.mkdir()
+    about = _about(folder / "scores", scenario, record, done)
+    detection.write(aside / detection.ARTEFACT, done.detections, about)
+    done.surrogates.write(aside / gathering.ARTEFACT, scenario)
+    _write_correlation(aside / CORRELATION, done, about)
+    figure.draw(aside / figure.ARTEFACT, scenario, done)
+    for made in sorted(aside.iterdir()):
+        made.replace(out / made.name)
+
+
+def _about(folder: Path, scenario: Scenario, record: UnseenRecord, done: Validation) -> dict[str, Any]:
+    """Metadata; what the report must know to show this beside the run that it is of, and to no other."""
+    own, detectors = done.own_score(scenario), dict.fromkeys(row.detector for row in done.detections)
+    warnings = {WARNINGS: [doubt.to_json() for doubt in done.doubts]}
+    return {
+        "schema": schemas.VERSION,
         "scenario": {"name": scenario.name, "hash": files.hash_of(scenario.model_dump(mode="json"))},
         "seed": scenario.seed,
         "unseen_seed": record.scenario.seed,
         "frames": record.frames,
         "apart_s": unseen_traffic.APART_S,
         "inputs": files.hash_of([record.keys, done.surrogates.inputs]),
+        "stages": _stages(scenario, folder),
+        "own_score": {"score": own.score, "parameters": own.parameters},
+        "shown": {detector: main_measure(detector) for detector in detectors},
+        **seen_from(scenario.folder, warnings),
     }
-    detection.write(out / detection.ARTEFACT, done.detections, about)
-    done.surrogates.write(out / gathering.ARTEFACT, scenario)
+
+
+def _stages(scenario: Scenario, folder: Path) -> dict[str, str]:
+    """The keys of a run's stages, from the artefacts that the scores were worked out of."""
+    work = Workspace(scenario, folder)
+    bring(work, "tpog")  # the last one there may have other voxels
+    return {name: stage_keys.inputs(name, work).key for name in RANKING}
+
+
+def _write_correlation(path: Path, done: Validation, about: dict[str, Any]) -> None:
     columns: dict[str, list[Any]] = {
         "score": [its.score.score for its in done.agreements],
         "parameters": [its.score.parameters for its in done.agreements],
@@ -172,5 +206,4 @@ def _write(out: Path, scenario: Scenario, record: UnseenRecord, done: Validation
         columns[kind] = [its.value for its in each]
         columns[f"{kind}_low"] = [its.interval.low for its in each]
         columns[f"{kind}_high"] = [its.interval.high for its in each]
-    tables.write(out / CORRELATION, "correlation", columns, {"schema": schemas.VERSION, **about})
-    figure.draw(out / figure.ARTEFACT, scenario, done)
+    tables.write(path, "correlation", columns, about)
