@@ -123,6 +123,26 @@ def read_accuracy(path: str | Path) -> tuple[list[dict[str, Any]], dict[str, Any
     return table.to_pylist(), about
 
 
+def read_validation(
+    detection: str | Path, correlation: str | Path
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]], dict[str, Any]] | None:
+    """Rows of ``detection.parquet`` and of ``correlation.parquet``, and the latter's metadata; None where one of them
+    is not there, or they are of different validations.
+    """
+    paths = Path(detection), Path(correlation)
+    if not all(path.is_file() for path in paths):
+        return None
+    found = []
+    for path in paths:
+        try:
+            found.append(tables.read(path, path.stem))
+        except InputError as error:
+            right = f"remove it, or run egvs validate again ({error})"
+            raise InputError(path, "is not what egvs validate writes", right) from None
+    (detected, one), (correlated, about) = found
+    return (detected.to_pylist(), correlated.to_pylist(), about) if one["inputs"] == about["inputs"] else None
+
+
 def read_visibility(path: str | Path, site: str) -> NDArray[np.float64]:
     """Hits of one site in every voxel, (nx, ny, nz) float64, from ``visibility.parquet``."""
     path = Path(path)

@@ -22,6 +22,7 @@ from pipeline.core import files
 from pipeline.core.findings import WARNINGS, warnings_of
 from pipeline.core.version import __version__
 from pipeline.report import figures, wording
+from pipeline.report.detected import VALIDATION, ValidationSummary
 from pipeline.report.drawing import maps
 from pipeline.report.drawing.colours import STYLE_SHEET
 from pipeline.report.drawing.roads import network_file
@@ -66,7 +67,8 @@ def inputs(work: Workspace) -> StageInputs:
     else:
         cast = scan_inputs(work)
         settings["scan"], hashes = cast.settings, dict(cast.files)
-    hashes |= work.digests(*(name for name in (*read, PERIOD_SCORES, *ACCURACY) if work.path(name).is_file()))
+    beside = (PERIOD_SCORES, *ACCURACY, *VALIDATION)
+    hashes |= work.digests(*(name for name in (*read, *beside) if work.path(name).is_file()))
     if (roads := network_file(work.folder)) is not None:
         hashes[roads.relative_to(work.folder).as_posix()] = files.sha256_of(roads)
     # what a stage sums up is the same in every run, but for the seconds of SUMO, which are not shown
@@ -121,7 +123,8 @@ def run(work: Workspace, inputs: StageInputs) -> Summary:
     first, last = _listed(ranking)
     drawn = figures.draw(work, ranking, (*first, *last), tpog)
     work.progress("figures drawn", 2, 3)
-    html = page(work.scenario, ranking, tpog, drawn, stages, StudySummary.read(out, stages), PeriodRanking.read(out))
+    study, detected = StudySummary.read(out, stages), ValidationSummary.read(out, stages)
+    html = page(work.scenario, ranking, tpog, drawn, stages, study, PeriodRanking.read(out), detected)
     files.write_text(work.path(ARTEFACTS[0]), html)
     work.progress("page written", 3, 3)
     kilobytes = round(len(html.encode("utf-8")) / 1000)
@@ -136,6 +139,7 @@ def page(
     stages: Mapping[str, StageRecord],
     study: StudySummary | None,
     by_period: PeriodRanking | None = None,
+    detected: ValidationSummary | None = None,
 ) -> str:
     """The whole page, HTML text; ``stages`` are those that are known, in the order of ``STAGES``."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -166,6 +170,7 @@ def page(
         longest_s=max(seconds, default=0.0),
         artefacts=[artefact for stage in stages.values() for artefact in stage.artefacts.items()],
         study=study,
+        detected=detected,
         first=first,
         choices=(*first, *last),
         listed=LISTED,

@@ -178,7 +178,7 @@ def _about(folder: Path, scenario: Scenario, record: UnseenRecord, done: Validat
         "unseen_seed": record.scenario.seed,
         "frames": record.frames,
         "apart_s": unseen_traffic.APART_S,
-        "inputs": files.hash_of([record.keys, done.surrogates.inputs]),
+        "inputs": files.hash_of([record.keys, record.numbers.tolist(), list(detectors), done.surrogates.inputs]),
         "stages": _stages(scenario, folder),
         "own_score": {"score": own.score, "parameters": own.parameters},
         "shown": {detector: main_measure(detector) for detector in detectors},
