@@ -65,18 +65,19 @@ class Screen:
         if counts := summary.pop("counts", None):
             summary["worst GEH of counts"] = max(count["geh"] for count in counts)
         periods = summary.pop("periods", {}) if stage == "traffic" else {}
-        self._print(f"{stage:<8} {took:>10}   {in_words(summary)}")
+        self.say(f"{stage:<8} {took:>10}   {in_words(summary)}")
         for period, its in periods.items():
-            self._print(f"{period:>19}   {in_words(its)}")
+            self.say(f"{period:>19}   {in_words(its)}")
         for warning in warnings_of([record.summary]):
-            self._print(f"warning: {warning}")
+            self.say(f"warning: {warning}")
 
     def setting_event(self, name: str, state: str, about: dict[str, Any]) -> None:
         """A setting of a study is "done", "kept" or "skipped": one line, but for what the budget leaves out."""
         if about.get("beyond"):
             return
         took = f"{about['seconds']:.2f} s" if "seconds" in about else state
-        self._print(f"{took:>10}   {name}{' (kept)' if state == 'kept' else ''} {about.get('why', '')}")
+        self.say(f"{took:>10}   {name}{' (kept)' if state == 'kept' else ''} {about.get('why', '')}")
 
-    def _print(self, line: str) -> None:
+    def say(self, line: str) -> None:
+        """Print a line, above the bar."""
         self._console.print(line, markup=False)

@@ -1,17 +1,19 @@
-"""Tables of what validation has to tell: which scores there are, what was exported."""
+"""Tables and lines of what validation has to tell: scores, exports, how far it is, what it found."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.cli.terminal import console, table
 from pipeline.validation.agreement import main_measure
 from pipeline.validation.detection import ALL
+from pipeline.validation.looking import LookListener
 
 if TYPE_CHECKING:
+    from pipeline.core.cost import Cost
     from pipeline.scenario.models import Scenario
     from pipeline.validation.agreement import ScoreName, Validation
     from pipeline.validation.exports.exporting import Export
@@ -20,6 +22,9 @@ if TYPE_CHECKING:
     from pipeline.validation.surrogates.registry import Entry
 
 _FILE_WIDTH = 160
+
+FRAME_MS = {"points": 3.0, "cluster": 60.0, "pointpillars": 120.0}
+"""A frame of 57,600 beams with each detector, measured on one core of a small cloud machine; of points, its cloud."""
 
 
 def print_scores(entries: Iterable[Entry]) -> None:
@@ -109,3 +114,42 @@ def _word(value: Value) -> str:
     if isinstance(value, bool):
         return "on" if value else "off"
     return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+class LookLines(LookListener):
+    """Tells in lines.
+
+    Parameters
+    ----------
+    say
+        Prints a line.
+    """
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._say = say
+
+    def begins(self, missing: Mapping[str, Sequence[str]], frames: int, processes: int) -> None:
+        """What is left to do, and about how long that takes."""
+        names = list(dict.fromkeys(name for its in missing.values() for name in its))
+        left = sum(map(bool, missing.values()))
+        if not left:
+            self._say(f"all that detectors find from {len(missing)} sites was kept from before")
+            return
+        kept = f" ({len(missing) - left} of {len(missing)} were kept from before)" if left < len(missing) else ""
+        looks = {name: sum(name in its for its in missing.values()) for name in names}
+        clouds_ms = FRAME_MS["points"] * left
+        found_ms = sum(FRAME_MS.get(name, 0.0) * count for name, count in looks.items() if name != "points")
+        about = f"about {_duration(1e-3 * frames * (clouds_ms + found_ms) / processes)} with a VLP-32C"
+        unknown = [name for name in names if name not in FRAME_MS]
+        but = f", and what {', '.join(unknown)} takes" if unknown else ""
+        cores = f"{processes} process{'es' if processes > 1 else ''}"
+        sites = f"{left} site{'s' if left > 1 else ''}"
+        self._say(f"{frames} frames from {sites}{kept}, {', '.join(names)}, {cores}: {about}{but}")
+
+    def looked(self, site: str, detectors: Sequence[str], cost: Cost) -> None:
+        """One line a site."""
+        self._say(f"{cost.seconds:>8.1f} s   {site}: {', '.join(detectors)}")
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 120.0 else f"{seconds / 60.0:.0f} min"

@@ -59,7 +59,7 @@ def validate(
     ] = DEFAULT_FRAMES,
     detector: Annotated[
         str, typer.Option(metavar="NAME,NAME", help="points, and detectors that are installed: cluster, pointpillars.")
-    ] = "points,cluster",
+    ] = "points",
     jobs: Jobs = None,
 ) -> None:
     """What would detectors find from each site, and which score foretells it?"""
@@ -73,7 +73,10 @@ def validate(
     folder = out or default_folder(loaded)
     names = [name.strip() for name in detector.split(",") if name.strip()]
     with Screen("validate") as screen:
-        done = validating.validate(loaded, folder, frames=frames, detectors=names, jobs=jobs, progress=screen.progress)
+        done = validating.validate(
+            loaded, folder, frames=frames, detectors=names, jobs=jobs, progress=screen.progress,
+            listener=validation_tables.LookLines(screen.say),
+        )  # fmt: skip
     validation_tables.print_validation(loaded, folder, done)
 
 
