@@ -1,0 +1,70 @@
+"""Detectors for tests, in a module of their own: other processes import it."""
+
+import os
+import signal
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.core.errors import InputError
+from pipeline.validation.sweeps import Detections
+
+
+@dataclass(frozen=True)
+class Middle:
+    """One box round the middle of the points that are not of the empty scan; its score, how many there are."""
+
+    NAME = "middle"
+    SOURCE = "tests"
+    size_m: float = 4.0
+
+    @property
+    def settings(self):
+        return {"size_m": self.size_m}
+
+    def at(self, view, roi):
+        del roi
+        return _MiddleAt(view, self.size_m)
+
+
+@dataclass(frozen=True)
+class _MiddleAt:
+    view: object
+    size_m: float
+
+    def detect(self, sweep):
+        at = sweep.points[:, :3].astype(np.float64)
+        far = np.sqrt((at**2).sum(axis=1))
+        new = far < self.view.empty_range_m[sweep.beam] - 0.5
+        if not new.any():
+            return Detections.none()
+        centre = at[new].mean(axis=0) + np.asarray(self.view.pose.position_m)  # sensors of the tests stand upright
+        return Detections(np.array([[*centre, self.size_m, 2.0, 1.5, 0.0]]), np.array([float(new.sum())]))
+
+
+@dataclass(frozen=True)
+class Odd(Middle):
+    """What goes wrong at one site, once a file named after it is there."""
+
+    NAME = "odd"
+    folder: Path = Path()
+
+    def at(self, view, roi):
+        if (self.folder / view.site).exists():
+            what = (self.folder / view.site).read_text()
+            if what == "refuse":
+                raise InputError("model.onnx", "no model", "a model")
+            if what == "die":
+                os._exit(3)
+            if what == "interrupt":
+                os.kill(os.getppid(), signal.SIGINT)
+                threading.Event().wait()
+            if what == "orphan":
+                with (self.folder / "alive").open("wb") as alive:
+                    alive.write(b"x")
+                    alive.flush()
+                    os.kill(os.getppid(), signal.SIGKILL)
+                    threading.Event().wait()
+        return super().at(view, roi)
