@@ -75,14 +75,16 @@ def latitude_and_longitude(text: str) -> tuple[float, float]:
 
 def radius_m(text: str) -> float | None:
     """``--surroundings``: metres, or None for all."""
+    from pipeline.scenario.types import FARTHEST_M
+
     if text == "all":
         return None
     try:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not 0 < value < math.inf:
-        raise InputError("--surroundings", repr(text), "metres, for example 300, or all")
+    if not 0 < value <= FARTHEST_M:
+        raise InputError("--surroundings", repr(text)[:80], "metres, for example 300, or all")
     return value
 
 

@@ -38,14 +38,14 @@ class Figures:
     backdrop: Backdrop
 
 
-def draw(work: Workspace, ranking: Ranking, listed: Sequence[ScoredSite], tpog: Tpog) -> Figures:
-    """Draw the figures of the run in a workspace; views of the ``listed`` sites."""
+def draw(work: Workspace, ranking: Ranking, choosable: Sequence[ScoredSite], tpog: Tpog) -> Figures:
+    """Draw the figures of the run in a workspace; views of the ``choosable`` sites."""
     box = extent(tpog.grid, ranking.sites)
     backdrop = Backdrop(outlines_of(world_of(work), box), roads_within(network_file(work.folder), box))
     occupied = tpog.counts.sum(axis=2) / tpog.frames
     scorer = Scorer(scene_of(work), tpog, work.path("trajectories.parquet"))
     occupancy = _occupancy(tpog, occupied, ranking, backdrop) if tpog.counts.any() else ""
-    views = site_views(work, ranking, listed, scorer, backdrop) if len(scorer.field.cells) else None
+    views = site_views(work, ranking, choosable, scorer, backdrop) if len(scorer.field.cells) else None
     return Figures(occupancy, _sites(tpog, occupied, ranking, backdrop), views, backdrop)
 
 

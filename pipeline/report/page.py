@@ -42,6 +42,9 @@ STAGES = ("check", "traffic", "statics", "tpog", "scan", "score")
 LISTED, FIRST, LAST = 40, 30, 5
 """More than ``LISTED`` sites are shown as the first and the last of them."""
 
+CHOOSABLE = 200
+"""Of more sites, the first ones and the ``LAST`` ones can be chosen to be drawn: each takes some 20 kB."""
+
 TEMPLATES = Path(__file__).parent / "templates"
 
 _LEFT_OUT = (
@@ -89,6 +92,13 @@ def _listed(ranking: Ranking) -> tuple[tuple[ScoredSite, ...], tuple[ScoredSite,
     return ranking.sites[:FIRST], ranking.sites[-LAST:]
 
 
+def _choosable(ranking: Ranking) -> tuple[ScoredSite, ...]:
+    """The sites that a reader may choose to see."""
+    if len(ranking.sites) <= CHOOSABLE:
+        return ranking.sites
+    return ranking.sites[: CHOOSABLE - LAST] + ranking.sites[-LAST:]
+
+
 def _shown(scenario: Scenario) -> dict[str, Any]:
     return {
         "name": scenario.name,
@@ -120,8 +130,7 @@ def run(work: Workspace, inputs: StageInputs) -> Summary:
     out = work.folder
     ranking, tpog, stages = Ranking.read(out / "scores.parquet"), read_tpog(out / "tpog.parquet"), _recorded(out)
     work.progress("artefacts read", 1, 3)
-    first, last = _listed(ranking)
-    drawn = figures.draw(work, ranking, (*first, *last), tpog)
+    drawn = figures.draw(work, ranking, _choosable(ranking), tpog)
     work.progress("figures drawn", 2, 3)
     study, detected = StudySummary.read(out, stages), ValidationSummary.read(out, stages)
     html = page(work.scenario, ranking, tpog, drawn, stages, study, PeriodRanking.read(out), detected)
@@ -172,7 +181,8 @@ def page(
         study=study,
         detected=detected,
         first=first,
-        choices=(*first, *last),
+        choices=_choosable(ranking),
+        out_of_choice=len(sites) - len(_choosable(ranking)),
         listed=LISTED,
         last=last,
         hidden=len(sites) - len(first) - len(last),

@@ -1,8 +1,9 @@
 """What each site sees and misses, and its empty scan: the figures of two sites, and the data of all that may be chosen.
 
-Steps, for each site that the page lists: march its beams once more; split the entropy, summed along z, into what the
-beams cross and what they don't; note where beams end. The best and the last site are drawn. Of every site the images'
-data is kept without palettes: the page joins both when a reader chooses another site, in its light or dark colours.
+Steps, for each site that a reader may choose: march its beams once more; split the entropy, summed along z, into what
+the beams cross and what they don't; note where beams end. The best and the last site are drawn. Of every site the
+images' data is kept without palettes: the page joins both when a reader chooses another site, in its light or dark
+colours. Where these are many, the images have fewer and larger pixels, so that the page stays small.
 """
 
 from __future__ import annotations
@@ -32,6 +33,12 @@ from pipeline.stages.shared.scans import scans
 _CELLS = 300
 """Cells of an empty scan's image from west to east."""
 
+MANY = 40
+"""Sites whose images are kept in full; of more, only those of the best and of the last."""
+
+_COARSE_CELLS, _COARSE_PIXELS = 150, 30_000
+"""The same for many sites, and the pixels of a field's image."""
+
 
 @dataclass(frozen=True)
 class SitePanel:
@@ -47,12 +54,13 @@ class SitePanel:
 @dataclass(frozen=True)
 class SiteViews:
     """The panels of the best and of the last site, their colour scale, and ``data``: JSON from which the page draws
-    those of any other.
+    those of any other; ``is_coarse`` where it draws them with larger pixels.
     """
 
     panels: tuple[SitePanel, ...]
     scale: str
     data: str
+    is_coarse: bool
 
 
 @dataclass(frozen=True)
@@ -68,27 +76,22 @@ class _Seen:
 
 
 def site_views(
-    work: Workspace, ranking: Ranking, listed: Sequence[ScoredSite], scorer: Scorer, backdrop: Backdrop
+    work: Workspace, ranking: Ranking, choosable: Sequence[ScoredSite], scorer: Scorer, backdrop: Backdrop
 ) -> SiteViews:
-    """Figures and data of the ``listed`` sites; those of the best and of the last site are drawn."""
-    grid, box = scorer.field.grid, extent(scorer.field.grid, listed)
+    """Figures and data of the ``choosable`` sites; those of the best and of the last site are drawn."""
+    grid, box, is_coarse = scorer.field.grid, extent(scorer.field.grid, choosable), len(choosable) > MANY
     peak = float(_columns(scorer.field, np.ones(len(scorer.field.cells), dtype=np.bool_)).max())
     panels: dict[str, SitePanel] = {}
     choices: dict[str, dict[str, Any]] = {}
-    for seen in _seen(work, listed, scorer):
-        images = {
-            "seen": raster.field_image(seen.seen_bit, peak),
-            "missed": raster.field_image(seen.missed_bit, peak),
-            "scan": raster.dots_image(seen.ends_m, box, _CELLS),
-            "shade": raster.shade_image(np.logical_not(seen.crossed.any(axis=2))),
-        }
+    for seen in _seen(work, choosable, scorer):
+        images = _images(seen, peak, box, in_full=not is_coarse or seen.scored in ranking.extremes)
         choices[seen.scored.site] = _choice(seen, images, box)
         if seen.scored in ranking.extremes:
             number = ranking.extremes.index(seen.scored)
             panels[seen.scored.site] = _panel(seen, grid, peak, images["scan"], backdrop, box, f"view-{number}")
     drawn = tuple(panels[site.site] for site in ranking.extremes)
     data = {
-        "sites": {site.site: choices[site.site] for site in listed},
+        "sites": {site.site: choices[site.site] for site in choosable},
         "palettes": {
             look: {"field": _text(raster.FIELD[look]), "scan": _text(raster.DOTS[look])} for look in raster.LOOKS
         }
@@ -96,12 +99,22 @@ def site_views(
         "end": _text(raster.END),
     }
     text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")  # no name may end the script
-    return SiteViews(drawn, shared_scale(peak, "Entropy in the column (bit)"), text)
+    return SiteViews(drawn, shared_scale(peak, "Entropy in the column (bit)"), text, is_coarse)
 
 
-def _seen(work: Workspace, listed: Sequence[ScoredSite], scorer: Scorer) -> Iterator[_Seen]:
+def _images(seen: _Seen, peak: float, box: Box, *, in_full: bool) -> dict[str, IndexedImage]:
+    pixels, cells = (raster.MOST_PIXELS, _CELLS) if in_full else (_COARSE_PIXELS, _COARSE_CELLS)
+    return {
+        "seen": raster.field_image(seen.seen_bit, peak, pixels),
+        "missed": raster.field_image(seen.missed_bit, peak, pixels),
+        "scan": raster.dots_image(seen.ends_m, box, cells),
+        "shade": raster.shade_image(np.logical_not(seen.crossed.any(axis=2)), pixels),
+    }
+
+
+def _seen(work: Workspace, choosable: Sequence[ScoredSite], scorer: Scorer) -> Iterator[_Seen]:
     """In the order of the scans."""
-    by_name, field = {site.site: site for site in listed}, scorer.field
+    by_name, field = {site.site: site for site in choosable}, scorer.field
     for scan in scans(work, by_name.keys()):
         scored, crossed = by_name[scan.site.name], scorer.hits(scan.beams) > 0
         here = crossed.ravel()[field.cells]

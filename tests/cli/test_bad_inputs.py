@@ -310,6 +310,10 @@ COMMANDS = {
     "verify nothing": (["verify", "{out}"], r"run.json: no such file"),
     "jobs 0": (["run", "{mini}", "--jobs", "0"], r"--jobs"),
     "--at no place": (["new", "{out}", "--osm", "x.osm", "--at", "here"], r"--at: 'here'; LAT,LON"),
+    "--surroundings beyond the Earth": (
+        ["new", "{out}", "--osm", "x.osm", "--surroundings", "1e300"],
+        r"--surroundings: '1e300'; metres, for example 300, or all",
+    ),
     "osm missing": (["new", "{out}", "--osm", "{out}.osm"], r"\.osm"),
 }
 

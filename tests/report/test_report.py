@@ -21,6 +21,7 @@ from pipeline.artefacts import tables
 from pipeline.artefacts.readers import read_scores, read_tpog
 from pipeline.core.grid import Grid
 from pipeline.report import page as report
+from pipeline.report import site_views
 from pipeline.report.drawing import map_frame, maps, raster
 from pipeline.report.drawing.map_frame import MapSite
 from pipeline.report.drawing.maps import Backdrop
@@ -428,6 +429,31 @@ def test_a_far_site_is_on_the_map(tmp_path):
     assert "far" in Reader(page(about, out)).text
 
 
+def choices(text):
+    """What the page holds of the sites that can be chosen."""
+    return json.loads(re.search(r'id="site-data">(.*?)</script>', text, re.DOTALL).group(1))
+
+
+@pytest.mark.parametrize(("count", "is_coarse"), [(40, False), (41, True)])
+def test_every_site_can_be_chosen_with_larger_pixels_where_there_are_many(tmp_path, monkeypatch, count, is_coarse):
+    monkeypatch.setattr(site_views, "_COARSE_PIXELS", 100)
+    sites = [(f"g{n:03}", 0.3 * n, -1, 2) for n in range(count)]
+    about, out = finished(tmp_path, sites=sites)
+    text = page(about, out)
+    found = choices(text)["sites"]
+    ranked = sorted(read_scores(out / "scores.parquet").to_pylist(), key=lambda row: row["rank"])
+    assert sorted(found) == [name for name, *_ in sites]
+    assert ("drawn with larger pixels" in text) == is_coarse
+    assert ("6 more sites between these are not listed, but can be chosen below" in text) == is_coarse
+
+    def width(site, kind):
+        return int.from_bytes(base64.b64decode(found[site]["images"][kind][0])[16:20], "big")
+
+    best, second = ranked[0]["site"], ranked[1]["site"]
+    assert width(best, "scan") == 300 and width(second, "scan") == (150 if is_coarse else 300)
+    assert width(second, "seen") == (width(best, "seen") // 2 if is_coarse else width(best, "seen"))
+
+
 def test_five_hundred_sites(tmp_path):
     sites = [(f"g{n:03}", 0.5 * (n % 25), -1 - 0.5 * (n // 25), 2) for n in range(500)]
     about, out = finished(tmp_path, sites=sites)
@@ -435,7 +461,9 @@ def test_five_hundred_sites(tmp_path):
     read = Reader(text)
     rows = sorted(read_scores(out / "scores.parquet").to_pylist(), key=lambda row: row["rank"])
     shown = [row for row in read.rows if re.search(r"\|g\d{3}\|", f"|{row}")]
-    assert len(shown) == 35 and "465 more sites" in read.text
+    assert len(shown) == 35 and "465 more sites" in read.text and "can be chosen below" not in read.text
+    assert list(choices(text)["sites"]) == [row["site"] for row in rows[:195] + rows[-5:]]
+    assert "any of the first 195 and the last 5 sites" in read.text
     assert f"|{rows[-1]['site']}|" in shown[-1]
     assert len(text) < 2_000_000
     titles = [t for t in read.texts if "rank" in t and "EGVS" in t and "height" in t]

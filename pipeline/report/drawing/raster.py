@@ -22,7 +22,7 @@ from pipeline.report.drawing.colours import ON_DARK, ON_LIGHT, SHADE, mixed, opa
 ColumnValues = NDArray[np.float64]
 """One value a column of voxels, (nx, ny) float64."""
 
-_MOST_PIXELS = 240_000
+MOST_PIXELS = 240_000
 """A raster has no more; larger grids are averaged."""
 
 
@@ -54,17 +54,17 @@ class IndexedImage:
         return f"data:image/png;base64,{base64.b64encode(data).decode('ascii')}"
 
 
-def field_image(values: ColumnValues, peak: float) -> IndexedImage:
+def field_image(values: ColumnValues, peak: float, most_pixels: int = MOST_PIXELS) -> IndexedImage:
     """A field on a square-root scale up to ``peak``, above 0, for the palettes ``FIELD``."""
-    share = np.sqrt(np.minimum(shrunk(values, np.mean) / peak, 1.0))
+    share = np.sqrt(np.minimum(shrunk(values, np.mean, most_pixels) / peak, 1.0))
     return IndexedImage.of(np.where(share > 0, 1 + np.floor(share * 253.999), 0).astype(np.uint8).T[::-1])
 
 
-def shade_image(shaded: NDArray[np.bool_]) -> IndexedImage:
+def shade_image(shaded: NDArray[np.bool_], most_pixels: int = MOST_PIXELS) -> IndexedImage:
     """A shade over columns of voxels, (nx, ny) bool, for ``SHADE_PALETTE``; where columns share a pixel, all must be
     shaded.
     """
-    return IndexedImage.of((shrunk(shaded.astype(np.float64), np.min).T[::-1] > 0).astype(np.uint8))
+    return IndexedImage.of((shrunk(shaded.astype(np.float64), np.min, most_pixels).T[::-1] > 0).astype(np.uint8))
 
 
 def dots_image(points_m: NDArray[np.float64], box: tuple[float, float, float, float], across: int) -> IndexedImage:
@@ -78,11 +78,11 @@ def dots_image(points_m: NDArray[np.float64], box: tuple[float, float, float, fl
     return IndexedImage.of(np.minimum(2 * counted, 254).astype(np.uint8).T[::-1])
 
 
-def shrunk(values: ColumnValues, how: Callable[..., Any]) -> ColumnValues:
-    """Fewer, larger pixels where there are more than ``_MOST_PIXELS``; those at the far edges stand for the columns
+def shrunk(values: ColumnValues, how: Callable[..., Any], most_pixels: int = MOST_PIXELS) -> ColumnValues:
+    """Fewer, larger pixels where there are more than ``most_pixels``; those at the far edges stand for the columns
     that are left.
     """
-    factor = math.ceil(math.sqrt(values.size / _MOST_PIXELS))
+    factor = math.ceil(math.sqrt(values.size / most_pixels))
     if factor <= 1:
         return values
     nx, ny = (-(-n // factor) for n in values.shape)
