@@ -200,3 +200,13 @@ def test_each_name_can_be_imported_and_used_first_and_says_what_it_is(run_folder
         kind, doc = said.split("\n", 1)
         assert doc.strip() not in ("", "None"), name
         assert kind == str(name[0].isupper()), name
+
+
+@pytest.mark.system
+def test_a_run_knows_nothing_of_validation(run_folder: Path) -> None:
+    code = (
+        "import sys, pipeline;"
+        "s = pipeline.load('mini', ['score.gamma=3']); pipeline.run(s, 'other', jobs=1);"
+        "print([m for m in sys.modules if m.startswith('pipeline.validation')])"
+    )
+    assert run_python(code, run_folder).strip() == "[]"

@@ -61,6 +61,8 @@ def print_validation(scenario: Scenario, out: Path, done: Validation) -> None:
     for doubt in done.doubts:
         print(f"warning: {doubt}")
     print(f"{out}: detection.parquet, surrogates.parquet, correlation.parquet, validation.png")
+    if done.report:
+        print(done.report)
 
 
 def _print_agreement(done: Validation, own: ScoreName, detectors: Sequence[str]) -> None:

@@ -59,7 +59,7 @@ def validate(
     ] = DEFAULT_FRAMES,
     detector: Annotated[
         str, typer.Option(metavar="NAME,NAME", help="points, and detectors that are installed: cluster, pointpillars.")
-    ] = "points",
+    ] = "points,cluster",
     jobs: Jobs = None,
 ) -> None:
     """What would detectors find from each site, and which score foretells it?"""

@@ -72,7 +72,7 @@ class DetectorSummary:
             math.copysign(1.0, (a - c) * (b - d)) for (a, b), (c, d) in combinations(known, 2) if a != c and b != d
         ]
         if math.isnan(tau) or not turns:
-            return f"{_sites(len(known))} with values are too few, or too much alike, to compare two orders."
+            return f"{_sites(len(known))} with values: too few, or too much alike, to compare two orders."
         share = sum(turn > 0 for turn in turns) / len(turns)
         between = "" if math.isnan(low) else f", between {low:.2f} and {high:.2f} with 95 % confidence"
         return (

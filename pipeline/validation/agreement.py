@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 from pipeline.core.findings import Finding
 from pipeline.scenario.models import Scenario
@@ -75,12 +76,15 @@ class Validation:
         Rows of ``correlation.parquet``.
     doubts
         What a reader should know: what is not defined, or was not unseen.
+    report
+        The page that shows it; None where the folder holds no whole run.
     """
 
     detections: tuple[SiteDetection, ...]
     surrogates: Surrogates
     agreements: tuple[Agreement, ...]
     doubts: tuple[Finding, ...]
+    report: Path | None = None
 
     def own_score(self, scenario: Scenario) -> ScoreName:
         """EGVS as the scenario has it."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -85,8 +86,7 @@ def validate(
         told = (*doubts, *_not_unseen(scenario), *undefined, *surrogates.skipped)
         done = Validation(tuple(rows), surrogates, tuple(agreements), told)
         _write(out, Path(folder), scenario, record, done)
-        refresh_report(out)
-    return done
+        return replace(done, report=refresh_report(out))
 
 
 def correlated(scenario: Scenario, rows: Sequence[SiteDetection], surrogates: Surrogates) -> list[Agreement]:

@@ -1,0 +1,100 @@
+"""What is found at a site, against numbers worked out by hand."""
+
+import math
+
+import numpy as np
+import pytest
+
+from pipeline.artefacts import tables
+from pipeline.core.grid import Roi
+from pipeline.validation import detection
+from pipeline.validation.frames import TrafficFrame
+from pipeline.validation.site_findings import POINTS, FoundBoxes, FoundPoints
+from pipeline.validation.sweeps import Detections
+
+ROI = Roi((0.0, 0.0, 0.0), (50.0, 50.0, 5.0))
+CAR, BUS = (10.0, 10.0, 0.8, 4.5, 1.8, 1.6, 0.0), (30.0, 20.0, 1.5, 12.0, 2.5, 3.0, 1.0)
+
+
+def _frame(number, *vehicles):
+    boxes = np.array([box for _, box in vehicles], dtype=np.float64).reshape(-1, 7)
+    names = tuple(f"v{i}" for i in range(len(vehicles)))
+    return TrafficFrame(number, names, tuple(kind for kind, _ in vehicles), boxes, np.zeros(len(vehicles)))
+
+
+FRAMES = [_frame(n) for n in range(10)]
+FRAMES[0] = _frame(0, ("passenger", CAR), ("bus", BUS))  # with 25 and 3 points
+FRAMES[5] = _frame(5, ("passenger", CAR), ("pedestrian", (1.0, 1.0, 0.9, 0.6, 0.6, 1.8, 0.0)))  # 0 points
+
+
+def _points(*of_first):
+    return FoundPoints(tuple(np.array(its, dtype=np.int64) for its in [of_first, [], [], [], [], [0], [], [], [], []]))
+
+
+def _boxes(first):
+    boxes, scores = zip(*first, strict=True)
+    found = Detections(np.array(boxes), np.array(scores))
+    return FoundBoxes((found, *[Detections.none()] * 9))
+
+
+def _row(rows, detector, objects_of="vehicles"):
+    (row,) = (row for row in rows if (row.detector, row.objects_of) == (detector, objects_of))
+    return row
+
+
+def test_points_on_three_vehicles():
+    rows, doubts = detection.measured(FRAMES, ROI, {"a": {POINTS: _points(25, 3)}})
+    row = _row(rows, POINTS)
+    assert (row.site, row.frames, row.objects, dict(row.objects_with)) == ("a", 10, 3, {1: 2, 5: 1, 20: 1})
+    value = {name: its.value for name, its in row.measures.items()}
+    assert value["seen_1"] == pytest.approx(2 / 3) and value["seen_5"] == value["seen_20"] == pytest.approx(1 / 3)
+    assert value["seen_50"] == 0.0 and value["log_points"] == pytest.approx((math.log(26) + math.log(4)) / 3)
+    # without the first frame one of one is missed, without the sixth two of two are seen
+    left_out = np.array([0.0, *[2 / 3] * 4, 1.0, *[2 / 3] * 4])
+    np.testing.assert_allclose(row.measures["seen_1"].left_out, left_out)
+    se = math.sqrt(0.9 * ((left_out - left_out.mean()) ** 2).sum())
+    assert row.measures["seen_1"].se == pytest.approx(se)
+    assert all(math.isnan(value[name]) for name in detection.PRECISION) and doubts == []
+
+
+def test_cars_and_seen_vehicles_alone():
+    rows, _ = detection.measured(FRAMES, ROI, {"a": {POINTS: _points(25, 3)}})
+    assert {row.objects_of: row.objects for row in rows} == {
+        "vehicles": 3, "cars": 2, "points_1": 2, "points_5": 1, "points_20": 1,
+    }  # fmt: skip
+    assert _row(rows, POINTS, "cars").measures["seen_1"].value == 0.5
+    assert _row(rows, POINTS, "points_5").measures["seen_20"].value == 1.0
+
+
+def test_boxes_on_two_of_three_vehicles():
+    found = {POINTS: _points(25, 3), "d": _boxes([(CAR, 0.9), (BUS, 0.8), ((40.0, 40.0, *CAR[2:]), 0.5)])}
+    rows, _ = detection.measured(FRAMES, ROI, {"a": found})
+    value = {name: its.value for name, its in _row(rows, "d").measures.items()}
+    assert value["recall_bev_iou70"] == value["recall_3d_iou50"] == pytest.approx(2 / 3)
+    assert 26 / 40 <= value["ap_bev_r40_iou70"] <= 27 / 40  # precision 1 up to a recall of 2/3
+    assert value["ap_combined_r40_iou70"] == pytest.approx(value["ap_bev_r40_iou70"] + value["ap_3d_r40_iou70"])
+    assert value["seen_1"] == pytest.approx(2 / 3)  # of the vehicles, whatever the detector
+    assert _row(rows, "d", "points_20").measures["recall_bev_iou70"].value == 1.0
+
+
+def test_a_site_that_sees_no_vehicle_is_told():
+    boxes = FoundBoxes(tuple([Detections.none()] * 10))
+    rows, doubts = detection.measured(FRAMES, ROI, {"a": {POINTS: _points(0, 0), "d": boxes}})
+    assert _row(rows, POINTS).measures["seen_1"].value == _row(rows, POINTS).measures["log_points"].value == 0.0
+    assert _row(rows, "d").measures["ap_bev_r40_iou70"].value == 0.0  # they are there, and missed
+    assert _row(rows, "d", "points_1").objects == 0
+    assert math.isnan(_row(rows, "d", "points_1").measures["ap_bev_r40_iou70"].value)
+    assert math.isnan(_row(rows, POINTS, "points_1").measures["log_points"].value)
+    assert "site a, detector d" in doubts[0].place and "no vehicles with 1 points or more in 10 frames" in str(
+        doubts[0]
+    )
+
+
+def test_rows_are_written_as_they_are(tmp_path):
+    rows, _ = detection.measured(FRAMES, ROI, {"a": {POINTS: _points(25, 3)}, "b": {POINTS: _points(0, 0)}})
+    about = {"schema": tables.schemas.VERSION, "inputs": "x", "frames": 10, "stages": {}}
+    detection.write(tmp_path / "detection.parquet", rows, about)
+    table, read = tables.read(tmp_path / "detection.parquet", "detection")
+    assert read == about and table.column("site").to_pylist() == ["a"] * 5 + ["b"] * 5
+    first = table.to_pylist()[0]
+    assert first["seen_1"] == rows[0].measures["seen_1"].value and first["seen_1_se"] == rows[0].measures["seen_1"].se

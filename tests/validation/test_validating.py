@@ -1,0 +1,171 @@
+"""The whole of ``egvs validate`` on a small scenario: what comes out, twice the same; and what it refuses."""
+
+import json
+import math
+import shutil
+
+import numpy as np
+import pytest
+
+from pipeline import load
+from pipeline.artefacts import tables
+from pipeline.validation import validating
+from pipeline.validation.agreement import BOXED, COUNTED, ScoreName
+from pipeline.validation.detection import ALL, MEASURES, SiteDetection
+from pipeline.validation.metrics.leave_out import BLOCKS, Estimate
+from pipeline.validation.site_findings import POINTS
+from pipeline.validation.surrogates.gathering import SurrogateRow, Surrogates
+from pipeline.validation.validating import correlated, validate
+from tests.validation.detecting import Middle
+
+ARTEFACTS = ("correlation.parquet", "detection.parquet", "surrogates.parquet", "validation.png")
+WANTED = ("validate", "--frames", "10", "--detector", "points", "--jobs", "1")
+
+
+@pytest.fixture
+def middle(monkeypatch):
+    """A detector beside those that are installed."""
+    monkeypatch.setattr(validating.registry, "make", lambda name: {"middle": Middle()}[name])
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A scenario with six sites, and its first validation."""
+    folder = tmp_path_factory.mktemp("whole")
+    from tests.conftest import write_mini
+
+    mini = write_mini(folder / "mini")
+    places = [(10, 12, 3), (30.5, -12, 3), (20, 12, 4), (5, -12, 2), (38, 11, 6), (16, -11, 5)]
+    lines = [f"p{n},{x},{y},{z}" for n, (x, y, z) in enumerate(places)]
+    (mini / "sites.csv").write_text("\n".join(["site,x_m,y_m,z_m", *lines]) + "\n")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(validating.registry, "make", lambda name: {"middle": Middle()}[name])
+        done = validate(load(mini), folder / "out", frames=10, detectors=["middle"], jobs=1)
+    return mini, folder / "out", done
+
+
+def test_what_comes_out(whole):
+    _, out, done = whole
+    assert sorted(path.name for path in out.iterdir() if path.name != ".lock") == sorted(ARTEFACTS)
+    table, about = tables.read(out / "detection.parquet", "detection")
+    assert table.num_rows == 6 * 2 * 5 and about["frames"] == 10 and about["seed"] == 7
+    assert about["shown"] == {POINTS: COUNTED[0], "middle": BOXED[0]}
+    rows = tables.read(out / "correlation.parquet", "correlation")[0].to_pylist()
+    assert len(rows) == len(done.scores) * (len(COUNTED) + len(BOXED))
+    assert all(-1 <= row["spearman"] <= 1 or math.isnan(row["spearman"]) for row in rows)
+    (own,) = (row for row in rows if about["own_score"].items() <= row.items() and row["measure"] == COUNTED[0])
+    assert own["n"] == 6 and own["kendall_low"] <= own["kendall"] <= own["kendall_high"]
+    assert json.loads(own["parameters"]) == {"gamma": 4, "voxel_m": 0.5, "moving_occlusion": False}
+
+
+def test_traffic_that_was_seen_is_told(whole):
+    doubt = next(doubt for doubt in whole[2].doubts if doubt.rule == "seen traffic")
+    assert "sites are judged by frames that the TPOG was counted from" in str(doubt)
+    about = tables.read_metadata(whole[1] / "detection.parquet", "detection")
+    assert any(its["place"] == "scenario.toml: traffic.fcd" for its in about["warnings"])  # wherever that is
+
+
+def test_twice_the_same_bytes(whole, middle, tmp_path):
+    mini, out, _ = whole
+    elsewhere = shutil.copytree(mini, tmp_path / "moved" / mini.name)  # the store of this test is empty
+    validate(load(elsewhere), tmp_path / "again", frames=10, detectors=["middle"], jobs=1)
+    for name in ARTEFACTS:
+        assert (tmp_path / "again" / name).read_bytes() == (out / name).read_bytes(), name
+
+
+@pytest.mark.parametrize(
+    ("sets", "parameters"),
+    [
+        (["score.gamma=inf", "roi.voxel_m=2.5"], {"gamma": "inf", "voxel_m": 2.5, "moving_occlusion": False}),
+        (["effects.moving_occlusion={}"], {"gamma": 4.0, "voxel_m": 0.5, "moving_occlusion": True}),
+    ],
+)
+def test_the_scenarios_own_score_is_among_those_tried(mini, tmp_path, sets, parameters):
+    scenario = load(mini, sets)
+    done = validate(scenario, tmp_path / "out", frames=10, jobs=1)
+    own = done.own_score(scenario)
+    assert own.score == "egvs" and json.loads(own.parameters) == parameters
+    assert set(done.values_of(own)) == {"pole_a", "pole_b"} and min(done.values_of(own).values()) > 0
+    assert any(its.score == own for its in done.agreements)
+
+
+def _made_up(values):
+    measured = {name: Estimate(value, np.full(BLOCKS, value), 0.0) for name in MEASURES for value in [0.0]}
+    return [
+        SiteDetection(f"s{n}", POINTS, ALL, 10, 5, {}, measured | {"seen_20": Estimate(v, np.full(BLOCKS, v), 0.0)})
+        for n, v in enumerate(values)
+    ]
+
+
+def test_scores_of_which_less_is_better_are_turned(mini):
+    rows = _made_up([0.1, 0.5, 0.3, 0.9, 0.7])
+    more = [SurrogateRow(f"s{n}", "more", {}, 1, v, 0.0) for n, v in enumerate([1.0, 3.0, 2.0, 5.0, 4.0])]
+    less = [SurrogateRow(f"s{n}", "less", {}, -1, v, 0.0) for n, v in enumerate([1.0, 3.0, 2.0, 5.0, 4.0])]
+    some = [SurrogateRow(f"s{n}", "some", {}, 1, v, 0.0) for n, v in enumerate([math.nan, 3.0, 2.0, 5.0, 4.0])]
+    found = correlated(load(mini), rows, Surrogates((*more, *less, *some), (), "x"))
+    kendall = {its.score.score: its.by_kind["kendall"] for its in found if its.measure == "seen_20"}
+    assert kendall["more"].value == pytest.approx(1.0) and kendall["less"].value == pytest.approx(-1.0)
+    assert kendall["some"].sites == 4 and kendall["some"].dropped == (f"{load(mini).name} s0",)
+    assert all(math.isnan(its.by_kind["kendall"].value) for its in found if its.measure == "seen_1")  # all the same
+
+
+def test_a_score_is_named_with_what_it_was_tried_with():
+    assert str(ScoreName("egvs", '{"gamma":"inf","moving_occlusion":true,"voxel_m":0.5}')) == (
+        "egvs (gamma inf, moving occlusion, voxel 0.5)"
+    )
+    assert str(ScoreName("coverage", "{}")) == "coverage"
+
+
+# ---- through the command line
+
+
+def test_a_second_run_says_that_all_was_kept(egvs, mini, tmp_path):
+    code, out, error = egvs(*WANTED, mini, "--out", tmp_path / "out")
+    assert code == 0, error
+    assert "10 frames from 2 sites, points, 1 process: about" in error and "s   pole_b: points" in error
+    assert "18 vehicles in 10 frames" in out and "warning: " in out
+    first = {name: (tmp_path / "out" / name).read_bytes() for name in ARTEFACTS}
+    code, again, error = egvs(*WANTED, mini, "--out", tmp_path / "out")
+    assert code == 0 and again == out
+    assert error == "all that detectors find from 2 sites was kept from before\n"
+    assert {name: (tmp_path / "out" / name).read_bytes() for name in ARTEFACTS} == first
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--frames", "11"], r"--frames: 11, of traffic with 40 frames every 0.5 s; at most 10: they lie at least 2 s"),
+        (["--frames", "9"], r"greater than or equal to 10"),
+        (["--detector", "nosuch"], r"--detector: unknown detector 'nosuch'; one of points, "),
+        (["--set", "roi.center_m=[20, 28, 2.5]"], r"no vehicle's centre is in it in any of 10 frames of unseen"),
+        (["--set", "sites.file='measured.csv'"], r"site pole_a: an empty scan that was measured"),
+    ],
+)
+def test_what_cannot_be_done_is_told(egvs, mini, tmp_path, arguments, message):
+    (mini / "cloud.csv").write_text("x_m,y_m,z_m\n12,3,0\n20,1,0\n")
+    (mini / "measured.csv").write_text("site,x_m,y_m,z_m,points\npole_a,10,12,3,cloud.csv\npole_b,30.5,-12,3,\n")
+    code, _, error = egvs(*WANTED, mini, "--out", tmp_path / "out", *arguments)
+    assert code == 2 and message in error, error
+    assert error.count("egvs: ") <= 1 and "Traceback" not in error
+    assert not any((tmp_path / "out" / name).exists() for name in ARTEFACTS)
+    assert [path.name for path in (tmp_path / "out").glob("*")] in ([], [".lock"])
+
+
+def test_a_file_in_place_of_the_folder_is_left_alone(egvs, mini, tmp_path):
+    (tmp_path / "out").write_text("mine")
+    code, _, error = egvs(*WANTED, mini, "--out", tmp_path / "out")
+    assert code == 2 and f"{tmp_path / 'out'}: cannot be written" in error
+    assert (tmp_path / "out").read_text() == "mine"
+
+
+def test_a_site_that_sees_no_vehicle_is_told(egvs, mini, tmp_path):
+    with (mini / "scenario.toml").open("a") as file:
+        file.write("\n[sensors.up]\nelevations_deg = [20, 40]\nchannels = 4\nazimuth_step_deg = 2.0\nrange_m = 100\n")
+    (mini / "sites.csv").write_text("site,x_m,y_m,z_m,sensor\npole_a,10,12,3,small\nsky,20,8,4.5,up\n")
+    code, out, error = egvs(*WANTED, mini, "--out", tmp_path / "out")
+    assert code == 0, error
+    rows = tables.read(tmp_path / "out" / "detection.parquet", "detection")[0].to_pylist()
+    by = {row["objects_of"]: row for row in rows if row["site"] == "sky"}
+    assert by["vehicles"]["seen_1"] == 0.0 and by["points_1"]["objects"] == 0
+    assert math.isnan(by["points_1"]["log_points"])
+    assert " 0.0 ± 0.0" in next(line for line in out.splitlines() if line.startswith("sky"))
