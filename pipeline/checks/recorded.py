@@ -6,7 +6,7 @@ solids, and, where no network tells the lanes, whether sites stand where they dr
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pipeline.artefacts import tables
 from pipeline.core.findings import Finding
 from pipeline.core.grid import Grid
+from pipeline.scenario.models import FILE
 from pipeline.world import limits
 from pipeline.world.mesh import World
 
@@ -38,6 +39,16 @@ def in_region(boxes: float, trajectories: Path) -> Iterator[Finding]:
     else:
         what = f"{boxes:.2g} vehicles are in it in a mean frame: the ranking rests on hardly any traffic"
         yield Finding("traffic in the region", "roi", what, cure)
+
+
+def periods_without(boxes: Mapping[str, float]) -> Iterator[Finding]:
+    """A warning for each period in which no vehicle is ever in the region, where one is in another; mean boxes a frame
+    by period.
+    """
+    for period in (name for name, mean in boxes.items() if mean == 0 and any(boxes.values())):
+        what = "no vehicle is ever in the region of interest: it adds nothing to the mix but certainty"
+        cure = "coordinates of one frame for all periods, or traffic that comes by"
+        yield Finding("traffic in the region", f"{FILE}: traffic.periods ({period})", what, cure)
 
 
 def through_solids(

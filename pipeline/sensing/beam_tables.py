@@ -16,12 +16,14 @@ from __future__ import annotations
 import csv
 import hashlib
 import math
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import cosdg, sindg
 
+from pipeline.core import files
 from pipeline.core.errors import InputError
 from pipeline.scenario.sensors import MOST_BEAMS, PatternModel
 
@@ -72,10 +74,11 @@ class BeamTable:
 
 def repeated(table: BeamTable) -> list[tuple[int, int]]:
     """Beams that point where an earlier one does, to 1e-6 degree: (beam, the earlier one), by beam."""
-    elevation, azimuth = np.round(table.elevation_deg, _DIGITS), np.round(np.mod(table.azimuth_deg, 360.0), _DIGITS)
-    azimuth = np.where(np.abs(elevation) == 90.0, 0.0, np.mod(azimuth, 360.0))
-    _, first, which = np.unique(np.column_stack([elevation, azimuth]), axis=0, return_index=True, return_inverse=True)
-    earlier = first[which.ravel()]
+    steps, turn = 10**_DIGITS, 360 * 10**_DIGITS
+    elevation, azimuth = (np.rint(a * steps).astype(np.int64) for a in (table.elevation_deg, table.azimuth_deg))
+    direction = elevation * turn + np.where(np.abs(elevation) == 90 * steps, 0, azimuth % turn)
+    _, first, which = np.unique(direction, return_index=True, return_inverse=True)
+    earlier = first[which]
     return [(int(beam), int(earlier[beam])) for beam in np.flatnonzero(earlier != np.arange(len(table)))]
 
 
@@ -87,6 +90,12 @@ def read(path: Path) -> BeamTable:
     InputError
         Naming file, row and value.
     """
+    return _read(path, files.sha256_of(path))
+
+
+@lru_cache(maxsize=4)
+def _read(path: Path, _content: str) -> BeamTable:
+    """Read once for all who ask."""
     angles: list[tuple[float, float]] = []
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:

@@ -78,6 +78,7 @@ def run(work: Workspace, inputs: StageInputs) -> Summary:
     mean = float(np.average(in_roi, weights=[period.weight for period in periods]))
     doubts = [
         *recorded.in_region(mean, source),
+        *recorded.periods_without(dict(zip((period.name for period in periods), in_roi, strict=True))),
         *recorded.through_solids(counting.hidden, counting.seen, counting.solid, grid, world_of(work)),
     ]
     summary: Summary = {

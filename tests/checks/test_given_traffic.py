@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 
+from pipeline.checks import recorded
+from tests.checks.conftest import net_xml
 from tests.checks.test_checking import found
 
 DEMAND = '<routes><vType id="a"/><vehicle id="v" depart="0"><route edges="east"/></vehicle></routes>'
@@ -91,3 +94,59 @@ def test_weights_that_no_mix_can_have_are_told_before_the_first_stage(mini: Path
         found(mini, f"traffic.periods=[{','.join(of).replace('1e-300', '3').replace('1e+300', '1')}]", "tpog.blocks=2")
         == {}
     )
+
+
+def moved(net: str, east_m: float) -> str:
+    """A network with all its lanes moved to the east."""
+
+    def there(shape: re.Match[str]) -> str:
+        pairs = (point.split(",") for point in shape[1].split())
+        return 'shape="' + " ".join(f"{float(x) + east_m:.2f},{y}" for x, y in pairs) + '"'
+
+    return re.sub(r'shape="([^"]*)"', there, net)
+
+
+UTM = "+proj=utm +zone=32 +datum=WGS84 +units=m +no_defs"
+MAPPED = net_xml().replace('projParameter="!"', f'projParameter="{UTM}"').replace("0.00,0.00", "-500000.00,-5600000.00")
+
+
+@pytest.mark.parametrize(
+    ("first", "other", "told"),
+    [
+        # the region ends at x = 40, the lanes begin at -40
+        (
+            net_xml(),
+            moved(net_xml(), 3000),
+            "no lane of its network leads through the region: the nearest is 2,920.0 m away",
+        ),
+        (
+            MAPPED,
+            MAPPED.replace("-500000", "-500009"),
+            "its network has another zero or projection than that of the first period"
+            " (netOffset [-500009.0, -5600000.0], not [-500000.0, -5600000.0])",
+        ),
+        (net_xml(), net_xml().replace("80,", "90,"), None),
+        (net_xml(), net_xml().replace("0.00,0.00", "9.00,0.00"), None),  # made without a map: zeros say nothing
+    ],
+)
+def test_a_period_whose_network_lies_elsewhere_is_told(street: Path, first: str, other: str, told: str | None) -> None:
+    (street / "net.net.xml").write_text(first)
+    (street / "other.net.xml").write_text(other)
+    for name in ("day", "night"):
+        configured(street, DEMAND, name=name)
+    night = (street / "night.sumocfg").read_text().replace("net.net.xml", "other.net.xml")
+    (street / "night.sumocfg").write_text(night)
+    periods = "\n".join(f'[[traffic.periods]]\nname = "{n}"\nsumocfg = "{n}.sumocfg"\n' for n in ("day", "night"))
+    simulated(street, "")
+    text = (street / "scenario.toml").read_text()
+    (street / "scenario.toml").write_text(f"{text}\n{periods}")
+    place = "scenario.toml: traffic.periods (night): "
+    assert found(street).get("region", []) == ([] if told is None else [place + told])
+
+
+def test_a_period_that_nobody_drives_in_is_told() -> None:
+    (told,) = recorded.periods_without({"day": 3.0, "night": 0.0})
+    assert told.place == "scenario.toml: traffic.periods (night)"
+    assert "no vehicle is ever in the region" in told.found
+    assert list(recorded.periods_without({"day": 0.0, "night": 0.0})) == []  # told of all of them at once
+    assert list(recorded.periods_without({"": 0.0})) == []
