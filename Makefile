@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: run test test-train unit lint bench scaling numerics pictures schema docs clean
+.PHONY: run test test-train unit lint bench scaling numerics validity pictures schema docs clean
 
 run: $(VENV)/.installed
 	$(BIN)/egvs run scenarios/nishishinjuku
@@ -37,6 +37,11 @@ scaling: $(VENV)/.installed-dev
 
 numerics: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.numerics --markdown docs/numerics-table.md
+
+# OSM_TRAINING, OSM_HELD_OUT: OpenStreetMap extracts; OSM_TRAINING_AT: lat,lon of a junction; VALIDITY: further options
+validity: $(VENV)/.installed-dev
+	$(BIN)/python -m benchmarks.validity $(if $(OSM_TRAINING),--osm-training $(OSM_TRAINING)) \
+		$(if $(OSM_TRAINING_AT),--osm-training-at $(OSM_TRAINING_AT)) $(if $(OSM_HELD_OUT),--osm-held-out $(OSM_HELD_OUT)) $(VALIDITY)
 
 pictures: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.pictures

@@ -1,0 +1,149 @@
+"""``make validity``: measures, analyses, and writes the tables and figures of docs/validity.md.
+
+What was measured is kept under runs/validity and in the store: an interrupted study goes on, a whole one is analysed
+anew in a minute. Sites are looked from on all cores.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from benchmarks.validity import figures, junctions, poses, study, tables
+from benchmarks.validity.junctions import Role, StudyJunction
+from benchmarks.validity.measuring import Part, measure
+from benchmarks.validity.record import Record
+from benchmarks.validity.study import Extent
+from pipeline.cli import arguments
+from pipeline.cli.progress import Screen
+from pipeline.core.errors import EgvsError, InputError, MissingBackendError
+from pipeline.validation.detectors import registry
+from pipeline.validation.site_findings import POINTS
+
+ROOT = Path(__file__).resolve().parents[2]
+TITLE = "Tables of the study of validity"
+
+
+def main(given: Sequence[str] | None = None) -> int:
+    """Run the study; the exit code."""
+    try:
+        _study(_parser().parse_args(given))
+    except EgvsError as error:
+        print(error, file=sys.stderr)
+        return error.exit_code
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.validity", description=__doc__)
+    parser.add_argument("--frames", type=int, default=study.FRAMES, help="of unseen traffic (default %(default)s)")
+    parser.add_argument(
+        "--sensor-frames", type=int, default=study.SENSOR_FRAMES, help="where sensors are compared (%(default)s)"
+    )
+    parser.add_argument("--places", type=int, default=poses.PLACES, help="of the grid (default %(default)s)")
+    parser.add_argument("--detector", metavar="NAME,NAME", help="default: all that are installed")
+    parser.add_argument("--junction", metavar="NAME,NAME", help="of the shipped ones; default: all")
+    parser.add_argument("--osm-training", type=Path, metavar="FILE", help="an OpenStreetMap extract")
+    parser.add_argument("--osm-training-at", metavar="LAT,LON", help="its junction; default: the largest")
+    parser.add_argument("--osm-held-out", type=Path, metavar="FILE", help="an extract of elsewhere")
+    parser.add_argument("--jobs", type=int, help="processes; default: one a core")
+    parser.add_argument("--data", type=Path, default=ROOT / "runs" / "validity", help="what was measured")
+    parser.add_argument("--docs", type=Path, default=ROOT / "docs", help="tables and figures")
+    return parser
+
+
+def _study(chosen: argparse.Namespace) -> None:
+    begun = time.monotonic()
+    detectors, without = _detectors(chosen.detector)
+    homes, left_out = _homes(chosen)
+    chosen.data.mkdir(parents=True, exist_ok=True)
+    each = [_ready(*home, chosen) for home in homes]
+    extent = Extent(chosen.frames, chosen.sensor_frames, chosen.places)
+    parts = study.parts(each, detectors, extent, chosen.data)
+    _tell_plan(parts, chosen.jobs)
+    records = {part.name: _measured(part, chosen, begun) for part in parts}
+    main_ones = [records[junction.name] for junction in each]
+    with_sensors = [records[part.name] for part in parts if part.scores is not None]
+    print("analysing")
+    made = list(study.tables_of(main_ones, with_sensors, detectors))
+    words = study.preface(main_ones, with_sensors, detectors, [*without, *left_out])
+    write(chosen.docs, words, made)
+    costs = tables.page("What scores cost", [], [study.costs(chosen.data, [junction.name for junction in each])])
+    (chosen.docs / "validity-costs.md").write_text(costs, encoding="utf-8")
+    print(f"{chosen.docs / 'validity-tables.md'}: {len(made)} tables, {time.monotonic() - begun:.0f} s")
+
+
+def write(docs: Path, words: Sequence[str], made: Sequence[tables.Table]) -> None:
+    """Tables as data and as a page, and the figures."""
+    tables.write(docs / "data" / "validity.json", words, made)
+    (docs / "validity-tables.md").write_text(tables.page(TITLE, words, made), encoding="utf-8")
+    figures.draw(docs / "images", made)
+
+
+def _detectors(asked: str | None) -> tuple[list[str], list[str]]:
+    """Those asked for, or all that can be made; what is left out, and why."""
+    if asked is not None:
+        names = [name.strip() for name in asked.split(",") if name.strip()]
+        for name in (name for name in names if name != POINTS):
+            registry.make(name)
+        return list(dict.fromkeys([POINTS, *names])), []
+    found, without = [POINTS], []
+    for name in sorted(registry.names(), key=lambda name: (name not in study.FAST, name)):
+        try:
+            registry.make(name)
+            found.append(name)
+        except MissingBackendError as error:
+            without.append(f"detector {name} ({error})")
+    return found, without
+
+
+def _homes(chosen: argparse.Namespace) -> tuple[list[tuple[str, Role, Path]], list[str]]:
+    """The junctions, training ones first; what is left out, and why."""
+    names = tuple(chosen.junction.split(",")) if chosen.junction else ()
+    if unknown := [name for name in names if name not in junctions.SHIPPED]:
+        raise InputError("--junction", repr(unknown[0]), f"one of {', '.join(junctions.SHIPPED)}")
+    homes = junctions.shipped(names)
+    there = {name for name, _, _ in homes}
+    without = [f"{name} (not in this run)" for name in junctions.SHIPPED if name not in there]
+    at = arguments.latitude_and_longitude(chosen.osm_training_at) if chosen.osm_training_at else None
+    named: dict[Role, tuple[Path | None, tuple[float, float] | None]] = {
+        "training": (chosen.osm_training, at),
+        "held out": (chosen.osm_held_out, None),
+    }
+    for role, (extract, place) in named.items():
+        if extract is not None:
+            homes.append(junctions.from_osm(role, extract, place, chosen.data / "junctions"))
+        else:
+            without.append(f"a {role} junction from OpenStreetMap (no extract was named)")
+    return sorted(homes, key=lambda home: junctions.ROLES.index(home[1])), without
+
+
+def _ready(name: str, role: Role, home: Path, chosen: argparse.Namespace) -> StudyJunction:
+    return junctions.ready(name, role, home, chosen.data / "worlds" / name, chosen.places)
+
+
+def _tell_plan(parts: Sequence[Part], jobs: int | None) -> None:
+    """Every part, and how long looking from its sites may take."""
+    cores = jobs or os.cpu_count() or 1
+    for part in parts:
+        looks = ", ".join(f"{name} from {len(sites)}" for name, sites in part.detectors.items())
+        print(f"{part.name}: {part.role}, {part.sensor}, {part.frames} frames, {looks}")
+    minutes = sum(study.reckoned_s(part) for part in parts) / cores / 60
+    print(f"{len(parts)} parts; looking from all sites takes some {minutes:.0f} minutes on {cores} cores", flush=True)
+
+
+def _measured(part: Part, chosen: argparse.Namespace, begun: float) -> Record:
+    def told(text: str) -> None:
+        print(f"{time.monotonic() - begun:6.0f} s  {text}", flush=True)
+
+    told(f"{part.name}: begins")
+    with Screen(part.name) as screen:
+        return measure(part, chosen.data, jobs=chosen.jobs, progress=screen.progress, told=told)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

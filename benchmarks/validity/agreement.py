@@ -1,0 +1,205 @@
+"""Does EGVS foretell detection, with which gamma, and does another score do better? The tables of A, B and D.
+
+What is chosen (gamma, the best score) is chosen on training junctions; held-out ones are only quoted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from benchmarks.validity.pools import DEFAULT, Pools, Setting
+from benchmarks.validity.record import Record, measures_of
+from benchmarks.validity.tables import Cell, Column, Table, with_interval
+from pipeline.validation.statistics.correlation import Correlation
+
+TRAINING, HELD_OUT = "training", "held out"
+
+WORDS = {
+    "seen_20": "share of vehicles with 20 points",
+    "log_points": "mean log(1 + points) of vehicles",
+    "ap_combined_r40_iou70": "AP R40, BEV + 3D, IoU 0.7",
+    "ap_combined_r40_iou50": "AP R40, BEV + 3D, IoU 0.5",
+}
+
+
+def told(found: Correlation | None) -> Cell:
+    """A coefficient as a cell."""
+    return None if found is None else with_interval(found.value, found.interval)
+
+
+def gamma_word(gamma: float) -> str:
+    """A gamma as text."""
+    return f"{gamma:g}"
+
+
+def by_setting(pools: Pools) -> Iterator[Table]:
+    """A: EGVS against detection by gamma, voxel size and moving occlusion; a table a measure."""
+    names = list(pools.studies)
+    for measure in measures_of(pools.detector):
+        rows: list[list[Cell]] = []
+        for setting in pools.settings():
+            cells = [told(pools.rho(name, str(setting), measure)) for name in names]
+            rows.append([gamma_word(setting.gamma), f"{setting.voxel_m:g}", _yes(setting.occlusion), *cells])
+        head = [Column("gamma"), Column("voxel, m"), Column("moving occlusion"), *(Column(n, "two") for n in names)]
+        caption = f"Spearman's rho of EGVS with the {WORDS[measure]} ({pools.detector})."
+        section = "A. EGVS by gamma, voxel size and moving occlusion"
+        yield Table(f"A {pools.detector} {measure}", section, caption, head, rows)
+
+
+_B_COLUMNS = [
+    Column("detector"),
+    Column("measure"),
+    Column("voxel, m"),
+    Column("moving occlusion"),
+    Column("best gamma, training"),
+    Column("as good"),
+    Column("rho, training", "two"),
+    Column("less gamma 10, training", "two"),
+    Column("rho, held out", "two"),
+    Column("gamma 10, held out", "two"),
+    Column("difference, held out", "two"),
+]
+
+
+def chosen_gamma(each: Sequence[Pools]) -> Table:
+    """B: gamma chosen on training junctions, for each voxel size, quoted on held-out ones."""
+    rows = [
+        _chosen_row(pools, measure, [s for s in pools.settings() if (s.voxel_m, s.occlusion) == ground])
+        for pools in each
+        if TRAINING in pools.studies
+        for measure in measures_of(pools.detector)
+        for ground in dict.fromkeys((s.voxel_m, s.occlusion) for s in pools.settings())
+    ]
+    caption = (
+        "Gamma with the highest rho on the training junctions, gammas that are as good (95 %), and what the choice is"
+        " worth on the held-out junctions, against gamma 10 with the same voxels."
+    )
+    return Table("B gamma", "B. Gamma chosen on training junctions", caption, _B_COLUMNS, rows)
+
+
+def _chosen_row(pools: Pools, measure: str, settings: Sequence[Setting]) -> list[Cell]:
+    of = {str(setting): setting for setting in settings}
+    ground = settings[0]
+    head: list[Cell] = [pools.detector, WORDS[measure], f"{ground.voxel_m:g}", _yes(ground.occlusion)]
+    name = pools.best(TRAINING, list(of), measure)
+    if name is None:
+        return [*head, *[None] * 7]
+    ten = str(Setting(DEFAULT.gamma, ground.voxel_m, ground.occlusion))
+    as_good = [gamma_word(s.gamma) for s in pools.as_good(TRAINING, of[name], settings, measure)]
+    cells = [told(pools.rho(TRAINING, name, measure)), told(pools.difference(TRAINING, name, ten, measure))]
+    if HELD_OUT in pools.studies:
+        quoted = [told(pools.rho(HELD_OUT, which, measure)) for which in (name, ten)]
+        cells += [*quoted, told(pools.difference(HELD_OUT, name, ten, measure))]
+    else:
+        cells += [None] * 3
+    return [*head, gamma_word(of[name].gamma), ", ".join(as_good), *cells]
+
+
+def by_sensor(records: Sequence[Record], detectors: Sequence[str]) -> list[Table]:
+    """B: the best gamma by sensor and voxel size on training junctions, and whether one gamma would do for all."""
+    sensors = list(dict.fromkeys(record.sensor for record in records))
+    rows: list[list[Cell]] = []
+    verdicts: list[list[Cell]] = []
+    for detector in detectors:
+        every = [(sensor, Pools([r for r in records if r.sensor == sensor], detector)) for sensor in sensors]
+        here = [(sensor, pools) for sensor, pools in every if pools.records]
+        for measure in measures_of(detector) if here else ():
+            cells = [
+                (sensor, pools, [s for s in pools.settings() if s.voxel_m == voxel_m and not s.occlusion])
+                for sensor, pools in here
+                for voxel_m in dict.fromkeys(s.voxel_m for s in pools.settings())
+            ]
+            rows += [_sensor_row(sensor, pools, settings, measure) for sensor, pools, settings in cells]
+            verdicts.append(_verdict(detector, measure, cells))
+    head = [Column("detector"), Column("measure"), Column("sensor"), Column("voxel, m"), Column("best gamma"),
+            Column("as good"), Column("rho", "two")]  # fmt: skip
+    section = "B. Gamma by sensor and voxel size"
+    first = (
+        "Best gamma on the training junctions by sensor and voxel size, from the same places, without moving occlusion."
+    )
+    second = (
+        "One gamma for all sensors and voxel sizes: the one with the highest mean rho, and in how many of the cells"
+        " above another gamma is better by more than noise. Where that is 0, the data carry no rule by voxel or sensor."
+    )
+    columns = [Column("detector"), Column("measure"), Column("one gamma"), Column("mean rho", "two"),
+               Column("cells", "whole"), Column("better ones", "whole"), Column("where")]  # fmt: skip
+    return [
+        Table("B sensors", section, first, head, rows),
+        Table("B one gamma", section, second, columns, verdicts),
+    ]
+
+
+def _sensor_row(sensor: str, pools: Pools, settings: Sequence[Setting], measure: str) -> list[Cell]:
+    of = {str(setting): setting for setting in settings}
+    head: list[Cell] = [pools.detector, WORDS[measure], sensor, f"{settings[0].voxel_m:g}"]
+    name = pools.best(TRAINING, list(of), measure)
+    if name is None:
+        return [*head, None, None, None]
+    as_good = ", ".join(gamma_word(s.gamma) for s in pools.as_good(TRAINING, of[name], settings, measure))
+    return [*head, gamma_word(of[name].gamma), as_good, told(pools.rho(TRAINING, name, measure))]
+
+
+def _verdict(detector: str, measure: str, cells: Sequence[tuple[str, Pools, Sequence[Setting]]]) -> list[Cell]:
+    """The one gamma, and the cells that another suits better."""
+
+    def mean_rho(gamma: float) -> float:
+        all_ = [pools.rho(TRAINING, str(s), measure).value for _, pools, its in cells for s in its if s.gamma == gamma]
+        return sum(all_) / len(all_)
+
+    means = {gamma: mean_rho(gamma) for gamma in dict.fromkeys(s.gamma for _, _, its in cells for s in its)}
+    known = {gamma: mean for gamma, mean in means.items() if mean == mean}
+    if not known:
+        return [detector, WORDS[measure], None, None, len(cells), None, None]
+    one = max(known, key=lambda gamma: known[gamma])
+    where = []
+    for sensor, pools, settings in cells:
+        its = next(s for s in settings if s.gamma == one)
+        gaps = [pools.difference(TRAINING, str(other), str(its), measure) for other in settings]
+        if any(gap is not None and gap.interval.low > 0.0 for gap in gaps):
+            where.append(f"{sensor} at {its.voxel_m:g} m")
+    return [detector, WORDS[measure], gamma_word(one), round(known[one], 4), len(cells), len(where), ", ".join(where)]
+
+
+def ranked(pools: Pools) -> Iterator[Table]:
+    """D: all scores by their rho on training junctions, quoted on held-out ones."""
+    if TRAINING not in pools.studies:
+        return
+    for measure in measures_of(pools.detector):
+        names = candidates(pools, measure)
+        rho = {name: pools.rho(TRAINING, name, measure).value for name in names}
+        order = sorted(names, key=lambda name: -rho[name] if rho[name] == rho[name] else 2.0)
+        best, default = order[0], str(DEFAULT)
+        rows: list[list[Cell]] = []
+        for name in order:
+            quoted = told(pools.rho(HELD_OUT, name, measure)) if HELD_OUT in pools.studies else None
+            rows.append([
+                name, told(pools.rho(TRAINING, name, measure)), quoted,
+                told(pools.difference(HELD_OUT, name, default, measure)),
+                told(pools.difference(HELD_OUT, name, best, measure)),
+            ])  # fmt: skip
+        head = [Column("score")] + [
+            Column(heading, "two")
+            for heading in (
+                "rho, training",
+                "rho, held out",
+                "less default EGVS, held out",
+                "less best of training, held out",
+            )
+        ]
+        caption = (
+            f"Scores in the order of their rho with the {WORDS[measure]} ({pools.detector}) on the training junctions;"
+            " of EGVS the default and the setting that is best there."
+        )
+        yield Table(f"D {pools.detector} {measure}", "D. All scores", caption, head, rows)
+
+
+def candidates(pools: Pools, measure: str) -> list[str]:
+    """The scores that are compared: each, and of EGVS the default and the setting that is best on training ones."""
+    settings = {str(setting) for setting in pools.settings()}
+    best = pools.best(TRAINING, [name for name in pools.scores if name in settings], measure)
+    kept = {str(DEFAULT), best}
+    return [name for name in pools.scores if name not in settings or name in kept]
+
+
+def _yes(value: bool) -> str:
+    return "yes" if value else "no"

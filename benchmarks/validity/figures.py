@@ -1,0 +1,135 @@
+"""Pictures of the study, drawn from its tables: rho by gamma, detection by height, all scores. Readable in grey."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from benchmarks.validity.agreement import WORDS
+from benchmarks.validity.tables import Table
+from pipeline.core import files
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_DARK, _MID, _LIGHT = "#0072B2", "#D55E00", "#777777"
+_STYLES = {"0.25": (_DARK, "o"), "0.5": (_MID, "s"), "1": (_LIGHT, "^")}
+
+
+def draw(folder: Path, tables: Sequence[Table]) -> list[Path]:
+    """Write the figures as PNG; those whose tables are there."""
+    of = {table.name: table for table in tables}
+    by_setting = [table for name, table in of.items() if name.startswith("A ")]
+    ranked = [table for name, table in of.items() if name.startswith("D ")]
+    made = {
+        "validity-gamma.png": gamma(by_setting) if by_setting else None,
+        "validity-heights.png": heights(of["C heights"]) if of["C heights"].rows else None,
+        "validity-scores.png": scores(ranked) if ranked else None,
+    }
+    written = []
+    for name, figure in made.items():
+        if figure is not None:
+            with files.aside(folder / name) as partial:
+                figure.savefig(partial, dpi=130, format="png", metadata={"Software": None})
+            written.append(folder / name)
+    return written
+
+
+def gamma(tables: Sequence[Table]) -> Figure:
+    """Rho against gamma: a column a detector and measure, a row a role."""
+    roles = [name for name in ("training", "held out") if name in {c.heading for c in tables[0].columns}]
+    figure, panels = _panels(len(roles), len(tables), 4.0, 3.2)
+    for column, table in enumerate(tables):
+        for row, role in enumerate(roles):
+            axes = panels[row, column]
+            _gamma_lines(axes, table, role)
+            axes.set(ylim=(-1.05, 1.05), xlabel="gamma", ylabel=f"rho, {role}" if column == 0 else "")
+            axes.set_title(_what(table), fontsize=9)
+    panels[0, 0].legend(fontsize=6.5, loc="lower left")
+    return figure
+
+
+def _gamma_lines(axes: Any, table: Table, role: str) -> None:
+    gammas = list(dict.fromkeys(table.column("gamma")))
+    grounds = zip(table.column("voxel, m"), table.column("moving occlusion"), strict=True)
+    for voxel, occlusion in dict.fromkeys(grounds):
+        rows = zip(
+            table.column("gamma"), table.column("voxel, m"), table.column("moving occlusion"), table.column(role),
+            strict=True,
+        )  # fmt: skip
+        its = [(gammas.index(g), cell) for g, v, o, cell in rows if (v, o) == (voxel, occlusion) and cell is not None]
+        colour, marker = _STYLES[voxel]
+        line = "--" if occlusion == "yes" else "-"
+        label = f"voxel {voxel} m" + (", moving occlusion" if occlusion == "yes" else "")
+        axes.plot([x for x, _ in its], [c[0] for _, c in its], line, color=colour, marker=marker, ms=4, label=label)
+        if (voxel, occlusion) == ("0.25", "no"):
+            known = [(x, c) for x, c in its if c[1] is not None]
+            axes.fill_between(
+                [x for x, _ in known], [c[1] for _, c in known], [c[2] for _, c in known], color=colour, alpha=0.12
+            )
+    axes.set_xticks(range(len(gammas)), gammas)
+
+
+def heights(table: Table) -> Figure:
+    """Detection against mounting height: a panel a detector and measure, a line a junction, all together in bold."""
+    kinds = list(dict.fromkeys(zip(table.column("detector"), table.column("measure"), strict=True)))
+    figure, panels = _panels(1, len(kinds), 4.0, 3.4)
+    marks = [
+        column.heading for column in table.columns if column.heading.endswith(" m") and "less" not in column.heading
+    ]
+    metres = [float(mark.split()[0]) for mark in marks]
+    for axes, (detector, measure) in zip(panels[0], kinds, strict=True):
+        for row in range(len(table.rows)):
+            if (table.column("detector")[row], table.column("measure")[row]) != (detector, measure):
+                continue
+            name, cells = table.column("junction")[row], [table.column(mark)[row] for mark in marks]
+            if any(cell is None for cell in cells):
+                continue
+            values = [cell[0] for cell in cells]
+            if name == "all":
+                ends = [[c[0] - c[1] for c in cells], [c[2] - c[0] for c in cells]] if cells[0][1] is not None else None
+                axes.errorbar(
+                    metres, values, yerr=ends, color="black", linewidth=2.2, marker="o", capsize=3, label=name
+                )
+            else:
+                axes.plot(metres, values, linewidth=1.0, marker=".", label=name)
+        axes.set(xlabel="height above the ground, m", ylabel=f"{measure}, %")
+        axes.set_title(detector, fontsize=9)
+    panels[0, 0].legend(fontsize=6.5)
+    return figure
+
+
+def scores(tables: Sequence[Table]) -> Figure:
+    """Every score's rho on training junctions (open) and held-out ones (filled), with intervals."""
+    figure, panels = _panels(1, len(tables), 5.4, 0.8 + 0.3 * max(len(table.rows) for table in tables))
+    for axes, table in zip(panels[0], tables, strict=True):
+        for heading, shift, face in (("rho, training", -0.15, "white"), ("rho, held out", 0.15, _DARK)):
+            for line, cell in enumerate(table.column(heading)):
+                if cell is not None:
+                    if cell[1] is not None:
+                        axes.plot(cell[1:], [line + shift] * 2, color="0.6", linewidth=1.3, zorder=1)
+                    axes.scatter([cell[0]], [line + shift], s=24, facecolors=face, edgecolors=_DARK, zorder=3)
+        axes.set_yticks(range(len(table.rows)), table.column("score"), fontsize=6.5)
+        axes.set(ylim=(len(table.rows) - 0.5, -0.5), xlim=(-1.05, 1.05), xlabel="rho: open training, filled held out")
+        axes.axvline(0.0, color="0.5", linewidth=0.8)
+        axes.set_title(_what(table), fontsize=9)
+    return figure
+
+
+def _what(table: Table) -> str:
+    _, detector, measure = table.name.split()
+    return f"{detector}: {WORDS[measure]}"
+
+
+def _panels(rows: int, columns: int, width: float, height: float) -> tuple[Figure, Any]:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(rows, columns, squeeze=False)
+    for axes in panels.ravel():
+        axes.grid(True, color="0.9", linewidth=0.6)
+        axes.tick_params(labelsize=7)
+    return figure, panels

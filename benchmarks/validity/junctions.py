@@ -1,0 +1,114 @@
+"""The junctions of the study, what each is there for, and its sites.
+
+*Training* junctions may choose (gamma, the best score, a detector's weights); *held-out* ones are what is quoted.
+Junctions from OpenStreetMap are made from extracts that the user names, since none is shipped; without them the study
+runs on the others, and its tables say so.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from benchmarks.validity import poses
+from pipeline.core import files
+from pipeline.core.errors import InputError
+from pipeline.importers import openstreetmap
+from pipeline.runs.workflow import bring
+from pipeline.scenario.loading import load
+from pipeline.scenario.models import Scenario, SitesModel
+from pipeline.sensing.sites import Site
+from pipeline.stages.base import Workspace
+from pipeline.stages.shared.scene import scene_of
+from pipeline.traffic import sumo_folder
+from pipeline.world.carriageway import Carriageway
+
+Role = Literal["training", "held out"]
+ROLES: tuple[Role, ...] = ("training", "held out")
+
+SHIPPED: dict[str, Role] = {
+    "ingolstadt": "training",
+    "hill": "training",
+    "roundabout": "training",
+    "nishishinjuku": "held out",
+}
+OSM: dict[Role, str] = {"training": "osm_training", "held out": "osm_held_out"}
+"""What junctions from OpenStreetMap are called."""
+
+SCENARIOS = Path(__file__).resolve().parents[2] / "scenarios"
+
+
+@dataclass(frozen=True)
+class StudyJunction:
+    """A junction of the study.
+
+    Attributes
+    ----------
+    given, grid
+        Its own upright sites, and those of :mod:`benchmarks.validity.poses`.
+    """
+
+    name: str
+    role: Role
+    scenario: Scenario
+    given: tuple[Site, ...]
+    grid: tuple[Site, ...]
+
+
+def shipped(names: Sequence[str] = ()) -> list[tuple[str, Role, Path]]:
+    """The scenarios of this project that the study looks at, and their folders."""
+    return [
+        (n, role, SCENARIOS / n) for n, role in SHIPPED.items() if (SCENARIOS / n).is_dir() and n in (names or (n,))
+    ]
+
+
+def from_osm(role: Role, extract: Path, at: tuple[float, float] | None, folder: Path) -> tuple[str, Role, Path]:
+    """The scenario made from an extract, in a folder of the study; made once for the same extract and place."""
+    name = OSM[role]
+    home, note = folder / name, folder / f"{name}.json"
+    if not extract.is_file():
+        raise InputError(f"--osm-{role.replace(' ', '-')}", f"no such file ({extract})", "an OpenStreetMap extract")
+    key = files.canonical_json({"extract": files.sha256_of(extract), "at": at})
+    if not (home.is_dir() and note.is_file() and note.read_bytes() == key):
+        if home.is_dir():
+            raise InputError(home, "is of another extract or place", "to remove it, so that it is made anew")
+        folder.mkdir(parents=True, exist_ok=True)
+        openstreetmap.new(home, extract, at)
+        note.write_bytes(key)
+    return name, role, home
+
+
+def ready(name: str, role: Role, home: Path, folder: Path, places: int = poses.PLACES) -> StudyJunction:
+    """A junction with its sites: its own upright ones, and the grid.
+
+    Parameters
+    ----------
+    folder
+        For the static world, from the store where it is there.
+    """
+    scenario = load(home)
+    folder.mkdir(parents=True, exist_ok=True)
+    work = Workspace(scenario, folder)
+    bring(work, "statics")
+    scene = scene_of(work)
+    given = tuple(site for site in scene.sites if site.pose.pitch_deg == site.pose.roll_deg == 0.0 and not site.points)
+    network = sumo_folder.roads(scenario)
+    carriageway = None if network is None else Carriageway.of(network)
+    grid = poses.grid_poses(scene, carriageway, scenario.sites.sensor, places)
+    return StudyJunction(name, role, scenario, given, grid)
+
+
+def posed(scenario: Scenario, sites: Sequence[Site], file: Path, sensor: str | None = None) -> Scenario:
+    """The scenario with these sites, written as a CSV; all with another sensor where one is named."""
+    with files.aside(file) as partial, partial.open("w", encoding="utf-8", newline="") as out:
+        rows = csv.writer(out, lineterminator="\n")
+        rows.writerow(["site", "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg", "sensor"])
+        for site in sites:
+            rows.writerow(
+                [site.name, *map(repr, (*site.pose.position_m, *site.pose.angles_deg)), sensor or site.sensor]
+            )
+    model = SitesModel(file=str(file.resolve()), sensor=sensor or scenario.sites.sensor)
+    return scenario.model_copy(update={"sites": model})

@@ -1,0 +1,114 @@
+"""The study's coefficients: of each junction, of the training junctions together, of the held-out ones together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+from benchmarks.validity.junctions import ROLES
+from benchmarks.validity.record import Record
+from pipeline.core import files
+from pipeline.validation.agreement import ScoreName
+from pipeline.validation.statistics.coefficients import Kind
+from pipeline.validation.statistics.correlation import RESAMPLES, Correlation, Study
+
+SEED = 2504
+"""Of the resamples of sites and blocks."""
+
+KIND: Kind = "spearman"
+"""The study compares orders: a planner takes the first of a list."""
+
+GAMMAS = (1.0, 2.0, 5.0, 10.0, 20.0, math.inf)
+VOXELS_M = (0.25, 0.5, 1.0)
+OCCLUSIONS = (False, True)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """EGVS with one choice of its parameters."""
+
+    gamma: float
+    voxel_m: float
+    occlusion: bool
+
+    def __str__(self) -> str:
+        """The score's name in a record."""
+        told = {
+            "gamma": "inf" if self.gamma == math.inf else self.gamma,
+            "moving_occlusion": self.occlusion,
+            "voxel_m": self.voxel_m,
+        }
+        return str(ScoreName("egvs", files.canonical_json(told).decode()))
+
+
+DEFAULT = Setting(10.0, 0.25, False)
+"""What a scenario has that says nothing else."""
+
+
+class Pools:
+    """Every junction's coefficients and the pooled ones, of one detector.
+
+    Parameters
+    ----------
+    records
+        Of one sensor; those that the detector looked at count.
+    """
+
+    def __init__(self, records: Sequence[Record], detector: str, resamples: int = RESAMPLES) -> None:
+        self.records = [record for record in records if detector in record.detections]
+        self.detector, self.resamples = detector, resamples
+        self._known: dict[tuple[str, ...], Correlation] = {}
+
+    @cached_property
+    def studies(self) -> dict[str, Study]:
+        """By name of the junction, or by role."""
+        together: dict[str, list[Record]] = {record.junction: [record] for record in self.records}
+        for role in ROLES:
+            if its := [record for record in self.records if record.role == role]:
+                together[role] = its
+        return {
+            name: Study([record.junction_of(self.detector) for record in its], SEED, self.resamples)
+            for name, its in together.items()
+        }
+
+    @cached_property
+    def scores(self) -> list[str]:
+        """Those that all records have, in their order."""
+        first, *others = (record.scores for record in self.records)
+        return [name for name in first if all(name in other for other in others)]
+
+    def settings(self) -> list[Setting]:
+        """Those of EGVS that all records have."""
+        every = [Setting(g, voxel, occlusion) for occlusion in OCCLUSIONS for voxel in VOXELS_M for g in GAMMAS]
+        return [setting for setting in every if str(setting) in self.scores]
+
+    def rho(self, pool: str, score: str, measure: str) -> Correlation:
+        """How well a score goes with a measure."""
+        if (key := (pool, score, measure)) not in self._known:
+            self._known[key] = self.studies[pool].correlation(score, measure, KIND)
+        return self._known[key]
+
+    def difference(self, pool: str, first: str, second: str, measure: str) -> Correlation | None:
+        """By how much better the first goes; None where it is the same score, or there is no such pool."""
+        if first == second or pool not in self.studies:
+            return None
+        if (key := (pool, first, second, measure)) not in self._known:
+            self._known[key] = self.studies[pool].difference(first, second, measure, KIND)
+        return self._known[key]
+
+    def best(self, pool: str, names: Sequence[str], measure: str) -> str | None:
+        """The score that goes best with a measure, of equals the first; None where none has a coefficient."""
+        known = [(self.rho(pool, name, measure).value, name) for name in names] if pool in self.studies else []
+        known = [its for its in known if not math.isnan(its[0])]
+        return max(known, key=lambda its: its[0])[1] if known else None
+
+    def as_good(self, pool: str, best: Setting, others: Sequence[Setting], measure: str) -> list[Setting]:
+        """Those that the data cannot tell from the best: the interval of the difference does not lie above 0."""
+        kept = []
+        for other in others:
+            gap = self.difference(pool, str(best), str(other), measure)
+            if gap is None or not gap.interval.low > 0.0:
+                kept.append(other)
+        return kept

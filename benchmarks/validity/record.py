@@ -1,0 +1,114 @@
+"""What was measured at the sites of one junction with one sensor: all that the analyses start from, kept as JSON.
+
+Numbers are kept in full, so that analyses of what was kept and of what was just measured are the same. What was
+measured with a clock is not in here.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.core import files
+from pipeline.validation.site_findings import POINTS
+from pipeline.validation.statistics.junctions import Junction, Measured
+
+COUNTED = ("seen_20", "log_points")
+BOXED = ("ap_combined_r40_iou70", "ap_combined_r40_iou50")
+"""What detection is measured by; the first is what a detector is shown by."""
+
+BESIDE = ("seen_1", "seen_5")
+"""Kept beside it of points on vehicles, to explain failures."""
+
+
+def measures_of(detector: str) -> tuple[str, ...]:
+    """The measures of a detector."""
+    return COUNTED if detector == POINTS else BOXED
+
+
+@dataclass(frozen=True)
+class StudySite:
+    """A site: its name, its place's, its height above the ground, its mean horizontal distance to vehicles."""
+
+    name: str
+    place: str
+    height_m: float
+    distance_m: float
+    is_given: bool
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """One measure of one detector, at the sites that it looked from.
+
+    Attributes
+    ----------
+    sites
+        Their numbers among the sites of the record.
+    values, se
+        One a site; NaN where it is not defined.
+    left_out
+        With each block of frames left out, one list a site.
+    """
+
+    sites: list[int]
+    values: list[float]
+    se: list[float]
+    left_out: list[list[float]]
+
+    def measured(self) -> Measured:
+        """As the statistics take it."""
+        return Measured(np.array(self.values, dtype=np.float64), np.array(self.left_out, dtype=np.float64))
+
+
+@dataclass(frozen=True)
+class Record:
+    """What was measured.
+
+    Attributes
+    ----------
+    key
+        Hash of everything that it depends on.
+    objects
+        Vehicle-frames that a detector should find.
+    scores
+        By name, one a site, turned so that more is better.
+    detections
+        By detector and measure.
+    """
+
+    key: str
+    junction: str
+    role: str
+    sensor: str
+    frames: int
+    objects: int
+    seeds: dict[str, int]
+    sites: list[StudySite]
+    scores: dict[str, list[float]]
+    detections: dict[str, dict[str, Estimates]]
+
+    def write(self, path: Path) -> None:
+        """As JSON."""
+        with files.aside(path) as partial:
+            partial.write_text(json.dumps(asdict(self), indent=None, separators=(",", ":")) + "\n", encoding="utf-8")
+
+    @classmethod
+    def read(cls, path: Path) -> Record:
+        """The inverse of :meth:`write`."""
+        value = json.loads(path.read_text(encoding="utf-8"))
+        sites = [StudySite(**site) for site in value.pop("sites")]
+        found = {d: {m: Estimates(**its) for m, its in by.items()} for d, by in value.pop("detections").items()}
+        return cls(sites=sites, detections=found, **value)
+
+    def junction_of(self, detector: str, scores: Mapping[str, list[float]] | None = None) -> Junction:
+        """The sites that a detector looked from, with all scores, or others in their place."""
+        by_measure = self.detections[detector]
+        rows = next(iter(by_measure.values())).sites
+        values = {name: np.array(its, dtype=np.float64)[rows] for name, its in (scores or self.scores).items()}
+        measures = {name: its.measured() for name, its in by_measure.items()}
+        return Junction(self.junction, tuple(self.sites[row].name for row in rows), values, measures)

@@ -1,0 +1,172 @@
+"""The whole study: what is measured, in which order, and what is made of it."""
+
+from __future__ import annotations
+
+import json
+import statistics
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.validity import agreement, failures, heights, junctions, poses
+from benchmarks.validity.agreement import WORDS
+from benchmarks.validity.junctions import StudyJunction
+from benchmarks.validity.measuring import Part
+from benchmarks.validity.pools import SEED, Pools
+from benchmarks.validity.record import Record, measures_of
+from benchmarks.validity.tables import Cell, Column, Table, number
+from pipeline.sensing.sites import Site
+from pipeline.validation.site_findings import POINTS
+from pipeline.validation.statistics.correlation import RESAMPLES
+
+FRAMES, SENSOR_FRAMES = 250, 100
+SENSORS = ("VLP-16", "VLP-32C", "OS1-64", "OS1-128")
+"""Compared at the first places of the grid of the training junctions."""
+
+FAST = (POINTS, "cluster")
+"""Detectors that look from every site, and with every sensor; others look from some."""
+
+FEW_PLACES, FEW_GIVEN = 5, 13
+"""Where other detectors look from: the first places of the grid at all heights, and as many of the given sites."""
+
+_CORE_MS = {POINTS: 4.0, "cluster": 60.0}
+_OTHER_CORE_MS = 240.0
+"""Of one core, a frame: what the plan reckons with."""
+
+
+@dataclass(frozen=True)
+class Extent:
+    """How much is measured.
+
+    Attributes
+    ----------
+    frames, sensor_frames
+        Of unseen traffic; of that where sensors are compared.
+    places
+        Of the grid.
+    """
+
+    frames: int = FRAMES
+    sensor_frames: int = SENSOR_FRAMES
+    places: int = poses.PLACES
+
+
+def parts(each: Sequence[StudyJunction], detectors: Sequence[str], extent: Extent, folder: Path) -> list[Part]:
+    """What is measured: every junction with its own sensor, then the training junctions with several sensors."""
+    fast = [name for name in detectors if name in FAST]
+    found = []
+    for junction in each:
+        sites = (*junction.given, *junction.grid)
+        few = {site.name for site in (*some(junction.given, FEW_GIVEN), *first_places(junction.grid))}
+        looks = {name: frozenset(site.name for site in sites) if name in FAST else frozenset(few) for name in detectors}
+        sensor = junction.scenario.sites.sensor
+        found.append(_part(junction, junction.name, sensor, sites, looks, extent.frames, folder))
+    for junction in each:
+        if junction.role == "training":
+            for sensor in SENSORS:
+                sites = first_places(junction.grid)
+                looks = {name: frozenset(site.name for site in sites) for name in fast}
+                name = f"{junction.name}-{sensor}"
+                found.append(_part(junction, name, sensor, sites, looks, extent.sensor_frames, folder, ("egvs",)))
+    return found
+
+
+def _part(
+    junction: StudyJunction, name: str, sensor: str, sites: tuple[Site, ...], looks: dict[str, frozenset[str]],
+    frames: int, folder: Path, scores: tuple[str, ...] | None = None,
+) -> Part:  # fmt: skip
+    scenario = junctions.posed(junction.scenario, sites, folder / f"{name}.sites.csv", sensor if scores else None)
+    given = frozenset(site.name for site in junction.given)
+    return Part(name, junction.name, junction.role, sensor, scenario, sites, given, looks, frames, scores)
+
+
+def some(sites: Sequence[Site], most: int) -> list[Site]:
+    """Not more than so many, evenly over the list."""
+    if len(sites) <= most:
+        return list(sites)
+    return [sites[i] for i in (np.arange(most) * len(sites) // most).tolist()]
+
+
+def first_places(grid: tuple[Site, ...]) -> tuple[Site, ...]:
+    """The sites at the first places of the grid."""
+    return grid[: FEW_PLACES * len(poses.HEIGHTS_M)]
+
+
+def reckoned_s(part: Part) -> float:
+    """Seconds of one core that looking takes, roughly."""
+    each = {name: _CORE_MS.get(name, _OTHER_CORE_MS) * len(sites) for name, sites in part.detectors.items()}
+    return sum(each.values()) * part.frames / 1e3
+
+
+def tables_of(records: Sequence[Record], with_sensors: Sequence[Record], detectors: Sequence[str]) -> Iterator[Table]:
+    """Every table of the page."""
+    every = [Pools(records, name) for name in detectors]
+    each = [pools for pools in every if pools.records]
+    yield measured_table(records, detectors)
+    for pools in each:
+        yield from agreement.by_setting(pools)
+    yield agreement.chosen_gamma(each)
+    if with_sensors:
+        yield from agreement.by_sensor(with_sensors, [name for name in detectors if name in FAST])
+    yield heights.table(records, detectors)
+    for pools in each:
+        yield from agreement.ranked(pools)
+    yield from failures.tables(each)
+
+
+def measured_table(records: Sequence[Record], detectors: Sequence[str]) -> Table:
+    """What was looked at, how much is detected there, and how sure that is."""
+    rows: list[list[Cell]] = []
+    for record in records:
+        for name in (name for name in detectors if name in record.detections):
+            for measure in measures_of(name):
+                its = record.detections[name][measure]
+                given = sum(record.sites[site].is_given for site in its.sites)
+                values = np.array([its.values, its.se]) * 100.0
+                rows.append([
+                    record.junction, record.role, given, len(its.sites) - given, record.frames,
+                    number(record.objects / record.frames), name, WORDS[measure], number(float(values[0].min())),
+                    number(float(values[0].mean())), number(float(values[0].max())), number(float(values[1].mean())),
+                ])  # fmt: skip
+    head = [Column("junction"), Column("role"), Column("given sites", "whole"), Column("grid", "whole"),
+            Column("frames", "whole"), Column("vehicles a frame", "one"), Column("detector"), Column("measure"),
+            Column("worst site", "one"), Column("mean", "one"), Column("best site", "one"),
+            Column("mean standard error", "one")]  # fmt: skip
+    caption = (
+        "Sites that each detector looked from, and what it found, in per cent (AP is BEV + 3D: up to 200; log points"
+        " times 100)."
+    )
+    return Table("0 measured", "What was measured", caption, head, rows)
+
+
+def preface(
+    records: Sequence[Record], with_sensors: Sequence[Record], detectors: Sequence[str], without: Sequence[str]
+) -> list[str]:
+    """What the page says before its tables: all that they depend on."""
+    seeds = "; ".join(f"{r.junction}: TPOG {r.seeds['TPOG']}, unseen traffic {r.seeds['unseen']}" for r in records)
+    found = [
+        "Made by `make validity`; [Does EGVS foretell detection?](validity.md) says what is meant. Intervals are of"
+        " 95 %; a dash is what is not defined, or has nothing to be compared with.",
+        f"Detectors: {', '.join(detectors)}. Frames: {', '.join(f'{r.junction} {r.frames}' for r in records)}"
+        + (f"; sensors compared on {with_sensors[0].frames}" if with_sensors else "")
+        + f". Seeds: {seeds}; {RESAMPLES} resamples of seed {SEED}.",
+    ]
+    if without:
+        found.append("Without: " + "; ".join(without) + ".")
+    if any(record.junction in junctions.OSM.values() for record in records):
+        found.append("Map data of the junctions from OpenStreetMap (c) OpenStreetMap contributors, ODbL.")
+    return found
+
+
+def costs(folder: Path, names: Sequence[str]) -> Table:
+    """Milliseconds a site of every score, as measured: the mean of the junctions' medians."""
+    each: dict[str, list[float]] = {}
+    for path in (folder / f"{name}.costs.json" for name in names):
+        for score, by in json.loads(path.read_text(encoding="utf-8")).items():
+            for parameters, ms in by.items():
+                each.setdefault(f"{score} {parameters}" if parameters != "{}" else score, []).append(ms)
+    rows: list[list[Cell]] = [[name, round(statistics.mean(its), 1)] for name, its in each.items()]
+    caption = "Milliseconds of one core a site, each as if it were the only score; another machine measures others."
+    return Table("costs", "Milliseconds a site", caption, [Column("score"), Column("ms a site", "one")], rows)
