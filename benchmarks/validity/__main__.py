@@ -42,7 +42,10 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.validity", description=__doc__)
     parser.add_argument("--frames", type=int, default=study.FRAMES, help="of unseen traffic (default %(default)s)")
     parser.add_argument(
-        "--sensor-frames", type=int, default=study.SENSOR_FRAMES, help="where sensors are compared (%(default)s)"
+        "--sensor-frames",
+        type=int,
+        default=study.SENSOR_FRAMES,
+        help="where sensors are compared, 0 for not at all (%(default)s)",
     )
     parser.add_argument("--places", type=int, default=poses.PLACES, help="of the grid (default %(default)s)")
     parser.add_argument("--detector", metavar="NAME,NAME", help="default: all that are installed")
@@ -70,6 +73,8 @@ def _study(chosen: argparse.Namespace) -> None:
     with_sensors = [records[part.name] for part in parts if part.scores is not None]
     print("analysing")
     made = list(study.tables_of(main_ones, with_sensors, detectors))
+    if not with_sensors:
+        left_out.append("a comparison of sensors")
     words = study.preface(main_ones, with_sensors, detectors, [*without, *left_out])
     write(chosen.docs, words, made)
     costs = tables.page("What scores cost", [], [study.costs(chosen.data, [junction.name for junction in each])])

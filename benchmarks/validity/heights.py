@@ -28,7 +28,7 @@ def table(records: Sequence[Record], detectors: Sequence[str]) -> Table:
     rows: list[list[Cell]] = []
     for detector in detectors:
         mine = [record for record in records if detector in record.detections]
-        for measure in measures_of(detector):
+        for measure in measures_of(detector) if mine else ():
             for name, group in [*((r.junction, [r]) for r in mine), ("all", mine)]:
                 rows.append([detector, WORDS[measure], name, *_cells(group, detector, measure)])
     low, *above = HEIGHTS_M

@@ -56,18 +56,21 @@ def grid_poses(scene: Scene, carriageway: Carriageway | None, sensor: str, place
 def free_at(scene: Scene, carriageway: Carriageway | None, sensor: str) -> NDArray[np.float64]:
     """The places of the lattice where a pole could stand, at every height, (n, 2)."""
     near = _near_lanes(_lattice(scene), carriageway)
-    kept = []
-    for number, at_m in enumerate(near.tolist()):
-        sites = _at_all_heights(scene, at_m, number, sensor)
-        if len(free_places.sort_out(sites, scene.world, carriageway).free) < len(sites):
-            continue
-        try:
-            for site in sites:
-                placing.check(scene, site.pose, scene.sensor(sensor), site.name)
-        except InputError:
-            continue
-        kept.append(at_m)
+    each = [_at_all_heights(scene, at_m, number, sensor) for number, at_m in enumerate(near.tolist())]
+    free = free_places.sort_out([sites[0] for sites in each], scene.world, carriageway).free
+    poles = {site.pole for site in free}
+    kept = [at_m for at_m, sites in zip(near, each, strict=True) if sites[0].pole in poles and _can_stand(scene, sites)]
     return np.array(kept, dtype=np.float64).reshape(-1, 2)
+
+
+def _can_stand(scene: Scene, sites: Sequence[Site]) -> bool:
+    """Whether sensors can: above the ground, in no solid, in reach of the region of interest."""
+    try:
+        for site in sites:
+            placing.check(scene, site.pose, scene.sensor(site.sensor), site.name)
+    except InputError:
+        return False
+    return True
 
 
 def spread(places_m: NDArray[np.float64], middle_m: NDArray[np.float64], wanted: int) -> list[int]:

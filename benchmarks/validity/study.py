@@ -43,7 +43,7 @@ class Extent:
     Attributes
     ----------
     frames, sensor_frames
-        Of unseen traffic; of that where sensors are compared.
+        Of unseen traffic; of that where sensors are compared, which 0 leaves out.
     places
         Of the grid.
     """
@@ -64,7 +64,7 @@ def parts(each: Sequence[StudyJunction], detectors: Sequence[str], extent: Exten
         sensor = junction.scenario.sites.sensor
         found.append(_part(junction, junction.name, sensor, sites, looks, extent.frames, folder))
     for junction in each:
-        if junction.role == "training":
+        if junction.role == "training" and extent.sensor_frames:
             for sensor in SENSORS:
                 sites = first_places(junction.grid)
                 looks = {name: frozenset(site.name for site in sites) for name in fast}

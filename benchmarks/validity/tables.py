@@ -68,7 +68,7 @@ def number(value: float) -> Cell:
 
 
 def _kept(value: float) -> float | None:
-    return None if math.isnan(value) else round(value, KEPT_DIGITS) + 0.0
+    return None if math.isnan(value) else round(float(value), KEPT_DIGITS) + 0.0
 
 
 def shown(cell: Cell, form: Form) -> str:

@@ -1,0 +1,259 @@
+"""The study of docs/validity.md: its places, what it keeps, its tables from made-up findings, its page."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pipeline
+from benchmarks.validity import __main__ as command
+from benchmarks.validity import agreement, failures, figures, heights, junctions, measuring, poses, study, tables
+from benchmarks.validity.pools import DEFAULT, Pools, Setting
+from benchmarks.validity.record import Estimates, Record, StudySite
+from pipeline.validation.looking import Look
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "docs"
+
+
+# the places
+
+
+def test_the_grid_is_the_same_each_time_upright_and_at_all_heights(mini: Path) -> None:
+    first, again = (poses.grid_poses(pipeline.build_scene(pipeline.load(mini)), None, "small") for _ in range(2))
+    assert first == again and len(first) == 40
+    assert [site.name for site in first[:5]] == ["g01h2", "g01h3", "g01h4.5", "g01h6", "g02h2"]
+    assert [site.pose.z_m for site in first[:4]] == [2.0, 3.0, 4.5, 6.0]
+    assert all(site.pose.angles_deg == (0.0, 0.0, 0.0) for site in first)
+    assert len({(site.pose.x_m, site.pose.y_m) for site in first}) == 10
+    assert poses.grid_poses(pipeline.build_scene(pipeline.load(mini)), None, "small", places=5) == first[:20]
+
+
+def test_no_place_is_in_the_building_or_outside_the_surroundings(mini: Path) -> None:
+    free = poses.free_at(pipeline.build_scene(pipeline.load(mini)), None, "small")
+    x, y = free.T
+    assert not ((x > 14) & (x < 18) & (y > 5) & (y < 8)).any()
+    assert x.min() == -12.0 and x.max() == 52.0 and y.min() == -22.0 and y.max() == 22.0
+
+
+def test_places_are_beside_lanes_and_their_heights_count_from_the_slope() -> None:
+    scenario = pipeline.load(ROOT / "scenarios" / "hill")
+    scene = pipeline.build_scene(scenario)
+    lanes = junctions.Carriageway.of(junctions.sumo_folder.roads(scenario))
+    grid = poses.grid_poses(scene, lanes, "VLP-32C")
+    import shapely
+
+    road = shapely.union_all(lanes.areas)
+    away = shapely.distance(road, shapely.points([(site.pose.x_m, site.pose.y_m) for site in grid]))
+    assert away.min() > 0.0 and away.max() <= poses.ROAD_M
+    for site in grid:
+        assert 4.0 < site.pose.z_m - float(site.name.partition("h")[2]) < 14.0  # the ground climbs to both sides of 9 m
+
+
+def test_places_are_spread_as_a_plain_search_spreads_them() -> None:
+    rng = np.random.default_rng(5)
+    at = rng.uniform(0, 50, (60, 2))
+    taken = [min(range(60), key=lambda i: math.dist(at[i], (25, 25)))]
+    while len(taken) < 8:
+        taken.append(max(range(60), key=lambda i: min(math.dist(at[i], at[j]) for j in taken)))
+    assert poses.spread(at, np.array([25.0, 25.0]), 8) == taken
+
+
+# what is measured and kept
+
+
+def part_of(mini: Path, folder: Path) -> measuring.Part:
+    junction = junctions.ready("mini", "training", mini, folder / "world", places=2)
+    extent = study.Extent(frames=10, sensor_frames=0, places=2)
+    part, *others = study.parts([junction], ["points"], extent, folder)
+    assert not others and len(part.sites) == 10 and part.given == {"pole_a", "pole_b"}
+    return measuring.Part(**{**vars(part), "scores": ("entropy_seen",)})
+
+
+def test_a_part_that_was_measured_is_kept_and_an_interrupted_one_goes_on(mini, tmp_path, monkeypatch) -> None:
+    said: list[str] = []
+    part = part_of(mini, tmp_path)
+    made = measuring.measure(part, tmp_path, jobs=1, told=said.append)
+    assert not said and made.frames == 10 and [site.is_given for site in made.sites[:3]] == [True, True, False]
+    assert made.sites[2].height_m == 2.0 and made.sites[2].place == "g01"
+    points = made.detections["points"]["seen_20"]
+    assert points.sites == list(range(10)) and max(points.values) <= 1.0
+    assert len(made.scores["entropy_seen"]) == 10 and made.sites[9].name == "g02h6"
+
+    monkeypatch.setattr(Look, "at", lambda *_: pytest.fail("looked again"))
+    assert measuring.measure(part_of(mini, tmp_path), tmp_path, jobs=1, told=said.append) == made
+    assert said == ["mini: kept"]
+    kept = (tmp_path / "mini.json").read_bytes()
+    (tmp_path / "mini.json").unlink()  # as if it had been interrupted before it was whole
+    assert measuring.measure(part, tmp_path, jobs=1, told=said.append) == made
+    assert said == ["mini: kept"] and (tmp_path / "mini.json").read_bytes() == kept
+
+
+def test_a_posed_scenario_has_these_sites_and_no_keys_of_the_old_ones(mini: Path, tmp_path: Path) -> None:
+    scenario = pipeline.load(mini, ["sites.yaw_deg=30"])
+    grid = poses.grid_poses(pipeline.build_scene(scenario), None, "small", places=1)
+    for sensor in (None, "VLP-16"):
+        sites = pipeline.build_scene(junctions.posed(scenario, grid, tmp_path / "its.csv", sensor)).sites
+        assert [(s.name, s.pose) for s in sites] == [(s.name, s.pose) for s in grid]
+        assert {s.sensor for s in sites} == {sensor or "small"}
+
+
+def test_wrong_arguments_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = ["--data", str(tmp_path)]
+    assert command.main([*data, "--junction", "tokyo"]) == 2
+    assert "--junction: 'tokyo'; one of ingolstadt" in capsys.readouterr().err
+    assert command.main([*data, "--detector", "crystal_ball"]) == 2
+    assert "unknown detector 'crystal_ball'" in capsys.readouterr().err
+    assert command.main([*data, "--junction", "hill", "--osm-held-out", str(tmp_path / "no.osm")]) == 2
+    assert "--osm-held-out: no such file" in capsys.readouterr().err
+
+
+# tables from made-up findings
+
+
+def made_up(name: str, role: str, *, boxes: bool = True) -> Record:
+    """Six places at four heights and six given sites; detection falls by a hundredth a metre of height, and grows with
+    the number of the place; ``entropy_seen`` foretells it, EGVS the opposite but for gamma 2."""
+    rng = np.random.default_rng(len(name))
+    sites = [StudySite(f"k{i}", f"k{i}", 3.0, 20.0, True) for i in range(6)]
+    sites += [StudySite(f"g{i}h{h:g}", f"g{i}", h, 20.0, False) for i in range(6) for h in poses.HEIGHTS_M]
+    values = np.array([0.5 + 0.05 * int(s.place[1:]) - 0.01 * s.height_m + (0.003 if s.is_given else 0) for s in sites])
+    left_out = values[:, None] + 0.001 * rng.normal(size=(len(sites), 10))
+    its = Estimates(list(range(len(sites))), values.tolist(), [0.01] * len(sites), left_out.tolist())
+    detections = {"points": {m: its for m in ("seen_20", "log_points", "seen_1", "seen_5")}}
+    if boxes:
+        detections["cluster"] = {m: its for m in ("ap_combined_r40_iou70", "ap_combined_r40_iou50")}
+    settings = [Setting(g, v, o) for g in (1.0, 2.0, 10.0) for v in (0.25, 1.0) for o in (False, True)]
+    scores = {str(s): (values * (1 if s.gamma == 2 else -1) + 3).tolist() for s in settings}
+    scores["entropy_seen"] = values.tolist()
+    scores["constant"] = [1.0] * len(sites)
+    return Record("", name, role, "VLP-32C", 50, 200, {"TPOG": 1, "unseen": 2}, sites, scores, detections)
+
+
+@pytest.fixture(scope="module")
+def records() -> list[Record]:
+    return [made_up("left", "training"), made_up("hilly", "training", boxes=False), made_up("right", "held out")]
+
+
+@pytest.fixture(scope="module")
+def all_tables(records: list[Record]) -> list[tables.Table]:
+    return list(study.tables_of(records, records[:1], ["points", "cluster", "pointpillars"]))
+
+
+def table(all_tables: list[tables.Table], name: str) -> tables.Table:
+    return next(its for its in all_tables if its.name == name)
+
+
+def test_rho_of_each_setting_is_that_of_the_findings(all_tables: list[tables.Table]) -> None:
+    its = table(all_tables, "A points seen_20")
+    assert [c.heading for c in its.columns[3:]] == ["left", "hilly", "right", "training", "held out"]
+    for row in its.rows:
+        assert all(cell[0] == (1.0 if row[0] == "2" else -1.0) for cell in row[3:])
+    assert [c.heading for c in table(all_tables, "A cluster ap_combined_r40_iou70").columns[3:]] == [
+        "left", "right", "training", "held out",
+    ]  # fmt: skip
+
+
+def test_gamma_is_chosen_on_training_junctions_whatever_the_held_out_ones_say(records: list[Record]) -> None:
+    other = Record(**{**vars(records[2]), "scores": {
+        name: [-v for v in its] for name, its in records[2].scores.items()}})  # fmt: skip
+    its = agreement.chosen_gamma([Pools([*records[:2], other], "points", 200)])
+    assert set(its.column("best gamma, training")) == {"2"} and set(its.column("as good")) == {"2"}
+    assert all(cell[0] == 1.0 for cell in its.column("rho, training"))
+    assert all(cell[0] == -1.0 for cell in its.column("rho, held out"))
+    assert all(cell[0] == -2.0 for cell in its.column("difference, held out"))
+
+
+def test_scores_are_ranked_by_training_junctions_and_one_without_order_comes_last(all_tables) -> None:
+    its = table(all_tables, "D points seen_20")
+    assert its.column("score") == [str(Setting(2.0, 0.25, False)), "entropy_seen", str(DEFAULT), "constant"]
+    assert its.rows[2][3] is None and its.rows[2][4][0] == -2.0  # the default, less itself, and less the best
+    assert its.rows[3][1:] == [None] * 4
+
+
+def test_heights_are_compared_place_by_place(records: list[Record]) -> None:
+    its = heights.table(records, ["points", "pointpillars"])
+    assert set(its.column("detector")) == {"points"}
+    assert its.column("junction") == ["left", "hilly", "right", "all"] * 2
+    every = its.rows[3]
+    assert every[3] == 18
+    means = [cell[0] for cell in every[4:8]]
+    assert means == pytest.approx([100 * (0.625 - 0.01 * h) for h in poses.HEIGHTS_M])
+    assert [cell[0] for cell in every[8:]] == pytest.approx([-1.0, -2.5, -4.0])
+    for value, low, high in every[8:]:
+        assert low < value < high and high - low < 0.6  # places share their differences; frames scatter by a little
+
+
+def test_failures_are_the_sites_whose_ranks_differ_most(records: list[Record]) -> None:
+    rows = failures.worst(records[0], "points", "seen_20", "entropy_seen")
+    assert [row[5] == row[6] for row in rows] == [True] * 3  # this score makes no mistake
+    best, *_ = sorted(records[0].sites, key=lambda s: -(0.05 * int(s.place[1:]) - 0.01 * s.height_m))
+    row = failures.worst(records[0], "points", "seen_20", str(DEFAULT))[0]
+    assert row[2] == best.name or row[5:7] == [1, 30] or row[5:7] == [30, 1]
+
+
+def test_one_gamma_is_held_against_each_sensor_and_voxel_size(all_tables: list[tables.Table]) -> None:
+    assert set(table(all_tables, "B sensors").column("best gamma")) == {"2"}
+    its = table(all_tables, "B one gamma")
+    assert its.column("one gamma")[0] == "2" and its.column("better ones")[0] == 0
+
+
+def test_figures_are_drawn_from_the_tables_twice_alike(all_tables: list[tables.Table], tmp_path: Path) -> None:
+    few = [its for its in all_tables if its.name in ("A points seen_20", "C heights", "D points seen_20")]
+    first, again = (figures.draw(tmp_path / name, few) for name in "ab")
+    assert [path.name for path in first] == ["validity-gamma.png", "validity-heights.png", "validity-scores.png"]
+    assert [path.read_bytes() for path in first] == [path.read_bytes() for path in again]
+
+
+def test_tables_are_read_back_and_make_the_same_page(all_tables: list[tables.Table], tmp_path: Path) -> None:
+    tables.write(tmp_path / "its.json", ["Said before."], all_tables)
+    words, back = tables.read(tmp_path / "its.json")
+    assert back == all_tables and words == ["Said before."]
+    assert tables.page("T", words, back) == tables.page("T", ["Said before."], all_tables)
+
+
+@pytest.mark.parametrize(
+    ("cell", "text"),
+    [
+        (None, "-"),
+        (0.456, "0.46"),
+        (-0.001, "0.00"),
+        ([0.5, None, None], "0.50"),
+        ([0.5, -0.12, 1], "0.50 (-0.12 to 1.00)"),
+    ],
+)
+def test_cells_as_text(cell: tables.Cell, text: str) -> None:
+    assert tables.shown(cell, "two") == text
+
+
+# the page
+
+
+def test_the_tables_of_the_docs_are_those_of_their_data() -> None:
+    words, made = tables.read(DOCS / "data" / "validity.json")
+    assert (DOCS / "validity-tables.md").read_text(encoding="utf-8") == tables.page(command.TITLE, words, made)
+
+
+def test_every_number_of_the_answers_stands_in_the_tables() -> None:
+    """Numbers with a decimal point: those are measured."""
+    answers = (DOCS / "validity.md").read_text(encoding="utf-8").partition("\n## Answers\n")[2]
+    shown = set(re.findall(r"\d+\.\d+", (DOCS / "validity-tables.md").read_text(encoding="utf-8")))
+    settings = {"0.25", "0.5", "4.5", "0.7"}
+    assert set(re.findall(r"\d+\.\d+", answers)) <= shown | settings
+
+
+def test_the_protocol_says_the_numbers_of_the_program() -> None:
+    page = " ".join((DOCS / "validity.md").read_text(encoding="utf-8").split())
+    assert f"judged by {study.FRAMES} frames" in page and f"on {study.SENSOR_FRAMES} frames" in page
+    assert f"first {study.FEW_PLACES} places" in page and f"at most {study.FEW_GIVEN} of the given" in page
+    assert ", ".join(study.SENSORS) in page and f"{poses.PLACES} places, each 2, 3, 4.5 and 6 m" in page
+    assert f"lattice of {poses.SPACING_M:g} m that reaches {poses.BESIDE_M:g} m" in page
+    assert f"within {poses.ROAD_M:g} m of a lane" in page
+    for name, role in junctions.SHIPPED.items():
+        assert re.search(rf"\| {name} \|[^|]*\| {role} \|", page), name
+    assert json.loads((DOCS / "data" / "validity.json").read_text(encoding="utf-8"))["preface"]
