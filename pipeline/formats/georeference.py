@@ -102,6 +102,8 @@ class Georeference:
             reading = self._declared(xy, place, declared)
         elif declared == WORLD or not len(xy):
             self.metres(xy, place, right)
+            if self.frame is None and len(xy) and _may_be_degrees(xy) and 0 < np.ptp(xy, axis=0).max() < _CLOSE_M:
+                raise self.unknown(place, f"{_span(xy)} look like longitude and latitude", xy)  # no thing is so thin
             reading = IN_WORLD
         else:
             reading = self._judged(xy, place, right)

@@ -84,6 +84,7 @@ def test_a_projection_of_the_world_itself_is_taken_where_nothing_says_what_the_w
         (HERE, [*DEGREES, [371.0, 50.86], *DEGREES], None, r"are no metres .*, and \(371, 50.86\) is no longitude"),
         (HERE, [*DEGREES, [97.2, 50.86], *DEGREES], None, r"are no metres .*, and \(97.2, 50.86\) is no longitude"),
         (NOWHERE, np.add(DEGREES, (361.28, 0.0)), None, r"are no metres .*, and \(371.* is no longitude and latitude"),
+        (NOWHERE, DEGREES, WORLD, "look like longitude and latitude, and nothing says where"),
         (HERE, DEGREES, WORLD, "are longitude and latitude: 0 m from the region of interest as such"),
         (HERE, CORNERS, "EPSG:999999", "'EPSG:999999' is none that is known"),
     ],
