@@ -22,7 +22,7 @@ _ALL = "vehicles"
 """The set of all objects, in ``detection.parquet``."""
 
 _MEASURES = {
-    "ap_combined_r40_iou70": "average precision, from above + in space",
+    "ap_combined_r40_iou70": "average precision from above plus that in space, up to 200 %",
     "seen_20": "vehicles with 20 points or more",
 }
 """Measures in words."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +64,7 @@ def measured(
     found
         By site and detector; of each site with its points.
     """
-    rows, doubts = list[SiteDetection](), list[Finding]()
+    rows, doubts = list[SiteDetection](), list[tuple[str, str, Finding]]()
     for site, its in found.items():
         points = its[POINTS]
         assert isinstance(points, FoundPoints)
@@ -75,14 +75,25 @@ def measured(
             precise: Mapping[str, Estimate] = {}
             if isinstance(what, FoundBoxes):
                 evaluation = evaluate(Record.of(objects, what.frames))
-                doubts += evaluation.doubts(f"site {site}, detector {name}")
+                doubts += [(site, name, doubt) for doubt in evaluation.doubts("")]
                 precise = evaluation.measures
             for subset, by_points in zip(SUBSETS, seen, strict=True):
                 on = nothing.points[subset.of(nothing)]
                 with_ = {least: int((on >= least).sum()) for least in _COUNTED}
                 own = {column: precise.get(_of(column, subset), _UNDEFINED) for column in PRECISION}
                 rows.append(SiteDetection(site, name, subset.name or ALL, len(frames), len(on), with_, own | by_points))
-    return rows, doubts
+    return rows, _together(doubts)
+
+
+def _together(doubts: Sequence[tuple[str, str, Finding]]) -> list[Finding]:
+    """What is the same of several sites is told once; ``doubts`` are of a site and a detector."""
+    sites: dict[tuple[str, Finding], list[str]] = {}
+    for site, detector, doubt in doubts:
+        sites.setdefault((detector, doubt), []).append(site)
+    return [
+        replace(doubt, place=f"detector {detector}, site{'s' if len(its) > 1 else ''} {', '.join(its)}")
+        for (detector, doubt), its in sites.items()
+    ]
 
 
 def write(path: Path, rows: Sequence[SiteDetection], metadata: Mapping[str, Any]) -> None:

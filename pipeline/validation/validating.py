@@ -7,8 +7,10 @@ was found; work out every score; correlate. ``detection.parquet``, ``surrogates.
 
 from __future__ import annotations
 
+import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -42,6 +44,7 @@ from pipeline.validation.surrogates.gathering import Surrogates
 from pipeline.validation.unseen_record import UnseenRecord, prepare
 
 CORRELATION = "correlation.parquet"
+_WORK = ".validate-"
 
 
 def validate(
@@ -73,19 +76,19 @@ def validate(
         What the check refuses; an unknown detector; more frames than traffic has; no vehicle in the region of interest.
     """
     chosen = {name: registry.make(name) for name in dict.fromkeys(detectors) if name != POINTS}
-    with alone(out), tempfile.TemporaryDirectory(prefix=".work-", dir=_folder(out)) as folder:
-        doubts = _checked(scenario, Path(folder) / "check", progress)
-        record = prepare(scenario, Path(folder) / "unseen", frames, jobs=jobs, progress=progress)
+    with alone(out), _workshop(out) as folder:
+        doubts = _checked(scenario, folder / "check", progress)
+        record = prepare(scenario, folder / "unseen", frames, jobs=jobs, progress=progress)
         watched = list(record.read())
         _refuse_empty(scenario, record, watched)
         look = Look(record, chosen)
         found = look_from(record.scene.sites, look, jobs=jobs, progress=progress, listener=listener)
         rows, undefined = detection.measured(watched, record.scene.roi, found)
-        surrogates = gathering.surrogates_of(scenario, Path(folder) / "scores", jobs=jobs, progress=progress)
+        surrogates = gathering.surrogates_of(scenario, folder / "scores", jobs=jobs, progress=progress)
         agreements = correlated(scenario, rows, surrogates)
         told = (*doubts, *_not_unseen(scenario), *undefined, *surrogates.skipped)
         done = Validation(tuple(rows), surrogates, tuple(agreements), told)
-        _write(out, Path(folder), scenario, record, done)
+        _write(out, folder, scenario, record, done)
         return replace(done, report=refresh_report(out))
 
 
@@ -124,12 +127,13 @@ def _by_score(sites: Sequence[str], surrogates: Surrogates) -> dict[ScoreName, N
     return found
 
 
-def _folder(out: Path) -> Path:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(out, error.strerror or str(error), "a folder that can be written") from None
-    return out
+@contextmanager
+def _workshop(out: Path) -> Iterator[Path]:
+    """A folder to work in, within the run's folder, which is held; those that were killed have left theirs."""
+    for left in out.glob(f"{_WORK}*"):
+        shutil.rmtree(left)
+    with tempfile.TemporaryDirectory(prefix=_WORK, dir=out) as folder:
+        yield Path(folder)
 
 
 def _checked(scenario: Scenario, folder: Path, progress: Progress) -> list[Finding]:

@@ -85,9 +85,11 @@ def test_a_site_that_sees_no_vehicle_is_told():
     assert _row(rows, "d", "points_1").objects == 0
     assert math.isnan(_row(rows, "d", "points_1").measures["ap_bev_r40_iou70"].value)
     assert math.isnan(_row(rows, POINTS, "points_1").measures["log_points"].value)
-    assert "site a, detector d" in doubts[0].place and "no vehicles with 1 points or more in 10 frames" in str(
-        doubts[0]
-    )
+    first = "no vehicles with 1 points or more in 10 frames: there is no average precision; more frames"
+    assert str(doubts[0]) == f"detector d, site a: {first}"
+    more = {name: {POINTS: _points(0, 0), "d": boxes} for name in "abc"}
+    told = list(map(str, detection.measured(FRAMES, ROI, more)[1]))
+    assert told[0] == f"detector d, sites a, b, c: {first}" and len(told) == len(doubts)
 
 
 def test_rows_are_written_as_they_are(tmp_path):

@@ -120,10 +120,12 @@ def test_a_score_is_named_with_what_it_was_tried_with():
 
 
 def test_a_second_run_says_that_all_was_kept(egvs, mini, tmp_path):
+    (tmp_path / "out" / ".validate-killed" / "unseen").mkdir(parents=True)  # what a kill leaves
     code, out, error = egvs(*WANTED, mini, "--out", tmp_path / "out")
     assert code == 0, error
     assert "10 frames from 2 sites, points, 1 process: about" in error and "s   pole_b: points" in error
     assert "18 vehicles in 10 frames" in out and "warning: " in out
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [".lock", *ARTEFACTS]
     first = {name: (tmp_path / "out" / name).read_bytes() for name in ARTEFACTS}
     code, again, error = egvs(*WANTED, mini, "--out", tmp_path / "out")
     assert code == 0 and again == out
