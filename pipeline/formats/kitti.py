@@ -40,6 +40,9 @@ CALIBRATION = (
 """The text of a file ``calib/*.txt``; the same for every frame."""
 
 
+_PLACES_THE_CAMERA = ("R0_rect", "Tr_velo_to_cam")
+
+
 @dataclass(frozen=True)
 class KittiObjects:
     """The lines of one file.
@@ -52,11 +55,14 @@ class KittiObjects:
         (n, 7) float64, in the LiDAR's frame: centre, length, width, height, heading from -pi to pi.
     scores
         (n,) float64; NaN for a label, which has none.
+    lines
+        Where each stands, counted from 1, (n,) int64.
     """
 
     names: tuple[str, ...]
     boxes: Floats
     scores: Floats
+    lines: NDArray[np.int64]
 
 
 def wrapped(angle_rad: Floats) -> Floats:
@@ -104,16 +110,45 @@ def read(path: Path) -> KittiObjects:
         raise InputError(path, "no such file", "a text file, one line an object (empty where there is none)") from None
     except UnicodeDecodeError:
         raise InputError(path, "is no text", "one line an object, as KITTI has them") from None
-    names, boxes, scores = [], [], []
+    names, boxes, scores, at = [], [], [], []
     for number, line in enumerate(text.splitlines(), 1):
         if not (words := line.split()) or words[0] == "DontCare":
             continue
         values = _numbers(f"{path}: line {number}", words)
+        at.append(number)
         names.append(words[0])
         boxes.append(values[7:14])
         scores.append(values[14] if len(words) > _VALUES else math.nan)
     camera = np.array(boxes, dtype=np.float64).reshape(-1, 7)
-    return KittiObjects(tuple(names), from_camera(camera), np.array(scores, dtype=np.float64))
+    numbers = np.array(at, dtype=np.int64)
+    return KittiObjects(tuple(names), from_camera(camera), np.array(scores, dtype=np.float64), numbers)
+
+
+def check_calibration(path: Path) -> None:
+    """Hold a file of calibration against :data:`CALIBRATION`, which alone brings boxes back without loss.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read, or the camera stands otherwise.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        raise InputError(path, "cannot be read", "a calibration as `egvs clouds` writes it") from None
+    entries = dict(line.split(":", 1) for line in text.splitlines() if ":" in line)
+    for line in CALIBRATION.splitlines():
+        key, values = line.split(":")
+        if key in _PLACES_THE_CAMERA and _floats(entries.get(key, "")) != _floats(values):
+            found = f"{key} is{entries[key]}" if key in entries else f"has no {key}"
+            raise InputError(path, found, f"{key}:{values}, as `egvs clouds` writes it")
+
+
+def _floats(text: str) -> list[float] | None:
+    try:
+        return [float(word) for word in text.split()]
+    except ValueError:
+        return None
 
 
 def _numbers(place: str, words: list[str]) -> list[float]:

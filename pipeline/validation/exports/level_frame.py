@@ -52,6 +52,14 @@ class LevelFrame:
         level[:, 6] = wrapped(boxes[:, 6] - np.radians(yaw_deg))
         return level
 
+    def world_boxes(self, boxes: Floats) -> Floats:
+        """The inverse of :meth:`boxes`."""
+        yaw_deg, _, _ = self.pose.angles_deg
+        world = boxes.copy()
+        world[:, :3] = _turned(rotation(yaw_deg, 0.0, 0.0), boxes[:, :3]) + np.asarray(self.pose.position_m)
+        world[:, 6] = wrapped(boxes[:, 6] + np.radians(yaw_deg))
+        return world
+
 
 def corners(boxes: Floats) -> Floats:
     """The eight corners of each upright box (n, 7), (n, 8, 3)."""
