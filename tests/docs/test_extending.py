@@ -135,3 +135,29 @@ def test_a_score_of_another_package_is_listed(tmp_path: Path) -> None:
     assert code == 0 and "near_points" in text and "within_m 20, 50" in text and "package egvs-near-points" in text, (
         text
     )
+
+
+@pytest.mark.system
+def test_a_detector_of_another_package_detects(tmp_path: Path) -> None:
+    beside = install(package("A detector"), tmp_path / "installed")
+    code = """
+import numpy as np
+from pipeline.core.grid import Roi
+from pipeline.sensing.sensors import CATALOGUE
+from pipeline.sensing.sites import Pose
+from pipeline.validation.detectors import registry
+from pipeline.validation.sweeps import SiteView, Sweep
+assert "middle" in registry.names(), registry.names()
+sensor = CATALOGUE["VLP-32C"]
+view = SiteView("s", Pose(1.0, 2.0, 3.0), sensor, np.full(sensor.beams, 50.0))
+ready = registry.make("middle").at(view, Roi((0.0, 0.0, 0.0), (9.0, 9.0, 9.0)))
+beam = np.arange(3, dtype=np.uint32)
+far = np.array([10.0, 10.0, 50.0])  # the last is background
+points = np.column_stack([sensor.directions()[beam] * far[:, None], np.ones(3)]).astype(np.float32)
+found = ready.detect(Sweep(points, beam))
+np.testing.assert_allclose(found.boxes[0, :3], points[:2, :3].mean(axis=0) + (1, 2, 3), atol=1e-5)
+assert found.scores.tolist() == [2.0]
+assert ready.detect(Sweep(points[:0], beam[:0])).boxes.shape == (0, 7)
+"""
+    done = processes.python(code, beside=beside)
+    assert done.returncode == 0, done.stderr

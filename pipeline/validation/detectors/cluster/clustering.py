@@ -33,22 +33,17 @@ class Density:
     Attributes
     ----------
     reach_m, reach_per_range
-        How far apart neighbours may be: the larger of a distance and a share of the range.
-    core_points
-        How many points within reach make a square a core, from which a cluster grows.
+        How far apart neighbours may be: a distance, along a beam more where this share of the range is more.
+    core_squares
+        How many squares with points make a square within their reach a core, from which a cluster grows.
     least_points
         Of a cluster; one with fewer is left out.
     """
 
     reach_m: float = 0.6
-    reach_per_range: float = 0.015
-    core_points: int = 2
+    reach_per_range: float = 0.02
+    core_squares: int = 1
     least_points: int = 5
-
-    def reach_at(self, range_m: Floats) -> Floats:
-        """How far apart neighbours may be at some ranges, in metres."""
-        found: Floats = np.maximum(self.reach_m, self.reach_per_range * range_m)
-        return found
 
 
 @dataclass(frozen=True)
@@ -102,7 +97,7 @@ def clusters_of(points_m: Floats, density: Density) -> Clusters:
     _, square = np.unique(ids[:, 0] * 2**32 + ids[:, 1], return_inverse=True)
     count = np.bincount(square)
     squares_m = np.column_stack([np.bincount(square, points_m[:, axis]) / count for axis in range(2)])
-    label = _dbscan(squares_m, count, density)
+    label = _dbscan(squares_m, density)
     label = _large_ones(label, np.bincount(label[square] + 1, minlength=1)[1:], density.least_points)
     points, starts = _in_order(label[square])
     squares, square_starts = _in_order(label)
@@ -124,26 +119,30 @@ def _in_order(label: Ints) -> tuple[Ints, Ints]:
     return order[starts[0] :], starts - starts[0]
 
 
-def _dbscan(squares_m: Floats, count: Ints, density: Density) -> Ints:
-    """The cluster of each square, -1 for none: DBSCAN on distances in units of the reach."""
+def _dbscan(squares_m: Floats, density: Density) -> Ints:
+    """The cluster of each square, -1 for none."""
     if not len(squares_m):
         return np.empty(0, dtype=np.int64)
-    dbscan, neighbours = _scikit_learn()
-    reach_m = density.reach_at(np.hypot(squares_m[:, 0], squares_m[:, 1]))
-    tree = neighbours(radius=float(reach_m.max()), algorithm="kd_tree").fit(squares_m)
-    graph = tree.radius_neighbors_graph(mode="distance")
-    rows = np.repeat(np.arange(len(squares_m)), np.diff(graph.indptr))
-    graph.data /= 0.5 * (reach_m[rows] + reach_m[graph.indices])
-    model = dbscan(eps=1.0, min_samples=density.core_points, metric="precomputed")
-    found: Ints = model.fit_predict(graph, sample_weight=count.astype(np.float64)).astype(np.int64)
+    found: Ints = _scikit_learn()(eps=1.0, min_samples=density.core_squares, algorithm="kd_tree").fit_predict(
+        _warped(squares_m, density)
+    )
+    return found.astype(np.int64)
+
+
+def _warped(xy_m: Floats, density: Density) -> Floats:
+    """Places where a distance of 1 is the reach."""
+    range_m = np.maximum(np.hypot(xy_m[:, 0], xy_m[:, 1]), 1e-9)
+    grows_from_m = density.reach_m / density.reach_per_range
+    there = range_m / density.reach_m
+    there = np.where(range_m > grows_from_m, (1.0 + np.log(range_m / grows_from_m)) / density.reach_per_range, there)
+    found: Floats = xy_m * (there / range_m)[:, None]
     return found
 
 
-def _scikit_learn() -> tuple[Any, Any]:
+def _scikit_learn() -> Any:
     try:
         from sklearn.cluster import DBSCAN
-        from sklearn.neighbors import NearestNeighbors
     except ImportError as error:
         right = "pip install 'egvs[validate]' brings scikit-learn"
         raise MissingBackendError(f"the detector cluster cannot start: {error}; {right}") from error
-    return DBSCAN, NearestNeighbors
+    return DBSCAN

@@ -22,6 +22,7 @@ from pipeline.validation.detectors.cluster.completing import Completed, Toleranc
 from pipeline.validation.detectors.cluster.hiding import RangeImage
 from pipeline.validation.detectors.cluster.l_shape import rectangles
 from pipeline.validation.detectors.ground import GroundMap, empty_points
+from pipeline.validation.metrics.overlap import overlap_each
 from pipeline.validation.sweeps import Detections, SiteView, Sweep
 
 Floats = NDArray[np.float64]
@@ -31,6 +32,9 @@ HEIGHTS_M = 0.2, 5.0
 
 AROUND_M = 8.0
 """Points this far from the region of interest, or nearer, are looked at: half a long vehicle."""
+
+MOST_SHARED = 0.1
+"""Of two boxes that overlap by more, seen from above, the less sure one is left out."""
 
 
 @dataclass(frozen=True)
@@ -101,4 +105,14 @@ class ClusterAtSite:
         boxes[:, :2] += np.asarray(self.view.pose.position_m)[:2]
         boxes[:, 2] += self.ground.height_m(boxes[:, :2])
         points = np.diff(clusters.starts)[vehicles]
-        return Detections(boxes, 1.0 - np.exp(-points / 100.0))
+        return _apart(Detections(boxes, 1.0 - np.exp(-points / 100.0)))
+
+
+def _apart(found: Detections) -> Detections:
+    """The surest detections that are not one in another: two vehicles are never in one place."""
+    kept = list[int]()
+    for row in np.argsort(-found.scores, kind="stable").tolist():
+        others = found.boxes[kept]
+        if not (overlap_each(np.repeat(found.boxes[row : row + 1], len(kept), 0), others)[0] > MOST_SHARED).any():
+            kept.append(row)
+    return Detections(found.boxes[kept], found.scores[kept])
