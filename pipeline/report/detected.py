@@ -134,7 +134,8 @@ class ValidationSummary:
             return None
         mine = [row for row in rows if row["objects_of"] == _ALL]
         own = [row for row in correlations if about["own_score"] == {key: row[key] for key in ("score", "parameters")}]
-        detectors = tuple(_summary(name, measure, mine, own) for name, measure in about["shown"].items())
+        shown = [(name, about["shown"][name]) for name in dict.fromkeys(row["detector"] for row in mine)]
+        detectors = tuple(_summary(name, measure, mine, own) for name, measure in shown)
         picture = base64.b64encode(figure.read_bytes()).decode("ascii")
         return cls(
             detectors, about["frames"], mine[0]["objects"], about["apart_s"], tuple(warnings_of([about])), picture

@@ -117,7 +117,7 @@ def _ranked(axes: Any, done: Validation, detector: str, own: ScoreName, *, named
     axes.set_ylim(len(mine) - 0.5, -0.5)
     axes.set_xlim(-1.05, 1.05)
     axes.axvline(0.0, color="0.5", linewidth=0.8)
-    axes.set(xlabel=f"Spearman's rho with {_WORDS[measure]}")
+    axes.set_xlabel(f"Spearman's rho with {_WORDS[measure]}", fontsize=8)
     axes.grid(True, axis="both", color="0.92", linewidth=0.6)
     axes.tick_params(labelsize=7)
 

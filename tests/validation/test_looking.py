@@ -157,7 +157,8 @@ def test_no_process_outlives_one_that_was_killed(mini, tmp_path):
     (tmp_path / "orphans.py").write_text(ORPHANS)
     root = Path(__file__).resolve().parents[2]
     command = [sys.executable, tmp_path / "orphans.py", mini, tmp_path]
-    killed = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(root)})
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    killed = subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL)
     with (tmp_path / "alive").open("rb", buffering=0) as alive:
         assert alive.read(1) == b"x"
         assert killed.wait() == -signal.SIGKILL
