@@ -19,13 +19,13 @@ from benchmarks.validity.measuring import Part, measure
 from benchmarks.validity.record import Record
 from benchmarks.validity.study import Extent
 from pipeline.cli import arguments
-from pipeline.cli.progress import Screen
 from pipeline.core.errors import EgvsError, InputError, MissingBackendError
 from pipeline.validation.detectors import registry
 from pipeline.validation.site_findings import POINTS
 
 ROOT = Path(__file__).resolve().parents[2]
 TITLE = "Tables of the study of validity"
+SAID_EVERY_S = 30.0
 
 
 def main(given: Sequence[str] | None = None) -> int:
@@ -145,9 +145,17 @@ def _measured(part: Part, chosen: argparse.Namespace, begun: float) -> Record:
     def told(text: str) -> None:
         print(f"{time.monotonic() - begun:6.0f} s  {text}", flush=True)
 
+    said_at, of_what = time.monotonic(), ""
+
+    def progress(what: str, done: int, total: int) -> None:
+        """A line when something new is counted, and every half minute."""
+        nonlocal said_at, of_what
+        if what != of_what or time.monotonic() - said_at >= SAID_EVERY_S:
+            said_at, of_what = time.monotonic(), what
+            told(f"{part.name}: {what} {done}" + (f" of {total}" if total else ""))
+
     told(f"{part.name}: begins")
-    with Screen(part.name) as screen:
-        return measure(part, chosen.data, jobs=chosen.jobs, progress=screen.progress, told=told)
+    return measure(part, chosen.data, jobs=chosen.jobs, progress=progress, told=told)
 
 
 if __name__ == "__main__":

@@ -5,10 +5,11 @@ What is chosen (gamma, the best score) is chosen on training junctions; held-out
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 from benchmarks.validity.pools import DEFAULT, Pools, Setting
-from benchmarks.validity.record import Record, measures_of
+from benchmarks.validity.poses import HEIGHTS_M
+from benchmarks.validity.record import Record, StudySite, measures_of
 from benchmarks.validity.tables import Cell, Column, Table, with_interval
 from pipeline.validation.statistics.correlation import Correlation
 
@@ -44,6 +45,33 @@ def by_setting(pools: Pools) -> Iterator[Table]:
         caption = f"Spearman's rho of EGVS with the {WORDS[measure]} ({pools.detector})."
         section = "A. EGVS by gamma, voxel size and moving occlusion"
         yield Table(f"A {pools.detector} {measure}", section, caption, head, rows)
+
+
+def by_kind_of_site(pools: Pools) -> Iterator[Table]:
+    """A: the default EGVS and the setting that is best on training junctions, on some of the sites alone."""
+    kinds: dict[str, Callable[[StudySite], bool]] = {
+        "all": lambda site: True,
+        "given": lambda site: site.is_given,
+        "grid": lambda site: not site.is_given,
+    }
+    for height_m in HEIGHTS_M:
+        kinds[f"grid, {height_m:g} m"] = lambda site, h=height_m: not site.is_given and site.height_m == h  # type: ignore[misc]
+    some = {kind: Pools([its.only(wanted) for its in pools.records], pools.detector) for kind, wanted in kinds.items()}
+    names = list(pools.studies)
+    for measure in measures_of(pools.detector):
+        settings = {str(setting) for setting in pools.settings()}
+        best = pools.best(TRAINING, [name for name in pools.scores if name in settings], measure)
+        rows: list[list[Cell]] = [
+            [score, kind, *(told(its.rho(name, score, measure)) for name in names)]
+            for score in dict.fromkeys(name for name in (str(DEFAULT), best) if name is not None)
+            for kind, its in some.items()
+        ]
+        head = [Column("score"), Column("sites"), *(Column(name, "two") for name in names)]
+        caption = (
+            f"Rho with the {WORDS[measure]} ({pools.detector}) among the junction's own sites alone, those of the grid"
+            " alone, and those of one height; of EGVS the default and what is best on the training junctions."
+        )
+        yield Table(f"A sites {pools.detector} {measure}", "A. Own sites, and the grid", caption, head, rows)
 
 
 _B_COLUMNS = [

@@ -20,7 +20,7 @@ _STYLES = {"0.25": (_DARK, "o"), "0.5": (_MID, "s"), "1": (_LIGHT, "^")}
 def draw(folder: Path, tables: Sequence[Table]) -> list[Path]:
     """Write the figures as PNG; those whose tables are there."""
     of = {table.name: table for table in tables}
-    by_setting = [table for name, table in of.items() if name.startswith("A ")]
+    by_setting = [table for name, table in of.items() if name.startswith("A ") and not name.startswith("A sites")]
     ranked = [table for name, table in of.items() if name.startswith("D ")]
     made = {
         "validity-gamma.png": gamma(by_setting) if by_setting else None,

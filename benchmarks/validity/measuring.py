@@ -152,5 +152,4 @@ def _site(site: Site, part: Part, unseen: UnseenRecord, frames: Sequence[Traffic
     ground_m = placing.ground_m(scene.world, pose) if scene.scenario.statics.ground else 0.0
     at = np.concatenate([frame.boxes[frame.wanted(scene.roi), :2] for frame in frames])
     away_m = float(np.hypot(*(at - np.array(pose.position_m[:2])).T).mean()) if len(at) else float("nan")
-    named = site.name.rpartition("h")[0] if site.name not in part.given else site.pole or site.name
-    return StudySite(site.name, named, round(pose.z_m - ground_m, 3), away_m, site.name in part.given)
+    return StudySite(site.name, site.pole, round(pose.z_m - ground_m, 3), away_m, site.name in part.given)

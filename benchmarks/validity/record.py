@@ -7,13 +7,14 @@ measured with a clock is not in here.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Set
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from pipeline.core import files
+from pipeline.validation.metrics.leave_out import BLOCKS
 from pipeline.validation.site_findings import POINTS
 from pipeline.validation.statistics.junctions import Junction, Measured
 
@@ -32,7 +33,8 @@ def measures_of(detector: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class StudySite:
-    """A site: its name, its place's, its height above the ground, its mean horizontal distance to vehicles."""
+    """A site: its name, the place that it shares with sites of other heights, its height above the ground, its mean
+    horizontal distance to vehicles."""
 
     name: str
     place: str
@@ -60,9 +62,19 @@ class Estimates:
     se: list[float]
     left_out: list[list[float]]
 
+    def only(self, sites: Set[int]) -> Estimates:
+        """At some of the sites."""
+        rows = [row for row, site in enumerate(self.sites) if site in sites]
+        return Estimates(
+            [self.sites[row] for row in rows],
+            [self.values[row] for row in rows],
+            [self.se[row] for row in rows],
+            [self.left_out[row] for row in rows],
+        )
+
     def measured(self) -> Measured:
         """As the statistics take it."""
-        return Measured(np.array(self.values, dtype=np.float64), np.array(self.left_out, dtype=np.float64))
+        return Measured(np.array(self.values, dtype=np.float64), np.array(self.left_out).reshape(-1, BLOCKS))
 
 
 @dataclass(frozen=True)
@@ -105,10 +117,22 @@ class Record:
         found = {d: {m: Estimates(**its) for m, its in by.items()} for d, by in value.pop("detections").items()}
         return cls(sites=sites, detections=found, **value)
 
-    def junction_of(self, detector: str, scores: Mapping[str, list[float]] | None = None) -> Junction:
-        """The sites that a detector looked from, with all scores, or others in their place."""
+    def junction_of(self, detector: str) -> Junction:
+        """The sites that a detector looked from, with all scores."""
         by_measure = self.detections[detector]
         rows = next(iter(by_measure.values())).sites
-        values = {name: np.array(its, dtype=np.float64)[rows] for name, its in (scores or self.scores).items()}
+        values = {name: np.array(its, dtype=np.float64)[rows] for name, its in self.scores.items()}
         measures = {name: its.measured() for name, its in by_measure.items()}
-        return Junction(self.junction, tuple(self.sites[row].name for row in rows), values, measures)
+        its = [self.sites[row] for row in rows]
+        return Junction(
+            self.junction, tuple(site.name for site in its), values, measures, tuple(site.place for site in its)
+        )
+
+    def only(self, wanted: Callable[[StudySite], bool]) -> Record:
+        """What was found from some of the sites."""
+        kept = {number for number, site in enumerate(self.sites) if wanted(site)}
+        found = {
+            detector: {measure: its.only(kept) for measure, its in by_measure.items()}
+            for detector, by_measure in self.detections.items()
+        }
+        return replace(self, detections=found)

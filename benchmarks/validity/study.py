@@ -107,6 +107,8 @@ def tables_of(records: Sequence[Record], with_sensors: Sequence[Record], detecto
     yield measured_table(records, detectors)
     for pools in each:
         yield from agreement.by_setting(pools)
+    for pools in each:
+        yield from agreement.by_kind_of_site(pools)
     yield agreement.chosen_gamma(each)
     if with_sensors:
         yield from agreement.by_sensor(with_sensors, [name for name in detectors if name in FAST])

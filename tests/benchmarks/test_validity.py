@@ -80,7 +80,7 @@ def test_a_part_that_was_measured_is_kept_and_an_interrupted_one_goes_on(mini, t
     part = part_of(mini, tmp_path)
     made = measuring.measure(part, tmp_path, jobs=1, told=said.append)
     assert not said and made.frames == 10 and [site.is_given for site in made.sites[:3]] == [True, True, False]
-    assert made.sites[2].height_m == 2.0 and made.sites[2].place == "g01"
+    assert made.sites[2].height_m == 2.0 and {site.place for site in made.sites[2:6]} == {"g01h2"}
     points = made.detections["points"]["seen_20"]
     assert points.sites == list(range(10)) and max(points.values) <= 1.0
     assert len(made.scores["entropy_seen"]) == 10 and made.sites[9].name == "g02h6"
@@ -157,6 +157,16 @@ def test_rho_of_each_setting_is_that_of_the_findings(all_tables: list[tables.Tab
     assert [c.heading for c in table(all_tables, "A cluster ap_combined_r40_iou70").columns[3:]] == [
         "left", "right", "training", "held out",
     ]  # fmt: skip
+
+
+def test_own_sites_the_grid_and_each_height_are_compared_alone(records: list[Record], all_tables) -> None:
+    its = table(all_tables, "A sites points seen_20")
+    assert its.column("sites") == ["all", "given", "grid", *(f"grid, {h:g} m" for h in poses.HEIGHTS_M)] * 2
+    assert all(cell[0] == (-1.0 if row[0] == str(DEFAULT) else 1.0) for row in its.rows for cell in row[2:])
+    of_grid = records[0].only(lambda site: not site.is_given)
+    assert of_grid.junction_of("points").sites == tuple(site.name for site in records[0].sites[6:])
+    nowhere = Pools([records[0].only(lambda site: False)], "points")
+    assert math.isnan(nowhere.rho("left", "entropy_seen", "seen_20").value)
 
 
 def test_gamma_is_chosen_on_training_junctions_whatever_the_held_out_ones_say(records: list[Record]) -> None:

@@ -148,7 +148,11 @@ class Study:
     def _draws_of(self, junction: Junction, known: NDArray[np.bool_]) -> Draws:
         """The same for all scores and measures that are defined at the same sites."""
         if (key := (junction.name, known.tobytes())) not in self._draws:
-            self._draws[key] = Draws.of(junction.name, int(known.sum()), junction.blocks, self.resamples, self.seed)
+            places = (
+                [place for place, has in zip(junction.places, known, strict=True) if has] if junction.places else ()
+            )
+            sites = int(known.sum())
+            self._draws[key] = Draws.of(junction.name, sites, junction.blocks, self.resamples, self.seed, places)
         return self._draws[key]
 
 

@@ -1,7 +1,8 @@
 r"""What was found at the sites of a junction, and the same with sites and blocks of frames resampled.
 
 Two things make a correlation uncertain: which sites were looked at, and which frames. A resample draws n of the n sites
-with replacement, and k of the k blocks of frames; the blocks are the same for all sites, for all see the same traffic.
+with replacement (whole places, where several sites stand at one), and k of the k blocks of frames; the blocks are the
+same for all sites, for all see the same traffic.
 
 Average precision is not computed anew for each draw of blocks. It is linear enough in the blocks: with
 :math:`\theta_{(g)}` the measure without block g, :math:`\bar\theta` their mean, and block g drawn :math:`w_g` times,
@@ -66,12 +67,16 @@ class Junction:
         By name, (n,) float64 each, turned so that more is better; NaN where a score is not defined.
     measures
         By name, of all the same blocks.
+    places
+        Where each site stands, for sites that stand at one place (at several heights) are much alike: they are drawn
+        together. Empty where each has a place of its own.
     """
 
     name: str
     sites: tuple[str, ...]
     scores: Mapping[str, NDArray[np.float64]]
     measures: Mapping[str, Measured]
+    places: tuple[str, ...] = ()
 
     @property
     def blocks(self) -> int:
@@ -102,11 +107,22 @@ class Draws:
     blocks: NDArray[np.int64]
 
     @classmethod
-    def of(cls, junction: str, sites: int, blocks: int, resamples: int, seed: int) -> Draws:
-        """The same for the same junction, numbers and seed, whatever else is drawn."""
+    def of(cls, junction: str, sites: int, blocks: int, resamples: int, seed: int, places: Sequence[str] = ()) -> Draws:
+        """The same for the same junction, numbers, places and seed, whatever else is drawn.
+
+        Sites of one place are drawn together: places with as many sites among each other, so that all resamples are of
+        as many sites.
+        """
         rng = np.random.default_rng(np.random.SeedSequence((seed, crc32(junction.encode()))))
         drawn = rng.multinomial(blocks, np.full(blocks, 1.0 / blocks), resamples)
-        return cls(rng.integers(0, sites, (resamples, sites)), drawn)
+        at: dict[str | int, list[int]] = {}
+        for site in range(sites):
+            at.setdefault(places[site] if places else site, []).append(site)
+        rows = []
+        for size in sorted({len(its) for its in at.values()}):
+            alike = np.array([its for its in at.values() if len(its) == size])
+            rows.append(alike[rng.integers(0, len(alike), (resamples, len(alike)))].reshape(resamples, -1))
+        return cls(np.concatenate(rows, axis=1), drawn)
 
     def of_score(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """A score, (m,), at the sites drawn, (resamples, m)."""

@@ -246,3 +246,29 @@ def test_one_junction_with_a_constant_score_is_named():
     flat = with_scores(flat, s0=np.ones(9))
     found = study([fine, flat]).correlation("s0", "ap", "kendall")
     assert math.isnan(found.value) and found.why == "s0 is the same at all sites of flat"
+
+
+def test_sites_of_one_place_are_drawn_together() -> None:
+    places = ("a", "b", "a", "c", "d", "d")  # two of two sites, two of one
+    draws = Draws.of("x", 6, 10, 4000, 0, places)
+    assert draws.sites.shape == (4000, 6)
+    often = np.stack([np.bincount(row, minlength=6) for row in draws.sites])
+    np.testing.assert_array_equal(often[:, 0], often[:, 2])
+    np.testing.assert_array_equal(often[:, 4], often[:, 5])
+    assert (often[:, [0, 4]].sum(axis=1) == 2).all() and (often[:, [1, 3]].sum(axis=1) == 2).all()
+    assert 0.45 < (often[:, 0] == 1).mean() < 0.55  # each of two, twice
+    alone = Draws.of("x", 6, 10, 50, 0, tuple("abcdef"))
+    np.testing.assert_array_equal(alone.sites, Draws.of("x", 6, 10, 50, 0).sites)
+
+
+def test_places_widen_an_interval_where_their_sites_are_alike() -> None:
+    rng = np.random.default_rng(1)
+    score, detected = (np.repeat(rng.normal(size=10), 4) + 0.01 * rng.normal(size=40) for _ in range(2))
+    measures = {"ap": Measured(detected, np.tile(detected[:, None], 10))}
+    sites = tuple(f"s{i}" for i in range(40))
+    widths = []
+    for places in ((), tuple(f"p{i // 4}" for i in range(40))):
+        study = Study([Junction("x", sites, {"s": score}, measures, places)], 0, 500)
+        interval = study.correlation("s", "ap", "spearman").interval
+        widths.append(interval.high - interval.low)
+    assert widths[1] > 1.5 * widths[0]
