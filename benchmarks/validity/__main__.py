@@ -145,13 +145,13 @@ def _measured(part: Part, chosen: argparse.Namespace, begun: float) -> Record:
     def told(text: str) -> None:
         print(f"{time.monotonic() - begun:6.0f} s  {text}", flush=True)
 
-    said_at, of_what = time.monotonic(), ""
+    said_at = time.monotonic()
 
     def progress(what: str, done: int, total: int) -> None:
-        """A line when something new is counted, and every half minute."""
-        nonlocal said_at, of_what
-        if what != of_what or time.monotonic() - said_at >= SAID_EVERY_S:
-            said_at, of_what = time.monotonic(), what
+        """A line every half minute."""
+        nonlocal said_at
+        if time.monotonic() - said_at >= SAID_EVERY_S:
+            said_at = time.monotonic()
             told(f"{part.name}: {what} {done}" + (f" of {total}" if total else ""))
 
     told(f"{part.name}: begins")

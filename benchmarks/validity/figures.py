@@ -88,10 +88,10 @@ def heights(table: Table) -> Figure:
                 continue
             values = [cell[0] for cell in cells]
             if name == "all":
-                ends = [[c[0] - c[1] for c in cells], [c[2] - c[0] for c in cells]] if cells[0][1] is not None else None
-                axes.errorbar(
-                    metres, values, yerr=ends, color="black", linewidth=2.2, marker="o", capsize=3, label=name
-                )
+                axes.plot(metres, values, color="black", linewidth=2.2, marker="o", label=name)
+                known = [(at, cell) for at, cell in zip(metres, cells, strict=True) if cell[1] is not None]
+                for at, cell in known:
+                    axes.plot([at, at], cell[1:], color="black", linewidth=1.2)
             else:
                 axes.plot(metres, values, linewidth=1.0, marker=".", label=name)
         axes.set(xlabel="height above the ground, m", ylabel=f"{measure}, %")

@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks.validity import agreement, failures, heights, junctions, poses
 from benchmarks.validity.agreement import WORDS
-from benchmarks.validity.junctions import StudyJunction
+from benchmarks.validity.junctions import Role, StudyJunction
 from benchmarks.validity.measuring import Part
 from benchmarks.validity.pools import SEED, Pools
 from benchmarks.validity.record import Record, measures_of
@@ -21,15 +21,16 @@ from pipeline.sensing.sites import Site
 from pipeline.validation.site_findings import POINTS
 from pipeline.validation.statistics.correlation import RESAMPLES
 
-FRAMES, SENSOR_FRAMES = 250, 100
+FRAMES, SENSOR_FRAMES = 250, 60
 SENSORS = ("VLP-16", "VLP-32C", "OS1-64", "OS1-128")
 """Compared at the first places of the grid of the training junctions."""
 
 FAST = (POINTS, "cluster")
 """Detectors that look from every site, and with every sensor; others look from some."""
 
-FEW_PLACES, FEW_GIVEN = 5, 13
-"""Where other detectors look from: the first places of the grid at all heights, and as many of the given sites."""
+FEW_PLACES = 5
+FEW_GIVEN: dict[Role, int] = {"training": 6, "held out": 13}
+"""Where other detectors look from: the first places of the grid at all heights, and so many of the given sites."""
 
 _CORE_MS = {POINTS: 4.0, "cluster": 60.0}
 _OTHER_CORE_MS = 240.0
@@ -59,7 +60,7 @@ def parts(each: Sequence[StudyJunction], detectors: Sequence[str], extent: Exten
     found = []
     for junction in each:
         sites = (*junction.given, *junction.grid)
-        few = {site.name for site in (*some(junction.given, FEW_GIVEN), *first_places(junction.grid))}
+        few = {site.name for site in (*some(junction.given, FEW_GIVEN[junction.role]), *first_places(junction.grid))}
         looks = {name: frozenset(site.name for site in sites) if name in FAST else frozenset(few) for name in detectors}
         sensor = junction.scenario.sites.sensor
         found.append(_part(junction, junction.name, sensor, sites, looks, extent.frames, folder))

@@ -16,6 +16,7 @@ from benchmarks.validity import agreement, failures, figures, heights, junctions
 from benchmarks.validity.pools import DEFAULT, Pools, Setting
 from benchmarks.validity.record import Estimates, Record, StudySite
 from pipeline.validation.looking import Look
+from tests.conftest import write_mini
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -111,6 +112,34 @@ def test_wrong_arguments_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "unknown detector 'crystal_ball'" in capsys.readouterr().err
     assert command.main([*data, "--junction", "hill", "--osm-held-out", str(tmp_path / "no.osm")]) == 2
     assert "--osm-held-out: no such file" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_the_whole_study_is_the_same_bytes_twice_and_says_what_it_went_without(tmp_path, monkeypatch, capsys) -> None:
+    (tmp_path / "scenarios").mkdir()
+    for name in ("ingolstadt", "nishishinjuku"):
+        write_mini(tmp_path / "scenarios" / name)
+    monkeypatch.setattr(junctions, "SCENARIOS", tmp_path / "scenarios")
+    monkeypatch.setattr(study, "SENSORS", ("VLP-16",))
+    options = ["--frames", "10", "--sensor-frames", "10", "--places", "2", "--jobs", "1", "--detector", "points"]
+    docs = [tmp_path / "first", tmp_path / "again"]
+    for folder in docs:
+        code = command.main([*options, "--data", str(tmp_path / "data"), "--docs", str(folder)])
+        out, err = capsys.readouterr()
+        assert code == 0, err
+        assert "ingolstadt: training, small, 10 frames, points from 10" in out
+        assert "3 parts; looking from all sites takes some 0 minutes on 1 cores" in out
+    assert out.count(": kept") == 3
+    made = sorted(path.relative_to(docs[0]) for path in docs[0].rglob("*") if path.is_file())
+    assert [str(path) for path in made if path.suffix != ".png"] == [
+        "data/validity.json", "validity-costs.md", "validity-tables.md",
+    ]  # fmt: skip
+    assert all((docs[0] / path).read_bytes() == (docs[1] / path).read_bytes() for path in made)
+    page = (docs[0] / "validity-tables.md").read_text(encoding="utf-8")
+    assert (
+        "Without: hill (not in this run); roundabout (not in this run); a training junction from OpenStreetMap" in page
+    )
+    assert "Detectors: points." in page and "ingolstadt: TPOG 7, unseen traffic" in page
 
 
 # tables from made-up findings
@@ -260,7 +289,8 @@ def test_every_number_of_the_answers_stands_in_the_tables() -> None:
 def test_the_protocol_says_the_numbers_of_the_program() -> None:
     page = " ".join((DOCS / "validity.md").read_text(encoding="utf-8").split())
     assert f"judged by {study.FRAMES} frames" in page and f"on {study.SENSOR_FRAMES} frames" in page
-    assert f"first {study.FEW_PLACES} places" in page and f"at most {study.FEW_GIVEN} of the given" in page
+    assert f"first {study.FEW_PLACES} places" in page and f"at most {study.FEW_GIVEN['held out']} of the given" in page
+    assert f"{study.FEW_GIVEN['training']} of a training one" in page
     assert ", ".join(study.SENSORS) in page and f"{poses.PLACES} places, each 2, 3, 4.5 and 6 m" in page
     assert f"lattice of {poses.SPACING_M:g} m that reaches {poses.BESIDE_M:g} m" in page
     assert f"within {poses.ROAD_M:g} m of a lane" in page
