@@ -64,6 +64,7 @@ def _study(chosen: argparse.Namespace) -> None:
     detectors, without = _detectors(chosen.detector)
     homes, left_out = _homes(chosen)
     chosen.data.mkdir(parents=True, exist_ok=True)
+    print(f"preparing {', '.join(name for name, _, _ in homes)}", flush=True)
     each = [_ready(*home, chosen) for home in homes]
     extent = Extent(chosen.frames, chosen.sensor_frames, chosen.places)
     parts = study.parts(each, detectors, extent, chosen.data)
