@@ -60,6 +60,13 @@ def validate(
     detector: Annotated[
         str, typer.Option(metavar="NAME,NAME", help="points, and detectors that are installed: cluster, pointpillars.")
     ] = "points,cluster",
+    detections: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="KITTI results of other detectors: DIR/SITE/DETECTOR/FRAME.txt."),
+    ] = None,
+    keep: Annotated[
+        bool, typer.Option("--keep", help="Also write ground truth and detections as KITTI labels and results.")
+    ] = False,
     jobs: Jobs = None,
 ) -> None:
     """What would detectors find from each site, and which score foretells it?"""
@@ -74,8 +81,8 @@ def validate(
     names = [name.strip() for name in detector.split(",") if name.strip()]
     with Screen("validate") as screen:
         done = validating.validate(
-            loaded, folder, frames=frames, detectors=names, jobs=jobs, progress=screen.progress,
-            listener=validation_tables.LookLines(screen.say),
+            loaded, folder, frames=frames, detectors=names, detections=detections, keep=keep, jobs=jobs,
+            progress=screen.progress, listener=validation_tables.LookLines(screen.say),
         )  # fmt: skip
     validation_tables.print_validation(loaded, folder, done)
 

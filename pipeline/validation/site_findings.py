@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.artefacts import schemas, tables
+from pipeline.core import files
 from pipeline.validation.frames import BOX
 from pipeline.validation.sweeps import Detections
 
@@ -53,6 +54,11 @@ class FoundBoxes:
     """Detections of each frame, those whose centre lies in the region of interest."""
 
     frames: tuple[Detections, ...]
+
+    @property
+    def digest(self) -> str:
+        """Hash of all boxes and scores."""
+        return files.hash_of([[its.boxes.tolist(), its.scores.tolist()] for its in self.frames])
 
     def write(self, path: Path, about: dict[str, Any]) -> None:
         """As ``detections.parquet``."""

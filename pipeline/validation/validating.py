@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -29,13 +29,15 @@ from pipeline.runs.stages import RANKING
 from pipeline.runs.workflow import bring, refresh_report
 from pipeline.scenario.models import Scenario
 from pipeline.stages.base import Workspace
-from pipeline.validation import detection, figure, unseen_traffic
+from pipeline.validation import detection, figure, keeping, unseen_traffic
 from pipeline.validation.agreement import BOXED, COUNTED, Agreement, ScoreName, Validation, main_measure
 from pipeline.validation.detection import ALL, SiteDetection
-from pipeline.validation.detectors import registry
+from pipeline.validation.detectors import kitti_results, registry
+from pipeline.validation.detectors.base import Detector
 from pipeline.validation.frames import TrafficFrame
 from pipeline.validation.looking import Look, LookListener, look_from
-from pipeline.validation.site_findings import POINTS
+from pipeline.validation.metrics.matching import within
+from pipeline.validation.site_findings import POINTS, FoundBoxes
 from pipeline.validation.statistics.coefficients import KINDS
 from pipeline.validation.statistics.correlation import Study
 from pipeline.validation.statistics.junctions import Junction, Measured
@@ -53,6 +55,8 @@ def validate(
     *,
     frames: int,
     detectors: Sequence[str] = (POINTS,),
+    detections: Path | None = None,
+    keep: bool = False,
     jobs: int | None = None,
     progress: Progress = silent,
     listener: LookListener | None = None,
@@ -65,15 +69,20 @@ def validate(
         The run's folder.
     frames
         Of unseen traffic.
-    listener
-        Hears how far the looking is.
     detectors
         Names; points on vehicles are always counted.
+    detections
+        A folder with KITTI results of further detectors, see :mod:`pipeline.validation.detectors.kitti_results`.
+    keep
+        Also write ground truth and detections, see :mod:`pipeline.validation.keeping`.
+    listener
+        Hears how far the looking is.
 
     Raises
     ------
     InputError
-        What the check refuses; an unknown detector; more frames than traffic has; no vehicle in the region of interest.
+        What the check refuses; an unknown detector; more frames than traffic has; no vehicle in the region of interest;
+        results that are not of these sites and frames.
     """
     chosen = {name: registry.make(name) for name in dict.fromkeys(detectors) if name != POINTS}
     with alone(out), _workshop(out) as folder:
@@ -81,15 +90,37 @@ def validate(
         record = prepare(scenario, folder / "unseen", frames, jobs=jobs, progress=progress)
         watched = list(record.read())
         _refuse_empty(scenario, record, watched)
+        given = _given(detections, record, chosen)
         look = Look(record, chosen)
         found = look_from(record.scene.sites, look, jobs=jobs, progress=progress, listener=listener)
+        found = {site: {**its, **given.get(site, {})} for site, its in found.items()}
         rows, undefined = detection.measured(watched, record.scene.roi, found)
         surrogates = gathering.surrogates_of(scenario, folder / "scores", jobs=jobs, progress=progress)
         agreements = correlated(scenario, rows, surrogates)
         told = (*doubts, *_not_unseen(scenario), *undefined, *surrogates.skipped)
         done = Validation(tuple(rows), surrogates, tuple(agreements), told)
-        _write(out, folder, scenario, record, done)
+        _write(out, folder, scenario, record, done, given)
+        if keep:
+            keeping.write(out / keeping.FOLDER, record, watched, found)
         return replace(done, report=refresh_report(out))
+
+
+def _given(
+    folder: Path | None, record: UnseenRecord, chosen: Mapping[str, Detector]
+) -> dict[str, dict[str, FoundBoxes]]:
+    """The boxes of other detectors by site and detector, those whose centre lies in the region of interest."""
+    if folder is None:
+        return {}
+    results = kitti_results.read(folder, {site.name: site.pose for site in record.scene.sites}, record.numbers)
+    if twice := [name for name in results if name in (POINTS, *chosen)]:
+        raise InputError(
+            "--detections", f"results of {twice[0]}, which is looked with too", "another name, or not both"
+        )
+    by_site: dict[str, dict[str, FoundBoxes]] = {site.name: {} for site in record.scene.sites}
+    for name, each in results.items():
+        for site_name, frames in each.items():
+            by_site[site_name][name] = FoundBoxes(tuple(within(its, record.scene.roi) for its in frames))
+    return by_site
 
 
 def correlated(scenario: Scenario, rows: Sequence[SiteDetection], surrogates: Surrogates) -> list[Agreement]:
@@ -158,11 +189,20 @@ def _not_unseen(scenario: Scenario) -> list[Finding]:
     return [Finding("seen traffic", f"{scenario.file}: traffic.fcd", what, "a network or a sumocfg has traffic unseen")]
 
 
-def _write(out: Path, folder: Path, scenario: Scenario, record: UnseenRecord, done: Validation) -> None:
+def _write(
+    out: Path,
+    folder: Path,
+    scenario: Scenario,
+    record: UnseenRecord,
+    done: Validation,
+    given: Mapping[str, Mapping[str, FoundBoxes]],
+) -> None:
     """All artefacts or none: they are made aside, then renamed."""
     aside = folder / "done"
     aside.mkdir()
     about = _about(folder / "scores", scenario, record, done)
+    if given:
+        about["given"] = {site: {name: its.digest for name, its in by.items()} for site, by in given.items()}
     detection.write(aside / detection.ARTEFACT, done.detections, about)
     done.surrogates.write(aside / gathering.ARTEFACT, scenario)
     _write_correlation(aside / CORRELATION, done, about)

@@ -9,6 +9,7 @@ import pytest
 
 from pipeline import load
 from pipeline.artefacts import tables
+from pipeline.core.errors import InputError
 from pipeline.validation import validating
 from pipeline.validation.agreement import BOXED, COUNTED, ScoreName
 from pipeline.validation.detection import ALL, MEASURES, SiteDetection
@@ -71,6 +72,31 @@ def test_twice_the_same_bytes(whole, middle, tmp_path):
     validate(load(elsewhere), tmp_path / "again", frames=10, detectors=["middle"], jobs=1)
     for name in ARTEFACTS:
         assert (tmp_path / "again" / name).read_bytes() == (out / name).read_bytes(), name
+
+
+def test_what_is_kept_comes_back_as_the_results_of_another_detector(mini, middle, tmp_path):
+    scenario = load(mini)
+    first = validate(scenario, tmp_path / "a", frames=10, detectors=["middle"], keep=True, jobs=1)
+    kept = tmp_path / "a" / "validation_kitti"
+    with pytest.raises(InputError, match="--detections: results of 'middle', which is looked with too"):
+        validate(scenario, tmp_path / "b", frames=10, detectors=["middle"], detections=kept, jobs=1)
+    for site in ("pole_a", "pole_b"):
+        frames = sorted(path.name for path in (kept / site / "middle").iterdir())
+        assert frames == sorted(path.name for path in (kept / site / "label_2").iterdir())
+        assert len(frames) == 10
+        (kept / site / "middle").rename(kept / site / "theirs")
+    again = validate(scenario, tmp_path / "b", frames=10, detections=kept, keep=True, jobs=1)
+    told = {(row.site, row.detector, row.objects_of): row.measures for row in [*first.detections, *again.detections]}
+    for (site, detector, objects_of), measures in told.items():
+        if detector == "middle":
+            for name, estimate in measures.items():
+                np.testing.assert_equal(told[site, "theirs", objects_of][name].value, estimate.value)
+    objects = sum(row.objects for row in first.detections if (row.detector, row.objects_of) == ("middle", ALL))
+    labels = [line for path in kept.rglob("label_2/*.txt") for line in path.read_text().splitlines()]
+    assert len(labels) == objects and all(line.startswith("Car ") for line in labels)
+    (kept / "pole_b" / "theirs" / "000000.txt").unlink()
+    with pytest.raises(InputError, match=r"pole_b/theirs/000000\.txt: no such file"):
+        validate(scenario, tmp_path / "b", frames=10, detections=kept, jobs=1)
 
 
 @pytest.mark.parametrize(
