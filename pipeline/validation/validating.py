@@ -113,9 +113,8 @@ def _given(
         return {}
     results = kitti_results.read(folder, {site.name: site.pose for site in record.scene.sites}, record.numbers)
     if twice := [name for name in results if name in (POINTS, *chosen)]:
-        raise InputError(
-            "--detections", f"results of {twice[0]}, which is looked with too", "another name, or not both"
-        )
+        found = f"results of {twice[0]!r}, which is looked with too"
+        raise InputError("--detections", found, "a folder of another name, or not both")
     by_site: dict[str, dict[str, FoundBoxes]] = {site.name: {} for site in record.scene.sites}
     for name, each in results.items():
         for site_name, frames in each.items():
