@@ -201,6 +201,7 @@ _ready: Look | None = None
 def _begin(look: Look) -> None:
     global _ready
     _ready = look
+    os.environ["OMP_NUM_THREADS"] = "1"  # before scikit-learn is loaded: its threads would wait for one another
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
