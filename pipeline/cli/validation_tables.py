@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 _FILE_WIDTH = 160
 
-FRAME_MS = {"points": 4.0, "cluster": 17.0, "pointpillars": 120.0}
+FRAME_MS = {"points": 4.0, "cluster": 17.0, "pointpillars": 80.0}
 """A frame of 57,600 beams with each detector, measured on one core of a small cloud machine; of points, its cloud."""
 
 SITE_S = 0.5

@@ -6,10 +6,15 @@ import math
 import numpy as np
 import pytest
 
+from pipeline import load
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Roi
 from pipeline.validation.detectors.pointpillars import decoding, detector, encoding
 from pipeline.validation.detectors.pointpillars.encoding import POINTS, SeenPoints, Window
+from pipeline.validation.looking import Look
+from pipeline.validation.site_findings import POINTS as POINTS_ON
+from pipeline.validation.site_findings import FoundBoxes, FoundPoints
+from pipeline.validation.unseen_record import prepare
 
 
 def _seen(rows):
@@ -110,3 +115,27 @@ def test_a_model_that_is_none_is_named(tmp_path):
         detector.Model.of(path)
     with pytest.raises(InputError, match="No such file"):
         detector.Model.of(tmp_path / "absent.onnx")
+
+
+def test_the_shipped_model_says_how_it_was_made():
+    about = detector.Model.of(detector.SHIPPED).about
+    assert about["convention"] == "ground" and about["parameters"] == 985785
+    assert "nishishinjuku" not in about["junctions"] and len(about["junctions"]) >= 4
+    assert about["curve"][-1]["step"] == about["recipe"]["steps"]
+    assert about["curve"][-1]["ap_bev_r40_iou50"] > 0.5  # of held-out frames and poses
+
+
+def test_the_shipped_model_finds_the_cars_of_a_road(mini, tmp_path):
+    """From both sites, with a sensor of the catalogue: every car with 100 points, to half a metre."""
+    record = prepare(load(mini, ["sites.sensor=VLP-32C"]), tmp_path / "r", 10)
+    look, well_seen = Look(record, {"pointpillars": detector.PointPillars()}), 0
+    for site in record.scene.sites:
+        its = look.at(site, [POINTS_ON, "pointpillars"])
+        boxes, points = its["pointpillars"], its[POINTS_ON]
+        assert isinstance(boxes, FoundBoxes) and isinstance(points, FoundPoints)
+        for frame, found, on in zip(record.read(), boxes.frames, points.points, strict=True):
+            sure = found.boxes[found.scores > 0.3]
+            for box in frame.boxes[frame.wanted(record.scene.roi)][on >= 100]:
+                assert np.hypot(*(sure[:, :2] - box[:2]).T).min(initial=9.0) < 0.5, (site.name, frame.number)
+                well_seen += 1
+    assert well_seen > 20
