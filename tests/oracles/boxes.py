@@ -62,7 +62,7 @@ def parting(axes: Any, half: Any, voxel: Any) -> list[tuple[Any, Any, Any]]:
     for n in [*units, *axes, *(cross(u, a) for u in units for a in axes)]:
         along = [abs(dot(a, n)) for a in axes]
         size = sum(abs(c) for c in n)
-        if size > Fraction(1, 10**40):  # else the edges are parallel: no axis
+        if size * 10**40 > 1:  # else the edges are parallel: no axis
             found.append((n, voxel / 2 * size + sum(h * s for h, s in zip(half, along, strict=True)), sum(along)))
     return found
 
