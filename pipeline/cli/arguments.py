@@ -47,6 +47,13 @@ def heights_m(text: str) -> tuple[float, float]:
     return low, high
 
 
+def model_file(path: Path) -> Path:
+    """``--out`` of ``egvs train``: a name that ends in .onnx."""
+    if path.suffix != ".onnx":
+        raise InputError("--out", repr(str(path)), "a file that ends in .onnx, for example model.onnx")
+    return path
+
+
 def size_bytes(text: str) -> float:
     """``--max``: bytes from 500M or 2G."""
     units = {"": 1.0, "K": 1e3, "M": 1e6, "G": 1e9, "T": 1e12}

@@ -12,7 +12,7 @@ from pipeline.cli.arguments import Jobs, Out, ScenarioPath, Set
 from pipeline.core.errors import InputError, MissingBackendError
 
 DEFAULT_FRAMES = 1000
-"""Of validation: what brings the standard error of average precision to about a point."""
+"""Of validation: average precision, BEV + 3D on a scale from 0 to 200, then had a standard error of 2.4 to 6.5."""
 
 _Scenarios = Annotated[list[Path], typer.Argument(metavar="SCENARIO...", help="Training junctions, one or more.")]
 
@@ -105,12 +105,15 @@ def train(
     """Train the PointPillars detector on simulated sweeps of junctions (needs the extra `train`)."""
     from pipeline.cli import validation_tables
     from pipeline.cli.progress import Screen
+    from pipeline.core import files, plugins
     from pipeline.scenario.loading import load
 
+    model = arguments.model_file(out)
+    plugins.require("egvs train", "train", "torch", "onnx", "onnxscript", "onnxruntime")
     try:
         from pipeline.validation.training import train as training
     except ImportError as error:
-        raise MissingBackendError(f"egvs train needs {error.name}: pip install 'egvs[train]'") from None
+        raise MissingBackendError(f"egvs train cannot start: {error}; pip install 'egvs[train]'") from None
 
     if convention not in ("ground", "sensor"):
         raise InputError("--convention", repr(convention), "ground or sensor")
@@ -122,9 +125,10 @@ def train(
         convention="sensor" if convention == "sensor" else "ground",
     )
     loaded = [load(path, set_ or ()) for path in scenarios]
+    files.make_room(model)
     with Screen("train") as screen:
-        about = training.train(loaded, out, recipe, jobs=jobs, progress=screen.progress)
-    validation_tables.print_training(out, about)
+        about = training.train(loaded, model, recipe, jobs=jobs, progress=screen.progress)
+    validation_tables.print_training(model, about)
 
 
 VERBS = (validate, clouds, scores, train)

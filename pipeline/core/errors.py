@@ -43,3 +43,9 @@ class RunError(EgvsError):
 
 class MissingBackendError(RunError):
     """A program or library that the run needs is not installed or cannot start."""
+
+
+class MissingExtraError(MissingBackendError):
+    """The user asked for a part whose libraries only an extra of this package brings, and it was not installed."""
+
+    exit_code = InputError.exit_code

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,14 +21,35 @@ def aside(path: Path) -> Iterator[Path]:
     """Yield a path to write to; rename it to ``path`` when the block ends well, remove it when it does not."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.partial")
-    if path.is_dir():
-        raise InputError(path, "is a folder", "a file, or nothing, where an artefact is written")
+    _refuse_folder(path)
     try:
         yield partial
         partial.replace(path)
     except BaseException:
         partial.unlink(missing_ok=True)
         raise
+
+
+def make_room(path: Path) -> None:
+    """Make the folder of a file that is written after long work, and see that it takes files.
+
+    Raises
+    ------
+    InputError
+        Where it could not be written.
+    """
+    try:
+        _refuse_folder(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise InputError(path, f"cannot be written ({error.strerror})", "a file in a folder of yours") from None
+
+
+def _refuse_folder(path: Path) -> None:
+    if path.is_dir():
+        raise InputError(path, "is a folder", "a file, or nothing, where an artefact is written")
 
 
 def write_text(path: Path, text: str) -> None:

@@ -11,10 +11,11 @@ from __future__ import annotations
 
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
 from operator import attrgetter
 from typing import Any
 
-from pipeline.core.errors import InputError, MissingBackendError
+from pipeline.core.errors import InputError, MissingBackendError, MissingExtraError
 
 OWN = "egvs"
 """The package of this program's own parts."""
@@ -35,6 +36,29 @@ _RIGHT = {
     "egvs.point_clouds": (("read",), "a module or an object with a function read"),
 }
 """What an object of a group must have, and what would be right, in words."""
+
+_PACKAGES = {"sklearn": "scikit-learn", "torch": "PyTorch"}
+"""What is installed, where it has another name than what is imported."""
+
+
+def require(what: str, extra: str, *libraries: str) -> None:
+    """Refuse a part whose libraries are not installed, before any work is done for it; none is imported.
+
+    Parameters
+    ----------
+    what
+        The part, as the message names it.
+    extra
+        Of this package; it brings the libraries.
+
+    Raises
+    ------
+    MissingExtraError
+        Names all that are missing, and how to install them.
+    """
+    if missing := [_PACKAGES.get(name, name) for name in libraries if find_spec(name) is None]:
+        told = f"{', '.join(missing)}, which {'are' if len(missing) > 1 else 'is'} not installed"
+        raise MissingExtraError(f"{what} needs {told}: pip install '{OWN}[{extra}]'")
 
 
 def names(group: str) -> list[str]:

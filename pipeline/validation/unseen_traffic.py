@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from pipeline.core.errors import InputError
 from pipeline.scenario.models import Scenario
@@ -27,7 +28,7 @@ def scenario_of(scenario: Scenario, frames: int) -> Scenario:
     Raises
     ------
     InputError
-        Where a period's length does not allow it.
+        For more frames than can be handled.
     """
     traffic = scenario.traffic
     if traffic.fcd is not None:
@@ -37,7 +38,12 @@ def scenario_of(scenario: Scenario, frames: int) -> Scenario:
     values = {key: getattr(traffic, key) for key in traffic.model_fields_set}
     if not traffic.periods:
         values |= {"frames": frames, "frame_period_s": stride * traffic.frame_period_s}
-    return scenario.model_copy(update={"traffic": type(traffic)(**values), "seed": seed})
+    try:
+        unseen = type(traffic)(**values)
+    except ValidationError as error:
+        found = error.errors()[0]["msg"].removeprefix("Value error, ")
+        raise InputError("--frames", f"{frames}, at least {APART_S:g} s apart: {found}", "fewer frames") from None
+    return scenario.model_copy(update={"traffic": unseen, "seed": seed})
 
 
 def numbers(scenario: Scenario, recorded: int, frames: int) -> NDArray[np.int64]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.core import plugins
-from pipeline.core.errors import InputError, MissingBackendError
+from pipeline.core.errors import InputError, MissingBackendError, MissingExtraError
 
 GROUP = "egvs.test_group"
 
@@ -119,3 +119,26 @@ def test_packages_without_a_name_are_sorted_too(site: Path) -> None:
     (site / "two-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\n", encoding="utf-8")
     assert plugins.names(GROUP) == ["one", "two"]
     assert (plugins.package_of(GROUP, "one"), plugins.package_of(GROUP, "two")) == ("one", "?")
+
+
+@pytest.mark.parametrize(
+    ("there", "message"),
+    [
+        ({"plug_x": None}, r"^it needs plug_x, which is not installed: pip install 'egvs\[some\]'$"),
+        ({"sklearn": None, "torch": None}, r"^it needs scikit-learn, PyTorch, which are not installed: pip install"),
+    ],
+)
+def test_what_needs_an_extra_is_refused_by_what_to_install(
+    there: dict[str, None], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in there:
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(MissingExtraError, match=message) as refused:
+        plugins.require("it", "some", "json", *there)
+    assert refused.value.exit_code == 2
+
+
+def test_what_is_installed_is_not_imported_to_see_that(site: Path) -> None:
+    (site / "plug_there.py").write_text("raise SystemExit", encoding="utf-8")
+    plugins.require("it", "some", "plug_there")
+    assert "plug_there" not in sys.modules

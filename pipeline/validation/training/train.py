@@ -123,7 +123,9 @@ class _Course:
         self._samples, self._held_out, self._recipe, self._out = samples, held_out, recipe, out
         self._net = PillarNet()
         self._optimizer = torch.optim.AdamW(self._net.parameters(), lr=_RATE, weight_decay=_DECAY)
-        self._pace = torch.optim.lr_scheduler.LambdaLR(self._optimizer, lambda step: _pace(step / recipe.steps))
+        self._pace = torch.optim.lr_scheduler.LambdaLR(
+            self._optimizer, lambda step: _share_of_rate(step / recipe.steps)
+        )
         self._about = about | {"code": code_digest.of(__name__).digest}
         self._kept = out.with_name(out.name + ".partial")
         self._step, self._curve = 0, list[dict[str, Any]]()
@@ -204,7 +206,7 @@ class _Course:
         self._step, self._curve, self._mean = int(state["step"]), json.loads(state["curve"]), dict(state["mean"])
 
 
-def _pace(done: float) -> float:
+def _share_of_rate(done: float) -> float:
     """Share of the learning rate once this share of the steps is done: up for the first fifth, then a cosine to 0."""
     if done < _WARM_UP:
         return 0.05 + 0.95 * done / _WARM_UP

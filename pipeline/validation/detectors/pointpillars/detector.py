@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -113,10 +113,10 @@ class _AtSite:
     model: Model
     view: SiteView
     roi: Roi
-    _windows: tuple[Window, ...] = field(init=False)
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "_windows", tuple(windows(self.roi)))
+    @cached_property
+    def _windows(self) -> list[Window]:
+        return windows(self.roi)
 
     @cached_property
     def _zero(self) -> HeightZero:
