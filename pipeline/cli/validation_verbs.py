@@ -109,11 +109,11 @@ def train(
     from pipeline.scenario.loading import load
 
     model = arguments.model_file(out)
-    plugins.require("egvs train", "train", "torch", "onnx", "onnxscript", "onnxruntime")
+    plugins.require("training", "train", "torch", "onnx", "onnxscript", "onnxruntime")
     try:
         from pipeline.validation.training import train as training
     except ImportError as error:
-        raise MissingBackendError(f"egvs train cannot start: {error}; pip install 'egvs[train]'") from None
+        raise MissingBackendError(f"training cannot start: {error}; pip install 'egvs[train]'") from None
 
     if convention not in ("ground", "sensor"):
         raise InputError("--convention", repr(convention), "ground or sensor")

@@ -50,7 +50,7 @@ def test_training_without_its_libraries(egvs, mini, tmp_path, monkeypatch, nothi
     monkeypatch.setattr(plugins, "find_spec", lambda name: sys.modules.get(name, "there"))
     code, _, error = egvs("train", mini, "--out", tmp_path / "new" / "model.onnx")
     right = "pip install 'egvs[train]'"
-    assert error == f"egvs: egvs train needs PyTorch, onnxscript, which are not installed: {right}\n"
+    assert error == f"egvs: training needs PyTorch, onnxscript, which are not installed: {right}\n"
     assert code == 2 and not (tmp_path / "new").exists()
 
 
