@@ -28,6 +28,7 @@ from pipeline.runs.locking import alone
 from pipeline.runs.stages import RANKING
 from pipeline.runs.workflow import bring, refresh_report
 from pipeline.scenario.models import Scenario
+from pipeline.sensing.sites import Site
 from pipeline.stages.base import Workspace
 from pipeline.validation import detection, figure, keeping, unseen_traffic
 from pipeline.validation.agreement import BOXED, COUNTED, Agreement, ScoreName, Validation, main_measure
@@ -96,7 +97,7 @@ def validate(
         found = {site: {**its, **given.get(site, {})} for site, its in found.items()}
         rows, undefined = detection.measured(watched, record.scene.roi, found)
         surrogates = gathering.surrogates_of(scenario, folder / "scores", jobs=jobs, progress=progress)
-        agreements = correlated(scenario, rows, surrogates)
+        agreements = correlated(record.scene.sites, scenario, rows, surrogates)
         told = (*doubts, *_not_unseen(scenario), *undefined, *surrogates.skipped)
         done = Validation(tuple(rows), surrogates, tuple(agreements), told)
         _write(out, folder, scenario, record, done, given)
@@ -122,26 +123,29 @@ def _given(
     return by_site
 
 
-def correlated(scenario: Scenario, rows: Sequence[SiteDetection], surrogates: Surrogates) -> list[Agreement]:
-    """Every score against every measure of every detector, over all vehicles."""
-    sites = tuple(dict.fromkeys(row.site for row in rows))
-    scores = _by_score(sites, surrogates)
+def correlated(
+    sites: Sequence[Site], scenario: Scenario, rows: Sequence[SiteDetection], surrogates: Surrogates
+) -> list[Agreement]:
+    """Every score against every measure of every detector, over all vehicles. Sites of a pole are drawn together."""
+    names, poles = tuple(site.name for site in sites), tuple(site.pole for site in sites)
+    scores = _by_score(names, surrogates)
     found = []
     for detector in dict.fromkeys(row.detector for row in rows):
         mine = [row for row in rows if row.detector == detector and row.objects_of == ALL]
-        names = COUNTED if detector == POINTS else BOXED
-        measures = {name: Measured.of([row.measures[name] for row in mine]) for name in names}
-        junction = Junction(scenario.name, sites, {str(name): values for name, values in scores.items()}, measures)
+        compared = COUNTED if detector == POINTS else BOXED
+        measures = {name: Measured.of([row.measures[name] for row in mine]) for name in compared}
+        by_name = {str(name): values for name, values in scores.items()}
+        junction = Junction(scenario.name, names, by_name, measures, poles)
         study = Study([junction], scenario.seed)
         by_kind = {
             (kind, measure, name): study.correlation(str(name), measure, kind)
             for kind in KINDS
-            for measure in names
+            for measure in compared
             for name in scores
         }
         found += [
             Agreement(name, detector, measure, {kind: by_kind[kind, measure, name] for kind in KINDS})
-            for measure in names
+            for measure in compared
             for name in scores
         ]
     return found

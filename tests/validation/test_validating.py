@@ -10,11 +10,14 @@ import pytest
 from pipeline import load
 from pipeline.artefacts import tables
 from pipeline.core.errors import InputError
+from pipeline.sensing.sites import Pose, Site
 from pipeline.validation import validating
 from pipeline.validation.agreement import BOXED, COUNTED, ScoreName
 from pipeline.validation.detection import ALL, MEASURES, SiteDetection
 from pipeline.validation.metrics.leave_out import BLOCKS, Estimate
 from pipeline.validation.site_findings import POINTS
+from pipeline.validation.statistics.correlation import Study
+from pipeline.validation.statistics.junctions import Junction, Measured
 from pipeline.validation.surrogates.gathering import SurrogateRow, Surrogates
 from pipeline.validation.validating import correlated, validate
 from tests.validation.detecting import Middle
@@ -128,11 +131,33 @@ def test_scores_of_which_less_is_better_are_turned(mini):
     more = [SurrogateRow(f"s{n}", "more", {}, 1, v, 0.0) for n, v in enumerate([1.0, 3.0, 2.0, 5.0, 4.0])]
     less = [SurrogateRow(f"s{n}", "less", {}, -1, v, 0.0) for n, v in enumerate([1.0, 3.0, 2.0, 5.0, 4.0])]
     some = [SurrogateRow(f"s{n}", "some", {}, 1, v, 0.0) for n, v in enumerate([math.nan, 3.0, 2.0, 5.0, 4.0])]
-    found = correlated(load(mini), rows, Surrogates((*more, *less, *some), (), "x"))
+    found = correlated(_sites(range(5)), load(mini), rows, Surrogates((*more, *less, *some), (), "x"))
     kendall = {its.score.score: its.by_kind["kendall"] for its in found if its.measure == "seen_20"}
     assert kendall["more"].value == pytest.approx(1.0) and kendall["less"].value == pytest.approx(-1.0)
     assert kendall["some"].sites == 4 and kendall["some"].dropped == (f"{load(mini).name} s0",)
     assert all(math.isnan(its.by_kind["kendall"].value) for its in found if its.measure == "seen_1")  # all the same
+
+
+def test_sites_of_a_pole_are_drawn_together(mini):
+    values = [0.1, 0.2, 0.5, 0.3, 0.3, 0.6, 0.9, 0.4]
+    rows = _made_up(values)
+    scores = [SurrogateRow(f"s{n}", "score", {}, 1, v, 0.0) for n, v in enumerate([1.0, 3, 2, 5, 4, 7, 6, 8])]
+    surrogates = Surrogates(tuple(scores), (), "x")
+    alone = correlated(_sites(range(8)), load(mini), rows, surrogates)
+    pairs = correlated(_sites([0, 0, 1, 1, 2, 2, 3, 3]), load(mini), rows, surrogates)
+    first, second = (next(f for f in found if f.measure == "seen_20").by_kind["spearman"] for found in (alone, pairs))
+    junction = Junction(
+        load(mini).name, tuple(f"s{n}" for n in range(8)), {"score": np.array([1.0, 3, 2, 5, 4, 7, 6, 8])},
+        {"seen_20": Measured(np.array(values), np.tile(np.array(values)[:, None], BLOCKS))},
+        tuple("aabbccdd"),
+    )  # fmt: skip
+    right = Study([junction], load(mini).seed).correlation("score", "seen_20", "spearman").interval
+    assert second.value == first.value
+    assert second.interval != first.interval and second.interval == right
+
+
+def _sites(poles):
+    return [Site(f"s{n}", Pose(0.0, 0.0, 3.0), "small", pole=f"pole {pole}") for n, pole in enumerate(poles)]
 
 
 def test_a_score_is_named_with_what_it_was_tried_with():

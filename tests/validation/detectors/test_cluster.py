@@ -9,7 +9,7 @@ from pipeline.core.grid import Roi
 from pipeline.sensing.sensors import CATALOGUE
 from pipeline.sensing.sites import Pose
 from pipeline.validation.detectors.cluster.clustering import SQUARE_M, Density, clusters_of
-from pipeline.validation.detectors.cluster.detector import Cluster
+from pipeline.validation.detectors.cluster.detector import Cluster, scores
 from pipeline.validation.detectors.cluster.kinds import kinds
 from pipeline.validation.metrics.overlap import overlap_each
 from pipeline.validation.sweeps import SiteView, Sweep
@@ -170,3 +170,10 @@ def test_the_table_of_kinds_is_sound():
 def test_its_settings_say_all_that_its_boxes_depend_on():
     settings = Cluster().settings
     assert set(settings) == {"density", "tolerances", "kinds"} and len(settings["kinds"]) == 64
+
+
+def test_a_score_is_of_points_and_fit():
+    """By hand: 1 - e^-1 with 100 points; 1/e of it with a cost of 10."""
+    full = 1.0 - np.exp(-1.0)
+    found = scores(np.array([100, 100, 100, 0]), np.array([0.0, 10.0, -3.0, 0.0]))
+    np.testing.assert_allclose(found, [full, full / np.e, full, 0.0], rtol=1e-12)

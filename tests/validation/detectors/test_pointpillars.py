@@ -90,11 +90,6 @@ def test_neighbours_of_a_peak_and_faint_ones_are_no_detections():
     np.testing.assert_allclose(scores, [0.8], atol=1e-6)
 
 
-def test_of_two_boxes_that_overlap_the_surer_one_stays():
-    boxes = np.array([[0, 0, 1, 4, 2, 2, 0.0], [1, 0, 1, 4, 2, 2, 0.1], [3.9, 0, 1, 4, 2, 2, 0.0]])
-    assert detector.apart(boxes) == [0, 2]
-
-
 @pytest.mark.parametrize("size_m", [(100.0, 50.0), (102.4, 102.4), (150.0, 60.0), (400.0, 300.0)])
 def test_windows_cover_the_region_and_share_a_seam(size_m):
     roi = Roi((5.0, -7.0, 0.0), (*size_m, 5.0))

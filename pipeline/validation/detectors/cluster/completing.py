@@ -62,15 +62,12 @@ class Completed:
         ground.
     kind
         Row of the table, (m,) int64.
-    seen
-        Share of length and width between the outermost points, (m, 2) float64.
     cost
-        (m,) float64.
+        C above, (m,) float64.
     """
 
     boxes: Floats
     kind: Ints
-    seen: Floats
     cost: Floats
 
 
@@ -104,8 +101,7 @@ def complete(
     c, s = np.cos(found.yaw_rad), np.sin(found.yaw_rad)
     place = c * u - s * v, s * u + c * v, 0.5 * kinds.size_m[kind, 2]
     boxes = np.column_stack([*place, kinds.size_m[kind], found.yaw_rad + turned * (0.5 * np.pi)])
-    seen = np.where(turned[:, None] == 1, extent[:, ::-1], extent) / kinds.size_m[kind, :2]
-    return Completed(boxes, kind, seen, cost[rows, turned, kind])
+    return Completed(boxes, kind, cost[rows, turned, kind])
 
 
 def _fixed(ends_m: Floats, hidden: NDArray[np.bool_]) -> tuple[Floats, Floats]:

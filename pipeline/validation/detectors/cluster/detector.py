@@ -22,7 +22,7 @@ from pipeline.validation.detectors.cluster.completing import Completed, Toleranc
 from pipeline.validation.detectors.cluster.hiding import RangeImage
 from pipeline.validation.detectors.cluster.l_shape import rectangles
 from pipeline.validation.detectors.ground import GroundMap, empty_points
-from pipeline.validation.metrics.overlap import overlap_each
+from pipeline.validation.detectors.overlapping import apart
 from pipeline.validation.sweeps import Detections, SiteView, Sweep
 
 Floats = NDArray[np.float64]
@@ -33,8 +33,8 @@ HEIGHTS_M = 0.2, 5.0
 AROUND_M = 8.0
 """Points this far from the region of interest, or nearer, are looked at: half a long vehicle."""
 
-MOST_SHARED = 0.1
-"""Of two boxes that overlap by more, seen from above, the less sure one is left out."""
+MANY_POINTS, MUCH_COST = 100.0, 10.0
+"""Points with which a score has gone 63 % of the way to 1; cost of completing that takes as much of it away."""
 
 
 @dataclass(frozen=True)
@@ -105,14 +105,10 @@ class ClusterAtSite:
         boxes[:, :2] += np.asarray(self.view.pose.position_m)[:2]
         boxes[:, 2] += self.ground.height_m(boxes[:, :2])
         points = np.diff(clusters.starts)[vehicles]
-        return _apart(Detections(boxes, 1.0 - np.exp(-points / 100.0)))
+        return apart(Detections(boxes, scores(points, found.cost[vehicles])), points)
 
 
-def _apart(found: Detections) -> Detections:
-    """The surest detections that are not one in another: two vehicles are never in one place."""
-    kept = list[int]()
-    for row in np.argsort(-found.scores, kind="stable").tolist():
-        others = found.boxes[kept]
-        if not (overlap_each(np.repeat(found.boxes[row : row + 1], len(kept), 0), others)[0] > MOST_SHARED).any():
-            kept.append(row)
-    return Detections(found.boxes[kept], found.scores[kept])
+def scores(points: NDArray[np.int64], cost: Floats) -> Floats:
+    """How sure boxes are, 0 to 1: by their points and how well they fit; a cost below 0, of a common kind, counts as 0."""
+    score: Floats = (1.0 - np.exp(-points / MANY_POINTS)) * np.exp(-np.maximum(cost, 0.0) / MUCH_COST)
+    return score

@@ -18,10 +18,10 @@ import numpy as np
 from pipeline.core import files
 from pipeline.core.errors import InputError, MissingBackendError
 from pipeline.core.grid import Roi
+from pipeline.validation.detectors.overlapping import apart
 from pipeline.validation.detectors.pointpillars import encoding
 from pipeline.validation.detectors.pointpillars.decoding import VALUES, decode
 from pipeline.validation.detectors.pointpillars.encoding import CELLS, FEATURES, POINTS, HeightZero, SeenPoints, Window
-from pipeline.validation.metrics.overlap import overlap_each
 from pipeline.validation.sweeps import Detections, SiteView, Sweep
 
 if TYPE_CHECKING:
@@ -34,7 +34,6 @@ ABOUT = "egvs"
 _INPUTS = {"features": [POINTS, FEATURES], "present": [POINTS], "cell": []}
 _REFUSALS = ("Fail", "InvalidArgument", "InvalidGraph", "InvalidProtobuf", "NotImplemented", "RuntimeException")
 _SEAM_M = 20.0  # windows share as much, so that no vehicle is cut by all of them
-_MOST_OVERLAP = 0.1
 
 
 @dataclass(frozen=True)
@@ -127,9 +126,7 @@ class _AtSite:
         seen = SeenPoints.of(sweep, self.view, self._zero)
         found = [self._in(window, seen) for window in self._windows]
         boxes, scores = np.concatenate([f.boxes for f in found]), np.concatenate([f.scores for f in found])
-        order = np.argsort(-scores, kind="stable")
-        kept = apart(boxes[order])
-        return Detections(boxes[order][kept], scores[order][kept])
+        return apart(Detections(boxes, scores), scores)
 
     def _in(self, window: Window, seen: SeenPoints) -> Detections:
         pillars = encoding.pillars(seen, window, self.model.about["convention"])
@@ -154,18 +151,3 @@ def windows(roi: Roi) -> list[Window]:
         first = low + (size / 2 if count > 1 else length / 2)
         centres.append([first + i * step for i in range(count)])
     return [Window((x, y)) for x in centres[0] for y in centres[1]]
-
-
-def apart(boxes: np.ndarray[Any, np.dtype[np.float64]]) -> list[int]:
-    """Of boxes (n, 7), the surest first, those that hardly overlap a surer one."""
-    kept: list[int] = []
-    for row in range(len(boxes)):
-        others = boxes[kept]
-        near = np.hypot(*(others[:, :2] - boxes[row, :2]).T) < 0.5 * (others[:, 3] + boxes[row, 3])
-        rival = others[near]
-        if (
-            len(rival) == 0
-            or overlap_each(np.repeat(boxes[row : row + 1], len(rival), 0), rival)[0].max() <= _MOST_OVERLAP
-        ):
-            kept.append(row)
-    return kept
