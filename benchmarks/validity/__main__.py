@@ -13,14 +13,13 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.validity import figures, junctions, poses, study, tables
+from benchmarks.validity import figures, junctions, poses, sensor_centred, study, tables
 from benchmarks.validity.junctions import Role, StudyJunction
 from benchmarks.validity.measuring import Part, measure
 from benchmarks.validity.record import Record
 from benchmarks.validity.study import Extent
 from pipeline.cli import arguments
 from pipeline.core.errors import EgvsError, InputError, MissingBackendError
-from pipeline.validation.detectors import registry
 from pipeline.validation.site_findings import POINTS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -95,12 +94,12 @@ def _detectors(asked: str | None) -> tuple[list[str], list[str]]:
     if asked is not None:
         names = [name.strip() for name in asked.split(",") if name.strip()]
         for name in (name for name in names if name != POINTS):
-            registry.make(name)
+            sensor_centred.make(name)
         return list(dict.fromkeys([POINTS, *names])), []
     found, without = [POINTS], []
-    for name in sorted(registry.names(), key=lambda name: (name not in study.FAST, name)):
+    for name in sorted(sensor_centred.names(), key=lambda name: (name not in study.FAST, name)):
         try:
-            registry.make(name)
+            sensor_centred.make(name)
             found.append(name)
         except MissingBackendError as error:
             without.append(f"detector {name} ({error})")

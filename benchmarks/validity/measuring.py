@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.validity import sensor_centred
 from benchmarks.validity.record import BESIDE, Estimates, Record, StudySite, measures_of
 from pipeline.core import code_digest, files
 from pipeline.core.progress import Progress, silent
@@ -23,7 +24,6 @@ from pipeline.sensing.sites import Site
 from pipeline.validation import detection
 from pipeline.validation.agreement import ScoreName
 from pipeline.validation.detection import ALL, SiteDetection
-from pipeline.validation.detectors import registry
 from pipeline.validation.frames import TrafficFrame
 from pipeline.validation.looking import Look, look_from
 from pipeline.validation.site_findings import POINTS, Found
@@ -75,7 +75,8 @@ def measure(
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".work-", dir=folder) as temporary:
         unseen = prepare(part.scenario, Path(temporary) / "unseen", part.frames, jobs=jobs, progress=progress)
-        looks = {name: Look(unseen, {name: registry.make(name)} if name != POINTS else {}) for name in part.detectors}
+        made = {name: {name: sensor_centred.make(name)} if name != POINTS else {} for name in part.detectors}
+        looks = {name: Look(unseen, its) for name, its in made.items()}
         key = _key(part, looks)
         if path.is_file() and (kept := Record.read(path)).key == key:
             told(f"{part.name}: kept")
@@ -89,10 +90,10 @@ def measure(
         scored = gathering.surrogates_of(
             part.scenario, Path(temporary) / "scores", part.scores, jobs=jobs, progress=progress
         )
-        made = _record(part, key, unseen, rows, scored)
+        record = _record(part, key, unseen, rows, scored)
     (folder / f"{part.name}.costs.json").write_text(json.dumps(scored.costs_ms(), indent=1) + "\n", encoding="utf-8")
-    made.write(path)
-    return made
+    record.write(path)
+    return record
 
 
 def _key(part: Part, looks: Mapping[str, Look]) -> str:

@@ -12,9 +12,21 @@ import pytest
 
 import pipeline
 from benchmarks.validity import __main__ as command
-from benchmarks.validity import agreement, failures, figures, heights, junctions, measuring, poses, study, tables
+from benchmarks.validity import (
+    agreement,
+    failures,
+    figures,
+    heights,
+    junctions,
+    measuring,
+    poses,
+    sensor_centred,
+    study,
+    tables,
+)
 from benchmarks.validity.pools import DEFAULT, Pools, Setting
 from benchmarks.validity.record import Estimates, Record, StudySite
+from pipeline.validation.detectors.pointpillars.detector import SHIPPED, Model
 from pipeline.validation.looking import Look
 from tests.conftest import write_mini
 
@@ -157,6 +169,7 @@ def made_up(name: str, role: str, *, boxes: bool = True) -> Record:
     detections = {"points": {m: its for m in ("seen_20", "log_points", "seen_1", "seen_5")}}
     if boxes:
         detections["cluster"] = {m: its for m in ("ap_combined_r40_iou70", "ap_combined_r40_iou50")}
+        detections[sensor_centred.NAME] = {m: its.only(set(range(6, 26))) for m in detections["cluster"]}
     settings = [Setting(g, v, o) for g in (1.0, 2.0, 10.0) for v in (0.25, 1.0) for o in (False, True)]
     scores = {str(s): (values * (1 if s.gamma == 2 else -1) + 3).tolist() for s in settings}
     scores["entropy_seen"] = values.tolist()
@@ -171,7 +184,7 @@ def records() -> list[Record]:
 
 @pytest.fixture(scope="module")
 def all_tables(records: list[Record]) -> list[tables.Table]:
-    return list(study.tables_of(records, records[:1], ["points", "cluster", "pointpillars"]))
+    return list(study.tables_of(records, records[:1], ["points", "cluster", "pointpillars", sensor_centred.NAME]))
 
 
 def table(all_tables: list[tables.Table], name: str) -> tables.Table:
@@ -186,6 +199,28 @@ def test_rho_of_each_setting_is_that_of_the_findings(all_tables: list[tables.Tab
     assert [c.heading for c in table(all_tables, "A cluster ap_combined_r40_iou70").columns[3:]] == [
         "left", "right", "training", "held out",
     ]  # fmt: skip
+
+
+def test_the_sensor_centred_detector_is_there_for_heights_alone(all_tables: list[tables.Table]) -> None:
+    its = sensor_centred.NAME
+    with_it = [t.name for t in all_tables if its in t.name or its in [cell for row in t.rows for cell in row]]
+    assert with_it == ["0 measured", "C heights"]
+
+
+def test_where_each_detector_looks_from(mini: Path, tmp_path: Path) -> None:
+    junction = junctions.ready("mini", "training", mini, tmp_path)
+    numbers = {
+        name: len(study.sites_of(name, junction)) for name in ("points", "cluster", "other", sensor_centred.NAME)
+    }
+    assert numbers == {"points": 42, "cluster": 42, "other": 22, sensor_centred.NAME: 20}
+    assert {site.name[:3] for site in study.sites_of(sensor_centred.NAME, junction)} == {f"g0{n}" for n in range(1, 6)}
+
+
+def test_no_shipped_model_has_seen_a_held_out_junction() -> None:
+    for model, convention, heights_m in ((SHIPPED, "ground", [2.0, 7.0]), (sensor_centred.MODEL, "sensor", [2.0, 2.0])):
+        about = Model.of(model).about
+        assert about["convention"] == convention and about["recipe"]["heights_m"] == heights_m
+        assert about["junctions"] == ["ingolstadt", "hill", "roundabout", "east"]
 
 
 def test_own_sites_the_grid_and_each_height_are_compared_alone(records: list[Record], all_tables) -> None:

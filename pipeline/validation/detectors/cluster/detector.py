@@ -109,6 +109,6 @@ class ClusterAtSite:
 
 
 def scores(points: NDArray[np.int64], cost: Floats) -> Floats:
-    """How sure boxes are, 0 to 1: by their points and how well they fit; a cost below 0, of a common kind, counts as 0."""
+    """How sure boxes are, 0 to 1: by their points and how well they fit; a cost below 0, of a common kind, is 0."""
     score: Floats = (1.0 - np.exp(-points / MANY_POINTS)) * np.exp(-np.maximum(cost, 0.0) / MUCH_COST)
     return score
