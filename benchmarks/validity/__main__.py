@@ -13,8 +13,9 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.validity import figures, junctions, poses, sensor_centred, study, tables
+from benchmarks.validity import figures, junctions, low_models, poses, study, tables
 from benchmarks.validity.junctions import Role, StudyJunction
+from benchmarks.validity.looking_from import FAST
 from benchmarks.validity.measuring import Part, measure
 from benchmarks.validity.record import Record
 from benchmarks.validity.study import Extent
@@ -62,9 +63,12 @@ def _study(chosen: argparse.Namespace) -> None:
     begun = time.monotonic()
     detectors, without = _detectors(chosen.detector)
     homes, left_out = _homes(chosen)
+    junctions.check_apart(homes)
     chosen.data.mkdir(parents=True, exist_ok=True)
     print(f"preparing {', '.join(name for name, _, _ in homes)}", flush=True)
     each = [_ready(*home, chosen) for home in homes]
+    for junction in each:
+        junctions.check_unseen(junction.scenario)
     extent = Extent(chosen.frames, chosen.sensor_frames, chosen.places)
     parts = study.parts(each, detectors, extent, chosen.data)
     _tell_plan(parts, chosen.jobs)
@@ -94,12 +98,12 @@ def _detectors(asked: str | None) -> tuple[list[str], list[str]]:
     if asked is not None:
         names = [name.strip() for name in asked.split(",") if name.strip()]
         for name in (name for name in names if name != POINTS):
-            sensor_centred.make(name)
+            low_models.make(name)
         return list(dict.fromkeys([POINTS, *names])), []
     found, without = [POINTS], []
-    for name in sorted(sensor_centred.names(), key=lambda name: (name not in study.FAST, name)):
+    for name in sorted(low_models.names(), key=lambda name: (name not in FAST, name)):
         try:
-            sensor_centred.make(name)
+            low_models.make(name)
             found.append(name)
         except MissingBackendError as error:
             without.append(f"detector {name} ({error})")
@@ -136,7 +140,7 @@ def _tell_plan(parts: Sequence[Part], jobs: int | None) -> None:
     cores = jobs or os.cpu_count() or 1
     for part in parts:
         looks = ", ".join(f"{name} from {len(sites)}" for name, sites in part.detectors.items())
-        print(f"{part.name}: {part.role}, {part.sensor}, {part.frames} frames, {looks}")
+        print(f"{part.name}: {part.role}, {part.sensor}, {part.frames} frames {part.apart_s:g} s apart, {looks}")
     minutes = sum(study.reckoned_s(part) for part in parts) / cores / 60
     print(f"{len(parts)} parts; looking from all sites takes some {minutes:.0f} minutes on {cores} cores", flush=True)
 

@@ -72,8 +72,9 @@ def _gamma_lines(axes: Any, table: Table, role: str) -> None:
 
 
 def heights(table: Table) -> Figure:
-    """Detection against mounting height: a panel a detector and measure, a line a junction, all together in bold."""
-    kinds = list(dict.fromkeys(zip(table.column("detector"), table.column("measure"), strict=True)))
+    """Detection against mounting height: a panel a detector and measure, a line a junction, held-out ones in bold."""
+    shown = zip(table.column("detector"), table.column("measure"), strict=True)
+    kinds = [kind for kind in dict.fromkeys(shown) if " " not in kind[0]]  # no differences
     figure, panels = _panels(1, len(kinds), 4.0, 3.4)
     marks = [
         column.heading for column in table.columns if column.heading.endswith(" m") and "less" not in column.heading
@@ -87,7 +88,7 @@ def heights(table: Table) -> Figure:
             if any(cell is None for cell in cells):
                 continue
             values = [cell[0] for cell in cells]
-            if name == "all":
+            if name == "held out":
                 axes.plot(metres, values, color="black", linewidth=2.2, marker="o", label=name)
                 known = [(at, cell) for at, cell in zip(metres, cells, strict=True) if cell[1] is not None]
                 for at, cell in known:

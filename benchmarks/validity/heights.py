@@ -1,70 +1,116 @@
 """Does a higher mount detect less? The table of C: the same places at four heights, compared place by place.
 
 Intervals resample places and blocks of frames together, as those of correlations do; differences are of the same place
-and the same frames. Junctions are taken together as the mean of theirs, weighted by their numbers of places.
+and the same frames. Junctions of one role are taken together: the mean of theirs, weighted by their numbers of places.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.validity.agreement import WORDS
+from benchmarks.validity.junctions import ROLES
+from benchmarks.validity.looking_from import FAST, FEW_PLACES
+from benchmarks.validity.low_models import LOW, SENSOR
 from benchmarks.validity.pools import SEED
 from benchmarks.validity.poses import HEIGHTS_M
 from benchmarks.validity.record import Record, measures_of
 from benchmarks.validity.tables import Cell, Column, Table, with_interval
-from pipeline.validation.statistics.correlation import RESAMPLES
+from pipeline.validation.detectors.pointpillars.detector import PointPillars
+from pipeline.validation.statistics.correlation import FEWEST_PLACES, RESAMPLES
 from pipeline.validation.statistics.intervals import Interval
 from pipeline.validation.statistics.junctions import Draws, Measured
 
 Floats = NDArray[np.float64]
 
 
+LESS = {LOW: PointPillars.NAME, SENSOR: LOW}
+"""Detectors that are compared with others: what training at one height does, and what the convention does."""
+
+
 def table(records: Sequence[Record], detectors: Sequence[str]) -> Table:
     """C: means at each height and differences to the lowest; shares and AP in per cent."""
     rows: list[list[Cell]] = []
-    for detector in detectors:
-        mine = [record for record in records if detector in record.detections]
-        for measure in measures_of(detector) if mine else ():
-            for name, group in [*((r.junction, [r]) for r in mine), ("all", mine)]:
-                rows.append([detector, WORDS[measure], name, *_cells(group, detector, measure)])
+    for what, first, second, few in _compared(detectors):
+        mine = [record for record in records if {first, second or first} <= set(record.detections)]
+        for measure in measures_of(first) if mine else ():
+            groups = [
+                *((r.junction, [r]) for r in mine),
+                *((role, [r for r in mine if r.role == role]) for role in ROLES),
+            ]
+            for name, group in ((name, group) for name, group in groups if group):
+                each = [by_height(record, first, second, measure, few) for record in group]
+                rows.append([what, WORDS[measure], name, *_cells([r.junction for r in group], each)])
     low, *above = HEIGHTS_M
     head = [Column("detector"), Column("measure"), Column("junction"), Column("places", "whole")]
     head += [Column(f"{h:g} m", "one") for h in HEIGHTS_M] + [Column(f"{h:g} less {low:g} m", "one") for h in above]
     caption = (
         "Mean over the places of the grid at each mounting height, and differences at the same places. Shares of"
-        " vehicles and AP in per cent (BEV + 3D: up to 200), log points times 100."
+        " vehicles and AP in per cent (BEV + 3D: up to 200), log points times 100. Of two detectors, the first less the"
+        " second from the same sites."
     )
     return Table("C heights", "C. Mounting height", caption, head, rows)
 
 
-def _cells(records: Sequence[Record], detector: str, measure: str) -> list[Cell]:
-    places = [by_height(record, detector, measure) for record in records]
-    number = sum(len(its[0].values) for its in places)
+def _compared(detectors: Sequence[str]) -> Iterator[tuple[str, str, str | None, int | None]]:
+    """What a row is called, its detector, one that is taken from it, and from how many places at most."""
+    for name in detectors:
+        yield name, name, None, None
+    if any(name in detectors for name in LESS):
+        for name in FAST:
+            if name in detectors:
+                yield f"{name}, first {FEW_PLACES} places", name, None, FEW_PLACES
+    for first, second in LESS.items():
+        if first in detectors and second in detectors:
+            yield f"{first} less {second}", first, second, None
+
+
+def _cells(junctions: Sequence[str], each: Sequence[list[Measured]]) -> list[Cell]:
+    number = sum(len(its[0].values) for its in each)
     if not number:
         return [0, *[None] * (2 * len(HEIGHTS_M) - 1)]
-    names = [record.junction for record in records]
-    means = [_mean(names, [its[i] for its in places]) for i in range(len(HEIGHTS_M))]
-    gaps = [_mean(names, [_less(its[i], its[0]) for its in places]) for i in range(1, len(HEIGHTS_M))]
+    means = [_mean(junctions, [its[i] for its in each]) for i in range(len(HEIGHTS_M))]
+    gaps = [_mean(junctions, [_less(its[i], its[0]) for its in each]) for i in range(1, len(HEIGHTS_M))]
     return [number, *means, *gaps]
 
 
-def by_height(record: Record, detector: str, measure: str) -> list[Measured]:
-    """The measure at the places that have all heights, one a height, place by place in the same order."""
+def by_height(record: Record, detector: str, less: str | None, measure: str, few: int | None) -> list[Measured]:
+    """The measure at the places that have all heights, one a height, place by place in the same order.
+
+    Parameters
+    ----------
+    less
+        Another detector, whose measure is taken from it.
+    few
+        The first so many places; all when None.
+    """
+    every = [_places(record, name, measure) for name in (detector, less) if name is not None]
+    shared = [place for place in every[0] if all(place in its for its in every)][:few]
+    found = []
+    for height_m in HEIGHTS_M:
+        each = []
+        for name, places in zip((detector, less), every, strict=False):
+            assert name is not None
+            measured, rows = record.detections[name][measure].measured(), [places[place][height_m] for place in shared]
+            each.append(Measured(measured.values[rows], measured.left_out[rows]))
+        found.append(each[0] if less is None else _less(*each))
+    return found
+
+
+def _places(record: Record, detector: str, measure: str) -> dict[str, dict[float, int]]:
+    """Of each place of the grid where the measure is defined at all heights, the row of each height."""
     its = record.detections[detector][measure]
-    row = {record.sites[site].name: i for i, site in enumerate(its.sites)}
     at: dict[str, dict[float, int]] = {}
-    for site in (record.sites[i] for i in its.sites):
+    for row, site in enumerate(record.sites[i] for i in its.sites):
         if not site.is_given:
-            at.setdefault(site.place, {})[site.height_m] = row[site.name]
-    measured = its.measured()
-    whole = [heights for heights in at.values() if set(heights) == set(HEIGHTS_M)]
-    whole = [heights for heights in whole if measured.known[list(heights.values())].all()]
-    rows = [[heights[h] for heights in whole] for h in HEIGHTS_M]
-    return [Measured(measured.values[chosen], measured.left_out[chosen]) for chosen in rows]
+            at.setdefault(site.place, {})[site.height_m] = row
+    known = its.measured().known
+    return {
+        place: rows for place, rows in at.items() if set(rows) == set(HEIGHTS_M) and known[list(rows.values())].all()
+    }
 
 
 def _less(first: Measured, second: Measured) -> Measured:
@@ -80,4 +126,6 @@ def _mean(junctions: Sequence[str], each: Sequence[Measured]) -> Cell:
         if weight:
             drawn = Draws.of(name, len(its.values), its.left_out.shape[1], RESAMPLES, SEED)
             draws += drawn.of_measure(its, np.ones(len(its.values), dtype=np.bool_)).mean(axis=1) * weight
+    if 0 < min(filter(None, weights.tolist())) < FEWEST_PLACES:
+        return with_interval(100.0 * value, Interval.unknown("too few places"))
     return with_interval(100.0 * value, Interval.of(100.0 * value, 100.0 * draws / weights.sum()))

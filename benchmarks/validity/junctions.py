@@ -8,6 +8,7 @@ runs on the others, and its tables say so.
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +24,7 @@ from pipeline.scenario.models import Scenario, SitesModel
 from pipeline.sensing.sites import Site
 from pipeline.stages.base import Workspace
 from pipeline.stages.shared.scene import scene_of
-from pipeline.traffic import sumo_folder
+from pipeline.traffic import network, sumo_folder
 from pipeline.world.carriageway import Carriageway
 
 Role = Literal["training", "held out"]
@@ -37,6 +38,9 @@ SHIPPED: dict[str, Role] = {
 }
 OSM: dict[Role, str] = {"training": "osm_training", "held out": "osm_held_out"}
 """What junctions from OpenStreetMap are called."""
+
+APART_M = 700.0
+"""Between junctions from OpenStreetMap of different roles, at least: twice what is seen round one."""
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "scenarios"
 
@@ -81,6 +85,47 @@ def from_osm(role: Role, extract: Path, at: tuple[float, float] | None, folder: 
     return name, role, home
 
 
+def check_unseen(scenario: Scenario) -> None:
+    """Refuse traffic that scores and detectors would share.
+
+    Raises
+    ------
+    InputError
+        For traffic that is a finished file.
+    """
+    if scenario.is_recorded:
+        found = "the traffic is a finished file: scores and detectors would see the same"
+        raise InputError(f"{scenario.file}: traffic.fcd", found, "a network, whose traffic has another seed")
+
+
+def check_apart(homes: Sequence[tuple[str, Role, Path]]) -> None:
+    """Refuse a training and a held-out junction from OpenStreetMap whose surroundings may meet.
+
+    Raises
+    ------
+    InputError
+        For regions of interest nearer than :data:`APART_M`.
+    """
+    there = {name: home for name, _, home in homes}
+    if set(OSM.values()) <= set(there):
+        first, second = (_on_map(there[name]) for name in OSM.values())
+        away_m = math.hypot(first[1] - second[1], first[2] - second[2])
+        if first[0] == second[0] and away_m < APART_M:
+            found = f"{away_m:.0f} m from the junction of --osm-training"
+            raise InputError(
+                "--osm-held-out", found, f"one at least {APART_M:g} m from it, which nothing was chosen on"
+            )
+
+
+def _on_map(home: Path) -> tuple[str, float, float]:
+    """The projection of a scenario from OpenStreetMap, and where its region of interest is in it, in metres."""
+    scenario = load(home)
+    location = network.location_of(home / "network.net.xml")
+    assert location is not None, "netconvert says where a map's network lies"
+    x, y, _ = scenario.roi.center_m
+    return location.projection, x - location.offset_m[0], y - location.offset_m[1]
+
+
 def ready(name: str, role: Role, home: Path, folder: Path, places: int = poses.PLACES) -> StudyJunction:
     """A junction with its sites: its own upright ones, and the grid.
 
@@ -95,8 +140,8 @@ def ready(name: str, role: Role, home: Path, folder: Path, places: int = poses.P
     bring(work, "statics")
     scene = scene_of(work)
     given = tuple(site for site in scene.sites if site.pose.pitch_deg == site.pose.roll_deg == 0.0 and not site.points)
-    network = sumo_folder.roads(scenario)
-    carriageway = None if network is None else Carriageway.of(network)
+    roads = sumo_folder.roads(scenario)
+    carriageway = None if roads is None else Carriageway.of(roads)
     grid = poses.grid_poses(scene, carriageway, scenario.sites.sensor, places)
     return StudyJunction(name, role, scenario, given, grid)
 

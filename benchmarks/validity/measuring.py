@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.validity import sensor_centred
-from benchmarks.validity.record import BESIDE, Estimates, Record, StudySite, measures_of
+from benchmarks.validity import low_models
+from benchmarks.validity.record import Estimates, Record, StudySite, beside_of, measures_of
 from pipeline.core import code_digest, files
 from pipeline.core.progress import Progress, silent
 from pipeline.scenario.models import Scenario
@@ -46,6 +46,8 @@ class Part:
         Names of the junction's own sites.
     detectors
         By name, the sites that it looks from; ``points`` looks from all.
+    frames, apart_s
+        Of unseen traffic, and the time between two.
     scores
         Which; all when None.
     """
@@ -59,6 +61,7 @@ class Part:
     given: frozenset[str]
     detectors: Mapping[str, frozenset[str]]
     frames: int
+    apart_s: float
     scores: tuple[str, ...] | None = None
 
 
@@ -74,8 +77,10 @@ def measure(
     path = folder / f"{part.name}.json"
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".work-", dir=folder) as temporary:
-        unseen = prepare(part.scenario, Path(temporary) / "unseen", part.frames, jobs=jobs, progress=progress)
-        made = {name: {name: sensor_centred.make(name)} if name != POINTS else {} for name in part.detectors}
+        unseen = prepare(
+            part.scenario, Path(temporary) / "unseen", part.frames, apart_s=part.apart_s, jobs=jobs, progress=progress
+        )
+        made = {name: {name: low_models.make(name)} if name != POINTS else {} for name in part.detectors}
         looks = {name: Look(unseen, its) for name, its in made.items()}
         key = _key(part, looks)
         if path.is_file() and (kept := Record.read(path)).key == key:
@@ -108,7 +113,7 @@ def _key(part: Part, looks: Mapping[str, Look]) -> str:
     }
     source = code_digest.of(detection.__name__, gathering.__name__)
     about = {
-        "part": [part.name, part.junction, part.role, part.sensor, sorted(part.given), part.frames],
+        "part": [part.name, part.junction, part.role, part.sensor, sorted(part.given), part.frames, part.apart_s],
         "looked": looked,
         "scores": gathering.inputs_key(part.scenario, part.scores),
         "program": [
@@ -131,7 +136,7 @@ def _record(part: Part, key: str, unseen: UnseenRecord, rows: Sequence[SiteDetec
     all_rows = [row for row in rows if row.objects_of == ALL]
     by_detector = {name: [row for row in all_rows if row.detector == name] for name in part.detectors}
     found = {
-        name: {m: _estimates(mine, m, place) for m in (*measures_of(name), *(BESIDE if name == POINTS else ()))}
+        name: {m: _estimates(mine, m, place) for m in (*measures_of(name), *beside_of(name))}
         for name, mine in by_detector.items()
     }
     frames = list(unseen.read())
@@ -139,6 +144,7 @@ def _record(part: Part, key: str, unseen: UnseenRecord, rows: Sequence[SiteDetec
     return Record(
         key, part.junction, part.role, part.sensor, unseen.frames, all_rows[0].objects, seeds,
         [_site(site, part, unseen, frames) for site in unseen.scene.sites], scores, found,
+        [str(doubt) for doubt in scored.skipped],
     )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Set
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,13 +22,18 @@ COUNTED = ("seen_20", "log_points")
 BOXED = ("ap_combined_r40_iou70", "ap_combined_r40_iou50")
 """What detection is measured by; the first is what a detector is shown by."""
 
-BESIDE = ("seen_1", "seen_5")
-"""Kept beside it of points on vehicles, to explain failures."""
+BESIDE_COUNTED, BESIDE_BOXED = ("seen_1", "seen_5"), ("ap_bev_r40_iou70", "ap_3d_r40_iou70")
+"""Kept beside them: of points on vehicles to explain failures, of boxes since their standard errors are aimed at."""
 
 
 def measures_of(detector: str) -> tuple[str, ...]:
     """The measures of a detector."""
     return COUNTED if detector == POINTS else BOXED
+
+
+def beside_of(detector: str) -> tuple[str, ...]:
+    """What is kept beside them."""
+    return BESIDE_COUNTED if detector == POINTS else BESIDE_BOXED
 
 
 @dataclass(frozen=True)
@@ -91,6 +96,8 @@ class Record:
         By name, one a site, turned so that more is better.
     detections
         By detector and measure.
+    skipped
+        What of the scores could not be worked out, as told.
     """
 
     key: str
@@ -103,6 +110,7 @@ class Record:
     sites: list[StudySite]
     scores: dict[str, list[float]]
     detections: dict[str, dict[str, Estimates]]
+    skipped: list[str] = field(default_factory=list)
 
     def write(self, path: Path) -> None:
         """As JSON."""

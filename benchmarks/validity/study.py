@@ -10,27 +10,24 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.validity import agreement, failures, heights, junctions, poses, sensor_centred
+from benchmarks.validity import agreement, failures, gaps, heights, junctions, low_models, poses
 from benchmarks.validity.agreement import WORDS
-from benchmarks.validity.junctions import Role, StudyJunction
+from benchmarks.validity.junctions import StudyJunction
+from benchmarks.validity.looking_from import FAST, first_places, sites_of
 from benchmarks.validity.measuring import Part
 from benchmarks.validity.pools import SEED, Pools
-from benchmarks.validity.record import Record, measures_of
+from benchmarks.validity.record import BESIDE_BOXED, Record, measures_of
 from benchmarks.validity.tables import Cell, Column, Table, number
 from pipeline.sensing.sites import Site
 from pipeline.validation.site_findings import POINTS
 from pipeline.validation.statistics.correlation import RESAMPLES
 
 FRAMES, SENSOR_FRAMES = 250, 60
+APART_S, SENSOR_APART_S = 7.0, 29.0
+"""Between two frames: half an hour of traffic in all, for signals turn in 71 to 137 s; in step with none of them."""
+
 SENSORS = ("VLP-16", "VLP-32C", "OS1-64", "OS1-128")
 """Compared at the first places of the grid of the training junctions."""
-
-FAST = (POINTS, "cluster")
-"""Detectors that look from every site, and with every sensor; others look from some."""
-
-FEW_PLACES = 5
-FEW_GIVEN: dict[Role, int] = {"training": 6, "held out": 13}
-"""Where other detectors look from: the first places of the grid at all heights, and so many of the given sites."""
 
 _CORE_MS = {POINTS: 4.0, "cluster": 25.0}
 _OTHER_CORE_MS = 80.0
@@ -60,47 +57,27 @@ def parts(each: Sequence[StudyJunction], detectors: Sequence[str], extent: Exten
     found = []
     for junction in each:
         sites = (*junction.given, *junction.grid)
-        looks = {name: frozenset(site.name for site in sites_of(name, junction)) for name in detectors}
-        sensor = junction.scenario.sites.sensor
-        found.append(_part(junction, junction.name, sensor, sites, looks, extent.frames, folder))
+        looks = {name: its for name in detectors if (its := frozenset(s.name for s in sites_of(name, junction)))}
+        sensor, frames = junction.scenario.sites.sensor, (extent.frames, APART_S)
+        found.append(_part(junction, junction.name, sensor, sites, looks, frames, folder))
     for junction in each:
         if junction.role == "training" and extent.sensor_frames:
             for sensor in SENSORS:
                 sites = first_places(junction.grid)
                 looks = {name: frozenset(site.name for site in sites) for name in fast}
                 name = f"{junction.name}-{sensor}"
-                found.append(_part(junction, name, sensor, sites, looks, extent.sensor_frames, folder, ("egvs",)))
+                frames = extent.sensor_frames, SENSOR_APART_S
+                found.append(_part(junction, name, sensor, sites, looks, frames, folder, ("egvs",)))
     return found
 
 
 def _part(
     junction: StudyJunction, name: str, sensor: str, sites: tuple[Site, ...], looks: dict[str, frozenset[str]],
-    frames: int, folder: Path, scores: tuple[str, ...] | None = None,
+    frames: tuple[int, float], folder: Path, scores: tuple[str, ...] | None = None,
 ) -> Part:  # fmt: skip
     scenario = junctions.posed(junction.scenario, sites, folder / f"{name}.sites.csv", sensor if scores else None)
     given = frozenset(site.name for site in junction.given)
-    return Part(name, junction.name, junction.role, sensor, scenario, sites, given, looks, frames, scores)
-
-
-def some(sites: Sequence[Site], most: int) -> list[Site]:
-    """Not more than so many, evenly over the list."""
-    if len(sites) <= most:
-        return list(sites)
-    return [sites[i] for i in (np.arange(most) * len(sites) // most).tolist()]
-
-
-def sites_of(detector: str, junction: StudyJunction) -> tuple[Site, ...]:
-    """Where a detector looks from at a junction."""
-    if detector in FAST:
-        return (*junction.given, *junction.grid)
-    if detector == sensor_centred.NAME:
-        return first_places(junction.grid)
-    return (*some(junction.given, FEW_GIVEN[junction.role]), *first_places(junction.grid))
-
-
-def first_places(grid: tuple[Site, ...]) -> tuple[Site, ...]:
-    """The sites at the first places of the grid."""
-    return grid[: FEW_PLACES * len(poses.HEIGHTS_M)]
+    return Part(name, junction.name, junction.role, sensor, scenario, sites, given, looks, *frames, scores)
 
 
 def reckoned_s(part: Part) -> float:
@@ -110,10 +87,11 @@ def reckoned_s(part: Part) -> float:
 
 
 def tables_of(records: Sequence[Record], with_sensors: Sequence[Record], detectors: Sequence[str]) -> Iterator[Table]:
-    """Every table of the page. The detector that is there for mounting heights alone has no coefficients."""
-    every = [Pools(records, name) for name in detectors if name != sensor_centred.NAME]
+    """Every table of the page. Detectors that are there for mounting heights alone have no coefficients."""
+    every = [Pools(records, name) for name in detectors if name not in low_models.NAMES]
     each = [pools for pools in every if pools.records]
     yield measured_table(records, detectors)
+    yield gaps.table(each, records)
     for pools in each:
         yield from agreement.by_setting(pools)
     for pools in each:
@@ -132,7 +110,7 @@ def measured_table(records: Sequence[Record], detectors: Sequence[str]) -> Table
     rows: list[list[Cell]] = []
     for record in records:
         for name in (name for name in detectors if name in record.detections):
-            for measure in measures_of(name):
+            for measure in (*measures_of(name), *(BESIDE_BOXED if name != POINTS else ())):
                 its = record.detections[name][measure]
                 given = sum(record.sites[site].is_given for site in its.sites)
                 values = np.array([its.values, its.se]) * 100.0

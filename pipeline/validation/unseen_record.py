@@ -60,7 +60,13 @@ class UnseenRecord:
 
 
 def prepare(
-    scenario: Scenario, folder: Path, frames: int, *, jobs: int | None = None, progress: Progress = silent
+    scenario: Scenario,
+    folder: Path,
+    frames: int,
+    *,
+    apart_s: float = unseen_traffic.APART_S,
+    jobs: int | None = None,
+    progress: Progress = silent,
 ) -> UnseenRecord:
     """Bring the static world and the record of a scenario into a folder.
 
@@ -70,17 +76,19 @@ def prepare(
         Where both are laid; they belong to the record, and stay as long as it is used.
     frames
         How many are used; the record may have more.
+    apart_s
+        Time between two frames, at least.
 
     Raises
     ------
     InputError
         Where traffic has fewer frames that far apart; or what the stages refuse.
     """
-    unseen = unseen_traffic.scenario_of(scenario, frames)
+    unseen = unseen_traffic.scenario_of(scenario, frames, apart_s)
     folder.mkdir(parents=True, exist_ok=True)
     work = Workspace(unseen, folder, jobs=jobs, progress=progress)
     keys = bring(work, *_STAGES)
     with tables.reader(work.path("trajectories.parquet"), "trajectories") as (_, about):
         recorded = int(about["frames"])
-    numbers = unseen_traffic.numbers(unseen, recorded, frames)
+    numbers = unseen_traffic.numbers(unseen, recorded, frames, apart_s)
     return UnseenRecord(unseen, scene_of(work), work.path("trajectories.parquet"), numbers, keys)

@@ -22,8 +22,8 @@ _STREAM = 0x7E57
 """Tells the seed of unseen traffic from every other seed that is drawn from the scenario's."""
 
 
-def scenario_of(scenario: Scenario, frames: int) -> Scenario:
-    """The scenario whose traffic is recorded for validation.
+def scenario_of(scenario: Scenario, frames: int, apart_s: float = APART_S) -> Scenario:
+    """The scenario whose traffic is recorded for validation, in frames at least so far apart.
 
     Raises
     ------
@@ -34,7 +34,7 @@ def scenario_of(scenario: Scenario, frames: int) -> Scenario:
     if traffic.fcd is not None:
         return scenario
     seed = int(np.random.SeedSequence((scenario.seed, _STREAM)).generate_state(1, np.uint64)[0]) >> 33  # fits SUMO's
-    stride = math.ceil(APART_S / traffic.frame_period_s - 1e-9)
+    stride = math.ceil(apart_s / traffic.frame_period_s - 1e-9)
     values = {key: getattr(traffic, key) for key in traffic.model_fields_set}
     if not traffic.periods:
         values |= {"frames": frames, "frame_period_s": stride * traffic.frame_period_s}
@@ -42,11 +42,11 @@ def scenario_of(scenario: Scenario, frames: int) -> Scenario:
         unseen = type(traffic)(**values)
     except ValidationError as error:
         found = error.errors()[0]["msg"].removeprefix("Value error, ")
-        raise InputError("--frames", f"{frames}, at least {APART_S:g} s apart: {found}", "fewer frames") from None
+        raise InputError("--frames", f"{frames}, at least {apart_s:g} s apart: {found}", "fewer frames") from None
     return scenario.model_copy(update={"traffic": unseen, "seed": seed})
 
 
-def numbers(scenario: Scenario, recorded: int, frames: int) -> NDArray[np.int64]:
+def numbers(scenario: Scenario, recorded: int, frames: int, apart_s: float = APART_S) -> NDArray[np.int64]:
     """Which frames of the record are used, (frames,), spread over all of it.
 
     Parameters
@@ -61,11 +61,11 @@ def numbers(scenario: Scenario, recorded: int, frames: int) -> NDArray[np.int64]
     InputError
         Where the record has fewer frames that far apart.
     """
-    stride = max(1, math.ceil(APART_S / scenario.traffic.frame_period_s - 1e-9))
+    stride = max(1, math.ceil(apart_s / scenario.traffic.frame_period_s - 1e-9))
     most = (recorded - 1) // stride + 1
     if frames > most:
         length = f"{recorded} frames every {scenario.traffic.frame_period_s:g} s"
         raise InputError(
-            "--frames", f"{frames}, of traffic with {length}", f"at most {most}: they lie at least {APART_S:g} s apart"
+            "--frames", f"{frames}, of traffic with {length}", f"at most {most}: they lie at least {apart_s:g} s apart"
         )
     return (np.arange(frames, dtype=np.int64) * most // frames) * stride

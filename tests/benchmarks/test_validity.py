@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,16 +17,28 @@ from benchmarks.validity import (
     agreement,
     failures,
     figures,
+    gaps,
     heights,
     junctions,
+    looking_from,
+    low_models,
     measuring,
     poses,
-    sensor_centred,
     study,
     tables,
 )
 from benchmarks.validity.pools import DEFAULT, Pools, Setting
-from benchmarks.validity.record import Estimates, Record, StudySite
+from benchmarks.validity.record import (
+    BESIDE_BOXED,
+    BESIDE_COUNTED,
+    BOXED,
+    COUNTED,
+    Estimates,
+    Record,
+    StudySite,
+)
+from pipeline.core.errors import InputError, MissingBackendError
+from pipeline.sensing.sites import Pose, Site
 from pipeline.validation.detectors.pointpillars.detector import SHIPPED, Model
 from pipeline.validation.looking import Look
 from tests.conftest import write_mini
@@ -80,6 +93,13 @@ def test_places_are_spread_as_a_plain_search_spreads_them() -> None:
 # what is measured and kept
 
 
+@pytest.fixture
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The record of the small scenario is 20 s long."""
+    monkeypatch.setattr(study, "APART_S", 2.0)
+    monkeypatch.setattr(study, "SENSOR_APART_S", 2.0)
+
+
 def part_of(mini: Path, folder: Path) -> measuring.Part:
     junction = junctions.ready("mini", "training", mini, folder / "world", places=2)
     extent = study.Extent(frames=10, sensor_frames=0, places=2)
@@ -88,7 +108,7 @@ def part_of(mini: Path, folder: Path) -> measuring.Part:
     return measuring.Part(**{**vars(part), "scores": ("entropy_seen",)})
 
 
-def test_a_part_that_was_measured_is_kept_and_an_interrupted_one_goes_on(mini, tmp_path, monkeypatch) -> None:
+def test_a_part_that_was_measured_is_kept_and_an_interrupted_one_goes_on(mini, tmp_path, monkeypatch, short) -> None:
     said: list[str] = []
     part = part_of(mini, tmp_path)
     made = measuring.measure(part, tmp_path, jobs=1, told=said.append)
@@ -126,13 +146,56 @@ def test_wrong_arguments_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "--osm-held-out: no such file" in capsys.readouterr().err
 
 
+def test_traffic_that_scores_have_seen_is_refused(mini: Path) -> None:
+    with pytest.raises(InputError, match=r"traffic\.fcd: the traffic is a finished file"):
+        junctions.check_unseen(pipeline.load(mini))
+    junctions.check_unseen(pipeline.load(ROOT / "scenarios" / "hill"))
+
+
+@pytest.mark.parametrize(("east_m", "far"), [(699.0, False), (701.0, True), (-701.0, True)])
+def test_junctions_of_different_roles_lie_apart(tmp_path: Path, east_m: float, far: bool) -> None:
+    homes = []
+    for role, offset_m in (("training", 0.0), ("held out", east_m)):
+        home = tmp_path / junctions.OSM[role]
+        write_mini(home)
+        location = f'<location netOffset="{1000.0 - offset_m},5.0" projParameter="+proj=utm +zone=32"/>'
+        (home / "network.net.xml").write_text(f"<net>{location}</net>")
+        homes.append((home.name, role, home))
+    junctions.check_apart(homes[:1])
+    if far:
+        junctions.check_apart(homes)
+    else:
+        with pytest.raises(InputError, match=r"held-out: 699 m from the junction of --osm-training; one at least"):
+            junctions.check_apart(homes)
+
+
+def given_site(number: int, pole: str, z_m: float) -> Site:
+    return Site(f"k{number}", Pose(0.0, 0.0, z_m), "small", pole=pole)
+
+
+def test_some_of_the_given_sites_are_of_many_poles_and_all_heights() -> None:
+    sites = [given_site(3 * p + i, f"p{p}", z) for p in range(12) for i, z in enumerate((3.0, 4.5, 6.0))]
+    few = looking_from.some(sites, 6)
+    assert [site.pole for site in few] == ["p0", "p2", "p4", "p6", "p8", "p10"]
+    assert [site.pose.z_m for site in few] == [3.0, 4.5, 6.0, 3.0, 4.5, 6.0]
+    more = looking_from.some(sites, 13)
+    assert len({site.name for site in more}) == 13 and len({site.pole for site in more}) == 12
+    assert sorted(site.pose.z_m for site in more).count(6.0) == 4
+    assert looking_from.some(sites, 36) == looking_from.some(sites, 99) == sites
+    pair = [given_site(0, "a", 2.0), given_site(1, "a", 3.0), given_site(2, "b", 2.0)]
+    assert [site.name for site in looking_from.some(pair, 2)] == ["k0", "k2"]
+
+
 @pytest.mark.slow
-def test_the_whole_study_is_the_same_bytes_twice_and_says_what_it_went_without(tmp_path, monkeypatch, capsys) -> None:
+def test_the_whole_study_is_the_same_bytes_twice_and_says_what_it_went_without(
+    tmp_path, monkeypatch, capsys, short
+) -> None:
     (tmp_path / "scenarios").mkdir()
     for name in ("ingolstadt", "nishishinjuku"):
         write_mini(tmp_path / "scenarios" / name)
     monkeypatch.setattr(junctions, "SCENARIOS", tmp_path / "scenarios")
     monkeypatch.setattr(study, "SENSORS", ("VLP-16",))
+    monkeypatch.setattr(junctions, "check_unseen", lambda scenario: None)  # these have a finished file
     options = ["--frames", "10", "--sensor-frames", "10", "--places", "2", "--jobs", "1", "--detector", "points"]
     docs = [tmp_path / "first", tmp_path / "again"]
     for folder in docs:
@@ -166,10 +229,10 @@ def made_up(name: str, role: str, *, boxes: bool = True) -> Record:
     values = np.array([0.5 + 0.05 * int(s.place[1:]) - 0.01 * s.height_m + (0.003 if s.is_given else 0) for s in sites])
     left_out = values[:, None] + 0.001 * rng.normal(size=(len(sites), 10))
     its = Estimates(list(range(len(sites))), values.tolist(), [0.01] * len(sites), left_out.tolist())
-    detections = {"points": {m: its for m in ("seen_20", "log_points", "seen_1", "seen_5")}}
+    detections = {"points": {m: its for m in (*COUNTED, *BESIDE_COUNTED)}}
     if boxes:
-        detections["cluster"] = {m: its for m in ("ap_combined_r40_iou70", "ap_combined_r40_iou50")}
-        detections[sensor_centred.NAME] = {m: its.only(set(range(6, 26))) for m in detections["cluster"]}
+        detections["cluster"] = {m: its for m in (*BOXED, *BESIDE_BOXED)}
+        detections[low_models.SENSOR] = {m: its.only(set(range(6, 26))) for m in detections["cluster"]}
     settings = [Setting(g, v, o) for g in (1.0, 2.0, 10.0) for v in (0.25, 1.0) for o in (False, True)]
     scores = {str(s): (values * (1 if s.gamma == 2 else -1) + 3).tolist() for s in settings}
     scores["entropy_seen"] = values.tolist()
@@ -184,7 +247,7 @@ def records() -> list[Record]:
 
 @pytest.fixture(scope="module")
 def all_tables(records: list[Record]) -> list[tables.Table]:
-    return list(study.tables_of(records, records[:1], ["points", "cluster", "pointpillars", sensor_centred.NAME]))
+    return list(study.tables_of(records, records[:1], ["points", "cluster", "pointpillars", low_models.SENSOR]))
 
 
 def table(all_tables: list[tables.Table], name: str) -> tables.Table:
@@ -201,26 +264,36 @@ def test_rho_of_each_setting_is_that_of_the_findings(all_tables: list[tables.Tab
     ]  # fmt: skip
 
 
-def test_the_sensor_centred_detector_is_there_for_heights_alone(all_tables: list[tables.Table]) -> None:
-    its = sensor_centred.NAME
+def test_the_low_models_are_there_for_heights_alone(all_tables: list[tables.Table]) -> None:
+    its = low_models.SENSOR
     with_it = [t.name for t in all_tables if its in t.name or its in [cell for row in t.rows for cell in row]]
     assert with_it == ["0 measured", "C heights"]
 
 
 def test_where_each_detector_looks_from(mini: Path, tmp_path: Path) -> None:
     junction = junctions.ready("mini", "training", mini, tmp_path)
-    numbers = {
-        name: len(study.sites_of(name, junction)) for name in ("points", "cluster", "other", sensor_centred.NAME)
-    }
-    assert numbers == {"points": 42, "cluster": 42, "other": 22, sensor_centred.NAME: 20}
-    assert {site.name[:3] for site in study.sites_of(sensor_centred.NAME, junction)} == {f"g0{n}" for n in range(1, 6)}
+    each = ("points", "cluster", "other", *low_models.NAMES)
+    for role, right in (("training", [42, 42, 22, 0, 0]), ("held out", [42, 42, 22, 20, 20])):
+        its = replace(junction, role=role)
+        assert [len(looking_from.sites_of(name, its)) for name in each] == right
+    assert {site.name[:3] for site in looking_from.sites_of(low_models.LOW, its)} == {f"g0{n}" for n in range(1, 6)}
 
 
 def test_no_shipped_model_has_seen_a_held_out_junction() -> None:
-    for model, convention, heights_m in ((SHIPPED, "ground", [2.0, 7.0]), (sensor_centred.MODEL, "sensor", [2.0, 2.0])):
+    for model, convention, heights_m in (
+        (SHIPPED, "ground", [2.0, 7.0]),
+        (low_models.model(low_models.LOW), "ground", [2.0, 2.0]),
+        (low_models.model(low_models.SENSOR), "sensor", [2.0, 2.0]),
+    ):
         about = Model.of(model).about
         assert about["convention"] == convention and about["recipe"]["heights_m"] == heights_m
         assert about["junctions"] == ["ingolstadt", "hill", "roundabout", "east"]
+
+
+def test_a_model_that_is_not_there_is_left_out(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(low_models, "model", lambda name: tmp_path / f"{name}.onnx")
+    with pytest.raises(MissingBackendError, match=r"pointpillars_2m\.onnx is not there"):
+        low_models.make(low_models.LOW)
 
 
 def test_own_sites_the_grid_and_each_height_are_compared_alone(records: list[Record], all_tables) -> None:
@@ -237,7 +310,7 @@ def test_gamma_is_chosen_on_training_junctions_whatever_the_held_out_ones_say(re
     other = Record(**{**vars(records[2]), "scores": {
         name: [-v for v in its] for name, its in records[2].scores.items()}})  # fmt: skip
     its = agreement.chosen_gamma([Pools([*records[:2], other], "points", 200)])
-    assert set(its.column("best gamma, training")) == {"2"} and set(its.column("as good")) == {"2"}
+    assert set(its.column("best gamma, training")) == {"2"} and set(its.column("not told apart")) == {"2"}
     assert all(cell[0] == 1.0 for cell in its.column("rho, training"))
     assert all(cell[0] == -1.0 for cell in its.column("rho, held out"))
     assert all(cell[0] == -2.0 for cell in its.column("difference, held out"))
@@ -253,14 +326,44 @@ def test_scores_are_ranked_by_training_junctions_and_one_without_order_comes_las
 def test_heights_are_compared_place_by_place(records: list[Record]) -> None:
     its = heights.table(records, ["points", "pointpillars"])
     assert set(its.column("detector")) == {"points"}
-    assert its.column("junction") == ["left", "hilly", "right", "all"] * 2
+    assert its.column("junction") == ["left", "hilly", "right", "training", "held out"] * 2
     every = its.rows[3]
-    assert every[3] == 18
+    assert every[3] == 12
     means = [cell[0] for cell in every[4:8]]
     assert means == pytest.approx([100 * (0.625 - 0.01 * h) for h in poses.HEIGHTS_M])
     assert [cell[0] for cell in every[8:]] == pytest.approx([-1.0, -2.5, -4.0])
     for value, low, high in every[8:]:
-        assert low < value < high and high - low < 0.6  # places share their differences; frames scatter by a little
+        assert low < value < high and high - low < 0.8  # places share their differences; frames scatter by a little
+
+
+def test_heights_of_two_detectors_are_compared_at_the_same_sites(records: list[Record]) -> None:
+    record = records[2]
+    low = {m: its.only(set(range(6, 26))) for m, its in record.detections["cluster"].items()}  # 5 of the 6 places
+    less = {
+        m: replace(its, values=[v - 0.02 * (2.0 + i % 4) for i, v in enumerate(its.values)]) for m, its in low.items()
+    }
+    both = replace(record, detections=record.detections | {low_models.LOW: low, low_models.SENSOR: less})
+    its = heights.table([both], ["points", low_models.LOW, low_models.SENSOR])
+    names = ["points", low_models.LOW, low_models.SENSOR, "points, first 5 places"]
+    assert list(dict.fromkeys(its.column("detector"))) == [*names, f"{low_models.SENSOR} less {low_models.LOW}"]
+    gap = its.rows[-1]
+    assert gap[2] == "held out" and gap[3] == 5
+    assert [cell[0] for cell in gap[4:8]] == pytest.approx([-4.0, -6.0, -8.0, -10.0])
+    assert [cell[0] for cell in gap[8:]] == pytest.approx([-2.0, -4.0, -6.0])
+
+
+def test_what_is_not_defined_is_listed(records: list[Record]) -> None:
+    its = records[0].detections["points"]
+    values = [math.nan, *its["seen_20"].values[1:]]
+    holed = replace(
+        records[0],
+        detections={"points": its | {"seen_20": replace(its["seen_20"], values=values)}},
+        skipped=["voxel 1 m: does not fit"],
+    )
+    rows = gaps.table([Pools([holed], "points", 200)], [holed]).rows
+    assert ["points", "share of vehicles with 20 points", "training", "entropy_seen", 29, "left k0", None] in rows
+    assert [row[6] for row in rows if row[3] == "constant"] == ["constant is the same at all sites of left"] * 2
+    assert rows[-1] == [None, None, "left", None, None, None, "voxel 1 m: does not fit"]
 
 
 def test_failures_are_the_sites_whose_ranks_differ_most(records: list[Record]) -> None:
@@ -274,7 +377,7 @@ def test_failures_are_the_sites_whose_ranks_differ_most(records: list[Record]) -
 def test_one_gamma_is_held_against_each_sensor_and_voxel_size(all_tables: list[tables.Table]) -> None:
     assert set(table(all_tables, "B sensors").column("best gamma")) == {"2"}
     its = table(all_tables, "B one gamma")
-    assert its.column("one gamma")[0] == "2" and its.column("better ones")[0] == 0
+    assert its.column("one gamma")[0] == "2" and its.column("higher better")[0] == its.column("lower better")[0] == 0
 
 
 def test_figures_are_drawn_from_the_tables_twice_alike(all_tables: list[tables.Table], tmp_path: Path) -> None:
@@ -323,9 +426,13 @@ def test_every_number_of_the_answers_stands_in_the_tables() -> None:
 
 def test_the_protocol_says_the_numbers_of_the_program() -> None:
     page = " ".join((DOCS / "validity.md").read_text(encoding="utf-8").split())
-    assert f"judged by {study.FRAMES} frames" in page and f"on {study.SENSOR_FRAMES} frames" in page
-    assert f"first {study.FEW_PLACES} places" in page and f"at most {study.FEW_GIVEN['held out']} of the given" in page
-    assert f"{study.FEW_GIVEN['training']} of a training one" in page
+    assert f"judged by {study.FRAMES} frames of another seed, {study.APART_S:g} s apart" in page
+    assert f"on {study.SENSOR_FRAMES} frames {study.SENSOR_APART_S:g} s apart" in page
+    assert (
+        f"first {looking_from.FEW_PLACES} places" in page
+        and f"at most {looking_from.FEW_GIVEN['held out']} of the given" in page
+    )
+    assert f"{looking_from.FEW_GIVEN['training']} of a training one" in page
     assert ", ".join(study.SENSORS) in page and f"{poses.PLACES} places, each 2, 3, 4.5 and 6 m" in page
     assert f"lattice of {poses.SPACING_M:g} m that reaches {poses.BESIDE_M:g} m" in page
     assert f"within {poses.ROAD_M:g} m of a lane" in page

@@ -1,14 +1,12 @@
 r"""Correlates scores with detection over sites, with intervals, at one junction or over several.
 
 Over several junctions sites are compared within each (a score in bits means little across junctions): the coefficient
-is the mean of the junctions' own, weighted by their numbers of sites,
+is the mean of the junctions' own, weighted by their numbers of places (sites of one pole are one place),
 
 .. math:: c = \sum_j n_j c_j / \sum_j n_j
 
-which for Spearman's is the correlation of all sites once they are ranked within their junctions and the ranks brought
-to the same scale, and for Pearson's the same with values in place of ranks. Resamples keep the junctions and draw sites
-and blocks of frames within each, so an interval speaks of other sites and other traffic at these junctions, not of
-other junctions.
+Resamples keep the junctions and draw places and blocks of frames within each, so an interval speaks of other places and
+other traffic at these junctions, not of other junctions.
 
 Two scores are compared on the same resamples: what they share is taken out.
 """
@@ -30,8 +28,8 @@ from pipeline.validation.statistics.junctions import Draws, Junction
 RESAMPLES = 2000
 """Resamples of an interval: its ends scatter by a twentieth of its width."""
 
-FEWEST_SITES = 5
-"""Sites of a junction that an interval needs."""
+FEWEST_PLACES = 5
+"""Places of a junction that an interval needs; where each site is a place of its own, sites."""
 
 
 @dataclass(frozen=True)
@@ -116,13 +114,15 @@ class Study:
         why = next(filter(None, (_undefined(*pair, scores, measure) for pair in pairs)), "")
         if why:
             return Correlation(math.nan, Interval.unknown(why), math.nan, sites, dropped, why)
-        each = [pooled([_once(*pair, score, measure, kind) for pair in pairs], masks)[0] for score in scores]
+        places = [junction.places_of(mask) for junction, mask in pairs]
+        each = [pooled([_once(*pair, score, measure, kind) for pair in pairs], places)[0] for score in scores]
         value = float(each[0] - each[1] if len(each) == 2 else each[0])
-        few = [f"{junction.name} has {mask.sum()} sites" for junction, mask in pairs if mask.sum() < FEWEST_SITES]
+        few = [f"{j.name} has sites at {count} places" for j, count in zip(self.junctions, places, strict=True)
+               if count < FEWEST_PLACES]  # fmt: skip
         if few:
-            interval = Interval.unknown(f"{few[0]}; an interval needs {FEWEST_SITES}")
+            interval = Interval.unknown(f"{few[0]}; an interval needs {FEWEST_PLACES}")
             return Correlation(value, interval, math.nan, sites, dropped, interval.why)
-        drawn = [pooled([self._drawn(*pair, score, measure, kind) for pair in pairs], masks) for score in scores]
+        drawn = [pooled([self._drawn(*pair, score, measure, kind) for pair in pairs], places) for score in scores]
         draws = drawn[0] - drawn[1] if len(drawn) == 2 else drawn[0]
         interval = Interval.of(value, draws)
         better = share_above(draws) if len(drawn) == 2 else math.nan
@@ -156,9 +156,9 @@ class Study:
         return self._draws[key]
 
 
-def pooled(each: Sequence[NDArray[np.float64]], masks: Sequence[NDArray[np.bool_]]) -> NDArray[np.float64]:
-    """The mean of the junctions' coefficients, each (resamples,), weighted by how many sites each has."""
-    weights = np.array([mask.sum() for mask in masks], dtype=np.float64)
+def pooled(each: Sequence[NDArray[np.float64]], places: Sequence[int]) -> NDArray[np.float64]:
+    """The mean of the junctions' coefficients, each (resamples,), weighted by how many places each has."""
+    weights = np.array(places, dtype=np.float64)
     mean: NDArray[np.float64] = (np.stack(each) * weights[:, None]).sum(axis=0) / weights.sum()
     return mean
 

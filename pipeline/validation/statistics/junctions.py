@@ -90,6 +90,12 @@ class Junction:
             known &= np.isfinite(self.scores[score])
         return known
 
+    def places_of(self, known: NDArray[np.bool_]) -> int:
+        """At how many places some of the sites stand, (n,) bool."""
+        if not self.places:
+            return int(known.sum())
+        return len({place for place, has in zip(self.places, known, strict=True) if has})
+
 
 @dataclass(frozen=True)
 class Draws:

@@ -152,7 +152,7 @@ def test_a_constant_score_has_no_correlation_and_it_is_told(thirteen):
     ("sites", "defined", "why"),
     [
         (2, False, "made up has 2 sites with values; 3 are needed"),
-        (4, True, "made up has 4 sites; an interval needs 5"),
+        (4, True, "made up has sites at 4 places; an interval needs 5"),
         (5, True, ""),
     ],
 )
