@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 import pipeline
-from pipeline.validation import frames
+from pipeline.artefacts import traffic_frames
+from pipeline.artefacts.traffic_frames import TrafficFrame
 from pipeline.validation.clouds.point_clouds import CloudMaker, random_of
-from pipeline.validation.frames import TrafficFrame
 
 BOUND_S = 0.003
 FRAMES = 100
@@ -22,7 +22,7 @@ def rows(scenario: Path, run: Path) -> list[tuple[str, str, str, bool]]:
     """Milliseconds a frame on one core, over the first sites of a scenario and frames of its finished run."""
     scene = pipeline.build_scene(pipeline.load(scenario))
     makers = [CloudMaker.of_site(scene, site) for site in scene.sites[:3]]
-    recorded = list(frames.read(run / "trajectories.parquet", np.arange(FRAMES, dtype=np.int64) * 50))
+    recorded = list(traffic_frames.read(run / "trajectories.parquet", np.arange(FRAMES, dtype=np.int64) * 50))
     measured = []
     for what, some in (("all its vehicles", len), (f"the nearest {NEAREST}", lambda _: NEAREST)):
         took, on = [], []

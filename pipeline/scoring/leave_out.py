@@ -80,7 +80,7 @@ class LeaveOut:
         only, which tells nothing."""
         periods = [its for its in read_periods(path) if period in (None, its.name)]
         cells = np.flatnonzero(tpog.counts)
-        groups = tuple(_groups(its) for its in periods)
+        groups = tuple(groups_of(its) for its in periods)
         if any(len(its.frames) < 2 for its in groups):
             return None
         counts = _grouped(path, cells, tpog.grid, groups, period)
@@ -152,7 +152,8 @@ def group_sizes(blocks: int, block_frames: int = 1, memory: float = 0.0) -> list
     return [len(part) for part in np.array_split(np.arange(blocks), groups)]
 
 
-def _groups(period: PeriodBlocks) -> Groups:
+def groups_of(period: PeriodBlocks) -> Groups:
+    """The groups that the blocks of one record are joined to."""
     sizes = group_sizes(period.blocks, period.block_frames, period.memory_frames)
     return Groups(period.block_frames * np.array(sizes, dtype=np.int64), period.memory_frames)
 

@@ -20,10 +20,13 @@ Where KITTI has a name for it, it is KITTI's.
 
 from __future__ import annotations
 
-from pipeline.validation.frames import CARS, TrafficFrame
+from pipeline.artefacts.traffic_frames import TrafficFrame
 
 CLASSES = ("Car", "Van", "Truck", "Trailer", "Bus", "Tram", "Motorcycle", "Cyclist", "Pedestrian", "Misc")
 """All of them, in the order of listings."""
+
+CARS = frozenset({"passenger", "taxi", "evehicle", "hov", "private", "vip", "authority"})
+"""SUMO vClasses that are cars."""
 
 _OF = dict.fromkeys(CARS, "Car") | {
     "delivery": "Van",

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from pipeline.artefacts import tables
+from pipeline.artefacts.traffic_frames import TrafficFrame
 from pipeline.core.findings import Finding
 from pipeline.core.grid import Roi
-from pipeline.validation.frames import TrafficFrame
 from pipeline.validation.metrics.average_precision import IOUS, SUBSETS, Subset, evaluate
 from pipeline.validation.metrics.leave_out import BLOCKS, Estimate, blocks_of
 from pipeline.validation.metrics.matching import Objects, Record

@@ -15,12 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.artefacts.traffic_frames import TrafficFrame
 from pipeline.core import files
 from pipeline.formats import kitti
 from pipeline.validation import classes
 from pipeline.validation.exports.level_frame import LevelFrame
 from pipeline.validation.exports.sites import frame_name
-from pipeline.validation.frames import TrafficFrame
 from pipeline.validation.site_findings import Found, FoundBoxes
 from pipeline.validation.unseen_record import UnseenRecord
 

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.artefacts import schemas, tables
+from pipeline.artefacts.traffic_frames import BOX
 from pipeline.core import files
-from pipeline.validation.frames import BOX
 from pipeline.validation.sweeps import Detections
 
 POINTS = "points"
@@ -29,7 +29,8 @@ class FoundPoints:
     Attributes
     ----------
     points
-        One array a frame, (vehicles,) int64, in the order of :meth:`pipeline.validation.frames.TrafficFrame.wanted`.
+        One array a frame, (vehicles,) int64, in the order of
+        :meth:`pipeline.artefacts.traffic_frames.TrafficFrame.wanted`.
     """
 
     points: tuple[NDArray[np.int64], ...]

@@ -78,8 +78,8 @@ class Detections:
     Attributes
     ----------
     boxes
-        (m, 7) float64, as :data:`pipeline.validation.frames.BOX`: centre in the world frame, length, width, height,
-        heading.
+        (m, 7) float64, as :data:`pipeline.artefacts.traffic_frames.BOX`: centre in the world frame, length, width,
+        height, heading.
     scores
         (m,) float64; a higher one is a surer detection.
     """

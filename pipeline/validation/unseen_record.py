@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.artefacts import tables
+from pipeline.artefacts.traffic_frames import TrafficFrame, read
 from pipeline.core.progress import Progress, silent
 from pipeline.runs.workflow import bring
 from pipeline.scenario.models import Scenario
@@ -20,7 +21,6 @@ from pipeline.sensing.scene import Scene
 from pipeline.stages.base import Workspace
 from pipeline.stages.shared.scene import scene_of
 from pipeline.validation import unseen_traffic
-from pipeline.validation.frames import TrafficFrame, read
 
 _STAGES = ("statics", "traffic")
 

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.artefacts import schemas, tables
+from pipeline.artefacts.traffic_frames import TrafficFrame
 from pipeline.core import files
 from pipeline.core.errors import InputError
 from pipeline.core.findings import WARNINGS, Finding, seen_from, warnings_of
@@ -35,7 +36,6 @@ from pipeline.validation.agreement import BOXED, COUNTED, Agreement, ScoreName, 
 from pipeline.validation.detection import ALL, SiteDetection
 from pipeline.validation.detectors import kitti_results, registry
 from pipeline.validation.detectors.base import Detector
-from pipeline.validation.frames import TrafficFrame
 from pipeline.validation.looking import Look, LookListener, look_from
 from pipeline.validation.metrics.matching import within
 from pipeline.validation.site_findings import POINTS, FoundBoxes

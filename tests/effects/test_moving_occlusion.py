@@ -481,15 +481,6 @@ def test_threads_change_no_byte(ran: tuple[Path, Path], switch: str) -> None:
 # Which frames
 
 
-def test_frames_are_spread_evenly() -> None:
-    assert effect.replayed(10, 5).tolist() == [1, 3, 5, 7, 9]
-    assert effect.replayed(10, 1).tolist() == [5]
-    assert effect.replayed(7, 3).tolist() == [1, 3, 5]
-    assert effect.replayed(5000, 500)[[0, -1]].tolist() == [5, 4995]
-    for wanted in (0, 7, 8):
-        assert effect.replayed(7, wanted).tolist() == list(range(7))
-
-
 def test_a_subset_is_the_same_each_time_and_too_many_are_all(ran: tuple[Path, Path]) -> None:
     folder, out = ran
     few = scores(folder, out, "effects.moving_occlusion.frames=9")

@@ -3,8 +3,8 @@
 import tomllib
 
 from pipeline.validation import classes
+from pipeline.validation.classes import CARS
 from pipeline.validation.clouds import bodies
-from pipeline.validation.frames import CARS
 
 
 def test_every_kind_has_a_class():

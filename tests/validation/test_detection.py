@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from pipeline.artefacts import tables
+from pipeline.artefacts.traffic_frames import TrafficFrame
 from pipeline.core.grid import Roi
 from pipeline.validation import detection
-from pipeline.validation.frames import TrafficFrame
 from pipeline.validation.site_findings import POINTS, FoundBoxes, FoundPoints
 from pipeline.validation.sweeps import Detections
 

@@ -48,6 +48,7 @@ from pydantic import BeforeValidator, Field
 from pipeline.artefacts import tables
 from pipeline.artefacts.readers import Tpog
 from pipeline.artefacts.recorded_boxes import FrameBoxes, read_boxes
+from pipeline.artefacts.traffic_frames import spread
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Grid
 from pipeline.effects.base import TransmitScore
@@ -210,17 +211,9 @@ class MovingOcclusion(TransmitScore[MovingOcclusionParameters]):
         return self.ready.falls(ends_m) if isinstance(self.ready, FacingBoxes) else None
 
 
-def replayed(recorded: int, wanted: int) -> NDArray[np.int64]:
-    """Which of the frames 0 .. recorded - 1 are replayed: the middles of ``wanted`` equal parts; all when 0 or more are
-    wanted."""
-    if wanted == 0 or wanted >= recorded:
-        return np.arange(recorded, dtype=np.int64)
-    return (2 * np.arange(wanted, dtype=np.int64) + 1) * recorded // (2 * wanted)
-
-
 def read_replay(path: Path, grid: Grid, wanted: int) -> Replay:
     """Boxes of the replayed frames in the grid's frame; InputError for a file that is corrupt or out of order."""
-    chosen = replayed(int(tables.read_metadata(path, "trajectories")["frames"]), wanted)
+    chosen = spread(int(tables.read_metadata(path, "trajectories")["frames"]), wanted)
     parts = [FrameBoxes(np.empty(0, dtype=np.int64), np.empty((0, 8))), *read_boxes(path, grid, chosen)]
     frame, values = (np.concatenate([getattr(part, name) for part in parts]) for name in ("frame", "values"))
     return Replay.of(len(chosen), frame, values)

@@ -27,11 +27,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.artefacts.traffic_frames import TrafficFrame
 from pipeline.core import files
 from pipeline.core.errors import InputError
 from pipeline.scenario.models import Scenario
 from pipeline.validation.clouds.surfaces import REFLECTIVITY
-from pipeline.validation.frames import TrafficFrame
 
 FILE = Path(__file__).with_name("bodies.toml")
 MOST_TRIANGLES = 5000

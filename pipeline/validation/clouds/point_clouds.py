@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.artefacts.traffic_frames import TrafficFrame
 from pipeline.core.errors import InputError
 from pipeline.effects.base import Detect
 from pipeline.kernels import bodies as kernels
@@ -30,7 +31,6 @@ from pipeline.sensing.sensors import Sensor
 from pipeline.sensing.sites import Pose, Site
 from pipeline.validation.clouds import bodies, surfaces
 from pipeline.validation.clouds.bodies import Bodies
-from pipeline.validation.frames import TrafficFrame
 from pipeline.validation.sweeps import LabelledSweep, SiteView, Sweep
 from pipeline.world.casting import EmptyScan
 

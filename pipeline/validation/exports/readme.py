@@ -8,13 +8,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pipeline.artefacts.traffic_frames import NO_VEHICLES
 from pipeline.core.version import __version__
 from pipeline.effects import on_traffic
 from pipeline.validation.classes import CLASSES
 from pipeline.validation.exports import openpcdet
 from pipeline.validation.exports.layouts import LAYOUTS, Layout
 from pipeline.validation.exports.sites import TRAINING, SiteSummary
-from pipeline.validation.frames import NO_VEHICLES
 from pipeline.validation.unseen_record import UnseenRecord
 
 _IDLE = "moving_occlusion"

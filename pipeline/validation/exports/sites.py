@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.artefacts.traffic_frames import TrafficFrame
 from pipeline.core import files
 from pipeline.core.parallel import in_order
 from pipeline.core.progress import Progress
@@ -25,7 +26,6 @@ from pipeline.validation import classes
 from pipeline.validation.clouds.point_clouds import CloudMaker, random_of
 from pipeline.validation.exports.layouts import Layout
 from pipeline.validation.exports.level_frame import LevelFrame, corners
-from pipeline.validation.frames import TrafficFrame
 from pipeline.validation.unseen_record import UnseenRecord
 
 TRAINING = 0.8

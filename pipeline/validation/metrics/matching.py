@@ -26,10 +26,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.artefacts.traffic_frames import BOX, TrafficFrame
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Roi
 from pipeline.kernels import matching as kernel
-from pipeline.validation.frames import BOX, CARS, TrafficFrame
+from pipeline.validation.classes import CARS
 from pipeline.validation.metrics.overlap import VIEWS, View
 from pipeline.validation.sweeps import Detections
 
@@ -41,7 +42,7 @@ class Objects:
     Attributes
     ----------
     boxes
-        (n, 7) float64, as :data:`pipeline.validation.frames.BOX`.
+        (n, 7) float64, as :data:`pipeline.artefacts.traffic_frames.BOX`.
     is_car
         (n,) bool.
     points

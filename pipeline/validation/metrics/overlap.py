@@ -27,7 +27,7 @@ def overlap_each(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.f
     Parameters
     ----------
     a, b
-        (n, 7) float64, as :data:`pipeline.validation.frames.BOX`.
+        (n, 7) float64, as :data:`pipeline.artefacts.traffic_frames.BOX`.
 
     Returns
     -------

@@ -15,7 +15,7 @@ import itertools
 import math
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
@@ -32,11 +32,11 @@ from pipeline.core.findings import Finding
 from pipeline.core.parallel import in_order
 from pipeline.core.progress import Progress, silent
 from pipeline.effects import registry as effects
-from pipeline.effects.base import Detect
-from pipeline.effects.score.moving_occlusion import replayed
 from pipeline.runs.workflow import bring
 from pipeline.scenario.effects import MovingOcclusionParameters
 from pipeline.scenario.models import Scenario
+from pipeline.scoring.targets.record import TargetRecord
+from pipeline.scoring.targets.seen import noticed_in, see
 from pipeline.scoring.thinning import Hits
 from pipeline.scoring.visibility import Beams, Visibility
 from pipeline.sensing.scene import Scene
@@ -44,12 +44,9 @@ from pipeline.stages.base import Workspace
 from pipeline.stages.shared.scans import SiteBeams, scans
 from pipeline.stages.shared.scene import SCANS, scene_of
 from pipeline.studies.measuring import inputs_of
-from pipeline.validation import frames
-from pipeline.validation.frames import TrafficFrame
 from pipeline.validation.surrogates import registry
 from pipeline.validation.surrogates.base import GAMMA, OCCLUSION, VOXEL, Score, Value
-from pipeline.validation.surrogates.evidence import Floats, Occupancy, SiteEvidence, VehiclePoints
-from pipeline.validation.surrogates.vehicles import FRAMES, points_on_vehicles
+from pipeline.validation.surrogates.evidence import Occupancy, SiteEvidence, VehiclePoints, everything
 
 ARTEFACT = "surrogates.parquet"
 _TRAJECTORIES = "trajectories.parquet"
@@ -237,7 +234,7 @@ class _Ready:
         bring(self._work, "statics", "scan", "traffic")
         self.scene = scene_of(self._work)
         self._points: dict[str, VehiclePoints] = {}
-        self._frames: list[TrafficFrame] | None = None
+        self._record: TargetRecord | None = None
 
     def scored(
         self, voxel_m: float, occlusion: bool, tasks: list[tuple[int, _Task]]
@@ -248,23 +245,26 @@ class _Ready:
         tpog, scene = read_tpog(work.path("tpog.parquet")), _with_occlusion(self.scene, occlusion)
         occupancy, visibility = Occupancy(tpog), Visibility(scene, tpog, work.path(_TRAJECTORIES))
         _ = occupancy.field.total_bit, occupancy.p, occupancy.log_free, occupancy.lowest  # before there are threads
-        if self._frames is None and any("vehicles" in task.score.needs for _, task in tasks):
-            self._frames = _frames_of(work.path(_TRAJECTORIES))
+        if self._record is None and any("vehicles" in task.score.needs for _, task in tasks):
+            self._record = TargetRecord.read(work.path(_TRAJECTORIES), tpog.grid)
 
         def rows(given: tuple[SiteBeams, NDArray[np.bool_]]) -> list[tuple[int, SurrogateRow]]:
             scan, returned = given
-            noticed = _noticed(scene, scan.beams)
+            noticed = noticed_in(scene, scan.beams.sensor)
 
             def count(beams: Beams) -> tuple[Hits, int]:
                 return visibility.borrowed_hits(beams).copy(), visibility.unit
 
             def look(beams: Beams) -> VehiclePoints:
                 if scan.site.name not in self._points:
-                    seen = self._frames if self._frames is not None else _frames_of(work.path(_TRAJECTORIES))
-                    self._points[scan.site.name] = points_on_vehicles(seen, tpog.grid, beams, noticed)
+                    record = self._record
+                    if record is None:
+                        record = TargetRecord.read(work.path(_TRAJECTORIES), tpog.grid)
+                    seen = see(record, beams, noticed)
+                    self._points[scan.site.name] = VehiclePoints(seen.points, seen.points_alone)
                 return self._points[scan.site.name]
 
-            evidence = SiteEvidence(occupancy, scan.beams, returned, count, look, noticed)
+            evidence = SiteEvidence(occupancy, scan.beams, returned, count, look, noticed or everything)
             return _rows(scan.site.name, evidence, tasks)
 
         yield from in_order(rows, zip(scans(work), _returned(work), strict=True), work.threads)
@@ -280,24 +280,6 @@ def _with_occlusion(scene: Scene, wanted: bool) -> Scene:
     mixed = bool(scene.scenario.traffic.periods)  # a replay would take all periods alike
     parameters = MovingOcclusionParameters(method="independent") if mixed else MovingOcclusionParameters()
     return replace(scene, effects=(*others, effects.make("moving_occlusion", parameters)))
-
-
-def _noticed(scene: Scene, beams: Beams) -> Callable[[Floats], Floats]:
-    """The chance that a return is noticed, by range: what all effects together detect."""
-
-    def noticed(range_m: Floats) -> Floats:
-        chance = np.ones(len(range_m))
-        for effect in scene.acting(Detect, "score"):
-            chance = chance * effect.detect(range_m, beams.sensor)
-        return chance
-
-    return noticed
-
-
-def _frames_of(path: Path) -> list[TrafficFrame]:
-    """Frames of the traffic that the TPOG was counted from, evenly spaced."""
-    recorded = int(tables.read_metadata(path, "trajectories")["frames"])
-    return list(frames.read(path, replayed(recorded, FRAMES)))
 
 
 def _returned(work: Workspace) -> Iterator[NDArray[np.bool_]]:

@@ -4,7 +4,7 @@ The road is where traffic is: columns of voxels that are ever occupied. A return
 the lowest layer that is ever occupied in its column (what hangs above does not count).
 
 Points on vehicles are those of boxes replayed from the traffic that the TPOG was counted from
-(:mod:`pipeline.validation.surrogates.vehicles`). Without any vehicle their means are not a number.
+(:mod:`pipeline.scoring.targets.seen`). Without any vehicle their means are not a number.
 """
 
 from __future__ import annotations

@@ -16,12 +16,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.artefacts.traffic_frames import NO_VEHICLES, TrafficFrame
 from pipeline.sensing.scanner import Scanner
 from pipeline.validation.clouds.point_clouds import CloudMaker
 from pipeline.validation.detectors.pointpillars import encoding
 from pipeline.validation.detectors.pointpillars.decoding import OUT_M, STRIDE, encode
 from pipeline.validation.detectors.pointpillars.encoding import Convention, HeightZero, Pillars, SeenPoints, Window
-from pipeline.validation.frames import NO_VEHICLES, TrafficFrame
 from pipeline.validation.training.poses import PoseRule
 from pipeline.validation.unseen_record import UnseenRecord
 

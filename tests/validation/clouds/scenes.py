@@ -7,11 +7,11 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 import pipeline
+from pipeline.artefacts.traffic_frames import TrafficFrame
 from pipeline.scenario.sensors import SensorModel
 from pipeline.sensing import sensors
 from pipeline.sensing.scene import Scene
 from pipeline.validation.clouds import bodies
-from pipeline.validation.frames import TrafficFrame
 from pipeline.world.mesh import World
 from tests.oracles import cast
 

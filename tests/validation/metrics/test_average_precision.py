@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from pipeline.artefacts.traffic_frames import TrafficFrame
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Roi
-from pipeline.validation.frames import TrafficFrame
 from pipeline.validation.metrics.average_precision import evaluate
 from pipeline.validation.metrics.leave_out import Estimate, blocks_of
 from pipeline.validation.metrics.matching import Objects, Record, within

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 import pipeline
-from pipeline.artefacts import tables
+from pipeline.artefacts import tables, traffic_frames
 from pipeline.core.errors import InputError, MissingBackendError, RunError
 from pipeline.scoring.visibility import Beams
 from pipeline.sensing.scanner import Scanner
-from pipeline.validation import frames
 from pipeline.validation.surrogates import registry
 from pipeline.validation.surrogates.gathering import surrogates_of
 from pipeline.validation.surrogates.vehicles import points_on_vehicles
@@ -69,7 +68,7 @@ def test_egvs_is_what_a_run_scores_to_the_last_bit(made, tmp_path, settings, par
 
 def test_points_are_those_of_the_record_that_the_tpog_was_counted_from(made):
     scenario, work, found = made
-    record = list(frames.read(work / "trajectories.parquet", np.arange(40)))  # all of them: fewer than 250
+    record = list(traffic_frames.read(work / "trajectories.parquet", np.arange(40)))  # all of them: fewer than 250
     scene = pipeline.build_scene(scenario)
     for one in scene.sites:
         beams = Beams.of(Scanner(scene).scan_site(one))

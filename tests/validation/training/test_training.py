@@ -12,13 +12,13 @@ import onnx
 import torch
 
 from pipeline import load
+from pipeline.artefacts.traffic_frames import TrafficFrame
 from pipeline.core.errors import InputError
 from pipeline.sensing.sensors import CATALOGUE
 from pipeline.sensing.sites import Pose
 from pipeline.validation.detectors.pointpillars import decoding
 from pipeline.validation.detectors.pointpillars.detector import ABOUT, Model, PointPillars
 from pipeline.validation.detectors.pointpillars.encoding import FEATURES, POINTS, HeightZero, Pillars, Window
-from pipeline.validation.frames import TrafficFrame
 from pipeline.validation.sweeps import SiteView
 from pipeline.validation.training import export, samples
 from pipeline.validation.training.loss import Batch, loss

@@ -58,8 +58,8 @@ class Completed:
     Attributes
     ----------
     boxes
-        (m, 7) float64, as :data:`pipeline.validation.frames.BOX`; from the sensor along the world's axes, z from the
-        ground.
+        (m, 7) float64, as :data:`pipeline.artefacts.traffic_frames.BOX`; from the sensor along the world's axes,
+        z from the ground.
     kind
         Row of the table, (m,) int64.
     cost

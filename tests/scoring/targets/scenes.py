@@ -1,0 +1,134 @@
+"""Scenes for tests of what is seen of vehicles, and a slow twin: every beam against every box, in float64.
+
+The twin shares no code with the kernel: it cuts a beam with the six planes of a box's faces, and asks of each point
+whether it lies on the face."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.artefacts.traffic_frames import TrafficFrame
+from pipeline.core.grid import Grid
+from pipeline.scoring.targets.record import TargetRecord
+from pipeline.scoring.targets.seen import SeenTargets, see
+from pipeline.scoring.visibility import Beams
+from pipeline.sensing import sensors
+from pipeline.sensing.sites import Pose
+
+GRID = Grid((100.0, 200.0, 0.0), 1.0, (40, 20, 5))
+SENSOR = sensors.CATALOGUE["VLP-16"]
+SHRINK_M = 1e-4 + 1e-9
+
+Noticed = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+
+
+def frame(boxes, kinds=None, pitch=None, number=0, vehicles=None, part=None) -> TrafficFrame:
+    """Boxes as ``traffic_frames.BOX``."""
+    boxes = np.array(boxes, dtype=np.float64).reshape(-1, 7)
+    kinds = ("passenger",) * len(boxes) if kinds is None else kinds
+    pitch = np.zeros(len(boxes)) if pitch is None else np.array(pitch)
+    vehicles = tuple(f"v{i}" for i in range(len(boxes))) if vehicles is None else vehicles
+    more = () if part is None else (np.array(part),)
+    return TrafficFrame(number, tuple(vehicles), tuple(kinds), boxes, pitch, *more)
+
+
+def beams_to(at, ends, weight=None) -> Beams:
+    """An empty scan from (x, y, z) whose beams end at ``ends``, seen from there."""
+    given = None if weight is None else np.array(weight, dtype=np.float64)
+    return Beams(Pose(*at), SENSOR, np.array(ends, dtype=np.float64).reshape(-1, 3), given)
+
+
+def seen(frames: Sequence[TrafficFrame], beams: Beams, noticed: Noticed | None = None) -> SeenTargets:
+    """What is seen in the grid of these tests."""
+    return see(TargetRecord.of(frames, GRID), beams, noticed)
+
+
+def axes_of(yaw: float, pitch: float) -> NDArray[np.float64]:
+    """Forward, left and up of a box, one a row: a turn about y that lifts the nose, then one about z."""
+    turn = np.array([[math.cos(yaw), -math.sin(yaw), 0.0], [math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
+    lift = np.array(
+        [[math.cos(pitch), 0.0, -math.sin(pitch)], [0.0, 1.0, 0.0], [math.sin(pitch), 0.0, math.cos(pitch)]]
+    )
+    return (turn @ lift).T
+
+
+def entered_m(box, pitch, origin, direction) -> float:
+    """Where a ray meets the first of the six faces of a box 0.1 mm smaller on each side; infinity where it does not."""
+    axes, half = axes_of(box[6], pitch), np.array(box[3:6]) / 2 - SHRINK_M
+    o, d, nearest = axes @ (np.array(origin) - np.array(box[:3])), axes @ np.array(direction), math.inf
+    for axis in range(3):
+        others = [a for a in range(3) if a != axis]
+        for side in (-1.0, 1.0):
+            if d[axis] == 0.0:
+                continue
+            t = (side * half[axis] - o[axis]) / d[axis]
+            at = o + t * d
+            if t >= 0.0 and (np.abs(at[others]) < half[others]).all():
+                nearest = min(nearest, t)
+    return nearest
+
+
+def holds(box, pitch, origin) -> bool:
+    """Whether a box holds a point."""
+    return bool((np.abs(axes_of(box[6], pitch) @ (np.array(origin) - np.array(box[:3]))) < np.array(box[3:6]) / 2).all())
+
+
+def seen_slowly(frames: Sequence[TrafficFrame], beams: Beams, noticed: Noticed | None = None) -> dict[str, list[float]]:
+    """Columns of ``SeenTargets``, beam by beam and box by box."""
+    found: dict[str, list[float]] = {
+        name: [] for name in ("points", "points_alone", "length_share", "width_share", "range_m")
+    }
+    for one in frames:
+        for row, column in _of_frame(one, beams, noticed or (lambda r: np.ones(len(r)))).items():
+            if row in one.wanted(GRID.roi).tolist():
+                for name, value in column.items():
+                    found[name].append(value)
+    return found
+
+
+def _of_frame(one: TrafficFrame, beams: Beams, noticed: Noticed) -> dict[int, dict[str, float]]:
+    origin = np.array(beams.pose.position_m)
+    boxes = [
+        (row, box, pitch)
+        for row, (box, pitch) in enumerate(zip(one.boxes, one.pitch_rad, strict=True))
+        if not holds(box, pitch, origin)
+    ]
+    hits: dict[int, list[tuple[float, float, float]]] = {row: [] for row in range(len(one.boxes))}
+    alone = dict.fromkeys(hits, 0.0)
+    for number, end in enumerate(beams.ends_m):
+        length = float(np.linalg.norm(end))
+        weight = 1.0 if beams.weight is None else float(beams.weight[number])
+        met = {row: entered_m(box, pitch, origin, end / length) for row, box, pitch in boxes}
+        for row, t in met.items():
+            alone[row] += weight if t < length else 0.0
+        first = min(met, key=lambda row: met[row], default=None)
+        if first is not None and met[first] < length:
+            worth = weight * float(noticed(np.array([met[first]]))[0])
+            at = origin + end / length * met[first] - one.boxes[first, :3]
+            u, v, _ = axes_of(one.boxes[first, 6], one.pitch_rad[first]) @ at
+            hits[first].append((worth, float(u), float(v)))
+    found = {}
+    for row, its in hits.items():
+        range_m = float(np.linalg.norm(one.boxes[row, :3] - origin))
+        kept = np.array([hit[1:] for hit in its if hit[0] > 0.0]).reshape(-1, 2)
+        span = np.ptp(kept, axis=0) / one.boxes[row, 3:5] if len(kept) else (0.0, 0.0)
+        found[row] = {
+            "points": sum(hit[0] for hit in its),
+            "points_alone": alone[row] * float(noticed(np.array([range_m]))[0]),
+            "length_share": float(span[0]),
+            "width_share": float(span[1]),
+            "range_m": range_m,
+        }
+    return found
+
+
+def random_boxes(rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+    """Boxes in and round the region, the largest as large as a bus, as ``traffic_frames.BOX``."""
+    return np.column_stack([
+        100 + rng.uniform(-4, 44, count), 200 + rng.uniform(-4, 24, count), rng.uniform(0.5, 2, count),
+        rng.uniform(2, 12, count), rng.uniform(1, 3, count), rng.uniform(1, 4, count), rng.uniform(-7, 7, count),
+    ])  # fmt: skip
