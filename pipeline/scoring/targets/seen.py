@@ -3,7 +3,8 @@
 The boxes of a frame are laid into the empty scan; a beam ends on the first box that it enters (made 0.1 mm smaller on
 each side, as everywhere). Boxes are plain boxes here, as for the TPOG.
 
-Limits: beams that cannot meet the region of interest were not cast, so what of a vehicle reaches out of it has none.
+Limits: beams that cannot meet the region of interest were not cast, so what of a vehicle reaches out of it has none, or
+few; and what stands wholly beyond the region hides none of those. (At ingolstadt it would change 6 of 24,888 counts.)
 Where effects lose returns, the points of a vehicle alone are thinned by the chance at its centre's range.
 """
 

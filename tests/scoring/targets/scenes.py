@@ -74,7 +74,20 @@ def entered_m(box, pitch, origin, direction) -> float:
 
 def holds(box, pitch, origin) -> bool:
     """Whether a box holds a point."""
-    return bool((np.abs(axes_of(box[6], pitch) @ (np.array(origin) - np.array(box[:3]))) < np.array(box[3:6]) / 2).all())
+    return bool(
+        (np.abs(axes_of(box[6], pitch) @ (np.array(origin) - np.array(box[:3]))) < np.array(box[3:6]) / 2).all()
+    )
+
+
+def is_beyond(box, pitch, origin) -> bool:
+    """Whether no part of a box lies in the upright block round the region and the sensor."""
+    corners = np.array(box[:3]) + np.array(np.meshgrid(*[(-0.5, 0.5)] * 3)).reshape(3, -1).T * box[3:6] @ axes_of(
+        box[6], pitch
+    )
+    low, high = np.array(GRID.roi.origin_m), np.array(GRID.roi.origin_m) + np.array(GRID.roi.size_m)
+    return bool(
+        (corners.min(axis=0) > np.maximum(high, origin)).any() or (corners.max(axis=0) < np.minimum(low, origin)).any()
+    )
 
 
 def seen_slowly(frames: Sequence[TrafficFrame], beams: Beams, noticed: Noticed | None = None) -> dict[str, list[float]]:
@@ -95,7 +108,7 @@ def _of_frame(one: TrafficFrame, beams: Beams, noticed: Noticed) -> dict[int, di
     boxes = [
         (row, box, pitch)
         for row, (box, pitch) in enumerate(zip(one.boxes, one.pitch_rad, strict=True))
-        if not holds(box, pitch, origin)
+        if not holds(box, pitch, origin) and not is_beyond(box, pitch, origin)
     ]
     hits: dict[int, list[tuple[float, float, float]]] = {row: [] for row in range(len(one.boxes))}
     alone = dict.fromkeys(hits, 0.0)

@@ -10,13 +10,15 @@ import numpy as np
 import pytest
 
 import pipeline
-from pipeline.artefacts import tables, traffic_frames
+from pipeline.artefacts import tables
 from pipeline.core.errors import InputError, MissingBackendError, RunError
+from pipeline.scoring.targets.record import TargetRecord
+from pipeline.scoring.targets.scores import points_on_target
+from pipeline.scoring.targets.seen import see
 from pipeline.scoring.visibility import Beams
 from pipeline.sensing.scanner import Scanner
 from pipeline.validation.surrogates import registry
 from pipeline.validation.surrogates.gathering import surrogates_of
-from pipeline.validation.surrogates.vehicles import points_on_vehicles
 from tests.conftest import write_mini
 from tests.core.test_plugins import install, site  # noqa: F401  the fixture
 from tests.docs.test_extending import package
@@ -68,13 +70,15 @@ def test_egvs_is_what_a_run_scores_to_the_last_bit(made, tmp_path, settings, par
 
 def test_points_are_those_of_the_record_that_the_tpog_was_counted_from(made):
     scenario, work, found = made
-    record = list(traffic_frames.read(work / "trajectories.parquet", np.arange(40)))  # all of them: fewer than 250
+    record = TargetRecord.read(work / "trajectories.parquet", scenario.roi.grid)
+    assert len(record.numbers) == 40  # all of them: fewer than 250
     scene = pipeline.build_scene(scenario)
     for one in scene.sites:
         beams = Beams.of(Scanner(scene).scan_site(one))
-        points = points_on_vehicles(record, scenario.roi.grid, beams)
-        mean = float(np.log1p(points.seen).mean())
-        assert points.seen.sum() > 0 and values(found, "points_on_target")[one.name] == pytest.approx(mean)
+        seen = see(record, beams)
+        mean = float(np.log1p(seen.points).mean())
+        assert seen.points.sum() > 0 and values(found, "points_on_target")[one.name] == pytest.approx(mean)
+        assert values(found, "points_on_target")[one.name] == points_on_target(seen)
 
 
 def test_the_file_has_the_same_bytes_at_any_number_of_threads(made, tmp_path):
