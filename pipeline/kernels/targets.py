@@ -31,19 +31,21 @@ _TINY = 1e-300
 
 
 @_kernel
-def _runs(span, azimuth, start, runs):  # type: ignore[no-untyped-def]
-    """Fill which rows of ascending azimuths in [-pi, pi], ``start`` being the first row's number, lie in a span, which
-    may leave that interval: first and one past the last on each turn of the circle, (3, 2) int64."""
-    runs[:] = start
+def _add_runs(span, azimuth, start, runs, count):  # type: ignore[no-untyped-def]
+    """Put to ``runs`` (m, 2), from ``count`` on, which rows of ascending azimuths in [-pi, pi] lie in a span, which may
+    leave that interval: first and one past the last, where ``start`` is the first row's number; a run for each turn of
+    the circle. Returns how many there are then."""
     low, high = span[0] - _MARGIN_RAD, span[1] + _MARGIN_RAD
     if high - low >= 2.0 * math.pi:
-        runs[1, 1] = start + azimuth.shape[0]
-        return
+        runs[count, 0], runs[count, 1] = start, start + azimuth.shape[0]
+        return count + 1
     for turn in range(-1, 2):
         first, last = low + turn * 2.0 * math.pi, high + turn * 2.0 * math.pi
         if first <= math.pi and last >= -math.pi:
-            runs[turn + 1, 0] = start + np.searchsorted(azimuth, first)
-            runs[turn + 1, 1] = start + np.searchsorted(azimuth, last)
+            runs[count, 0] = start + np.searchsorted(azimuth, first)
+            runs[count, 1] = start + np.searchsorted(azimuth, last)
+            count += runs[count, 0] < runs[count, 1]
+    return count
 
 
 @_kernel
@@ -97,8 +99,6 @@ def _meet(k, box, beams, runs, owner, range_m, t_m):  # type: ignore[no-untyped-
     worth = 0.0
     for run in range(runs.shape[0]):
         first, last = runs[run]
-        if first == last:
-            continue
         _enter(box, d, first, last, t_m)
         for i in range(last - first):
             n = first + i
@@ -113,16 +113,17 @@ def _meet(k, box, beams, runs, owner, range_m, t_m):  # type: ignore[no-untyped-
 def _add(k, box, beams, runs, owner, range_m, low, high):  # type: ignore[no-untyped-def]
     """What the beams are worth that end on box k; ``low`` and ``high`` (2,) are filled with the bounds of where they
     end, along and across the box, of beams that are worth something."""
-    x, y, z = beams[3][0], beams[3][1], beams[3][2]
-    weight, total = beams[5], 0.0
+    ax, ay, az, ao = box[0], box[1], box[2], box[3]
+    bx, by, bz, bo = box[5], box[6], box[7], box[8]
+    x, y, z, weight, total = beams[3][0], beams[3][1], beams[3][2], beams[5], 0.0
     a_low, a_high, b_low, b_high = np.inf, -np.inf, np.inf, -np.inf
     for run in range(runs.shape[0]):
         for n in range(runs[run, 0], runs[run, 1]):
             if owner[n] == k:
                 total += weight[n]
                 if weight[n] > 0.0:
-                    a = box[3] + range_m[n] * (box[0] * x[n] + box[1] * y[n] + box[2] * z[n])
-                    b = box[8] + range_m[n] * (box[5] * x[n] + box[6] * y[n] + box[7] * z[n])
+                    a = ao + range_m[n] * (ax * x[n] + ay * y[n] + az * z[n])
+                    b = bo + range_m[n] * (bx * x[n] + by * y[n] + bz * z[n])
                     a_low, a_high, b_low, b_high = min(a_low, a), max(a_high, a), min(b_low, b), max(b_high, b)
     low[0], high[0], low[1], high[1] = a_low, a_high, b_low, b_high
     return total
@@ -148,8 +149,9 @@ def _list(k, b, box, beams, runs, owner, range_m, hits, count):  # type: ignore[
 def _restore(runs, length_m, owner, range_m):  # type: ignore[no-untyped-def]
     """Take the boxes out of the way of beams again."""
     for run in range(runs.shape[0]):
-        for n in range(runs[run, 0], runs[run, 1]):
-            owner[n], range_m[n] = -1, length_m[n]
+        first, last = runs[run]
+        owner[first:last] = -1
+        range_m[first:last] = length_m[first:last]
 
 
 @_kernel
@@ -194,7 +196,7 @@ def first_met(begin, o, size_m, boxes, beams, owner, range_m, found, hits):  # t
         most = max(most, starts[f + 1] - starts[f])
     facing, block, span = np.empty((most, 15)), np.empty((most, 9)), np.empty((most, 2))
     box, away, t_m = np.empty(most, np.int64), np.empty(most), np.empty(azimuth.shape[0])
-    runs = np.empty((most, bands.shape[0] - 1, 3, 2), np.int64)
+    runs, filled = np.empty((most, 3 * bands.shape[0], 2), np.int64), np.zeros(most, np.int64)
     for f in range(begin, starts.shape[0] - 1):
         if room > 0 and count + azimuth.shape[0] > room:
             return f, count
@@ -207,20 +209,19 @@ def first_met(begin, o, size_m, boxes, beams, owner, range_m, found, hits):  # t
         kept = face(o, order, here[0], here[1], here[2], size_m, facing, block, span, box)
         for k in range(kept):
             lowest, highest = _slopes(block[k])
+            filled[k] = 0
             for i in range(bands.shape[0] - 1):
-                if slopes[i, 0] > highest or slopes[i, 1] < lowest:
-                    runs[k, i] = 0
-                else:
-                    _runs(span[k], azimuth[bands[i] : bands[i + 1]], bands[i], runs[k, i])
-            alone[first + box[k]] = _meet(k, facing[k], beams, runs[k].reshape(-1, 2), owner, range_m, t_m)
+                if slopes[i, 0] <= highest and slopes[i, 1] >= lowest:
+                    filled[k] = _add_runs(span[k], azimuth[bands[i] : bands[i + 1]], bands[i], runs[k], filled[k])
+            alone[first + box[k]] = _meet(k, facing[k], beams, runs[k, : filled[k]], owner, range_m, t_m)
         for k in range(kept):
-            b, its = first + box[k], runs[k].reshape(-1, 2)
+            b, its = first + box[k], runs[k, : filled[k]]
             if listed[b] and room > 0:
                 count = _list(k, b, facing[k], beams, its, owner, range_m, hits, count)
             elif listed[b]:
                 total[b] = _add(k, facing[k], beams, its, owner, range_m, at_low[b], at_high[b])
         for k in range(kept):
-            _restore(runs[k].reshape(-1, 2), beams[4], owner, range_m)
+            _restore(runs[k, : filled[k]], beams[4], owner, range_m)
     return starts.shape[0] - 1, count
 
 

@@ -112,7 +112,7 @@ def test_spans_are_of_points_that_may_come():
 
 
 def scene(seed: int, upright: bool):
-    """Two frames of boxes, a site among or beside them, its beams; each third time returns are lost, or beams shared."""
+    """Two frames of boxes, a site among or beside them, its beams; of a third returns are lost, of one beams shared."""
     rng = np.random.default_rng(seed)
     at = (100.0 + rng.uniform(-5, 45), 200.0 + rng.uniform(-5, 25), rng.uniform(0.5, 6))
     if upright:  # rings and columns
