@@ -95,11 +95,8 @@ def see(record: TargetRecord, beams: Beams, noticed: Callable[[Floats], Floats] 
     noticed
         The chance that a return from each range (n,) is noticed; 1 where it is None.
     """
-    sensor_m, row, values = (
-        record.grid.to_grid_m(np.asarray(beams.pose.position_m)),
-        record.row,
-        record.all_boxes.values,
-    )
+    sensor_m = record.grid.to_grid_m(np.asarray(beams.pose.position_m))
+    row, values = record.row, record.all_boxes.values
     alone, total, low, high = _counted(record, sensor_m, beams, noticed)
     range_m = np.sqrt(((values[row, :3] - sensor_m) ** 2).sum(axis=1))
     seen = high[row] >= low[row]
@@ -122,7 +119,8 @@ def _in_bands(beams: Beams, bands: int) -> tuple[NDArray[Any], ...]:
     starts = np.flatnonzero(np.diff(band[rows], prepend=-1))
     slopes = np.column_stack([np.minimum.reduceat(slope[rows], starts), np.maximum.reduceat(slope[rows], starts)])
     weight = np.ones(len(rows)) if beams.weight is None else beams.weight[rows]
-    return np.append(starts, len(rows)), slopes, azimuth[rows], np.take(d, rows, axis=1), length_m[rows], weight
+    d = np.take(d, rows, axis=1)  # each axis in one piece, as d[:, rows] is not: the kernel's loops need that
+    return np.append(starts, len(rows)), slopes, azimuth[rows], d, length_m[rows], weight
 
 
 def _counted(
