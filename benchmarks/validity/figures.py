@@ -1,4 +1,6 @@
-"""Pictures of the study, drawn from its tables: rho by gamma, detection by height, all scores. Readable in grey."""
+"""Pictures of the study, drawn from its tables: rho by gamma, detection by height, all scores. Readable in grey.
+
+Each shows the first measure of each detector, the one by which things are chosen; tables have them all."""
 
 from __future__ import annotations
 
@@ -7,21 +9,27 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.validity.agreement import WORDS
+from benchmarks.validity.record import measures_of
 from benchmarks.validity.tables import Table
 from pipeline.core import files
+from pipeline.validation.site_findings import POINTS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _DARK, _MID, _LIGHT = "#0072B2", "#D55E00", "#777777"
+_ABREAST = 3
 _STYLES = {"0.25": (_DARK, "o"), "0.5": (_MID, "s"), "1": (_LIGHT, "^")}
 
 
 def draw(folder: Path, tables: Sequence[Table]) -> list[Path]:
     """Write the figures as PNG; those whose tables are there."""
     of = {table.name: table for table in tables}
-    by_setting = [table for name, table in of.items() if name.startswith("A ") and not name.startswith("A sites")]
-    ranked = [table for name, table in of.items() if name.startswith("D ")]
+    first = {measures_of(POINTS)[0], measures_of("")[0]}
+    by_setting = [
+        of[name] for name in of if name.startswith("A ") and name.split()[-1] in first and len(name.split()) == 3
+    ]
+    ranked = [of[name] for name in of if name.startswith("D ") and name.split()[-1] in first]
     made = {
         "validity-gamma.png": gamma(by_setting) if by_setting else None,
         "validity-heights.png": heights(of["C heights"]) if of["C heights"].rows else None,
@@ -44,10 +52,16 @@ def gamma(tables: Sequence[Table]) -> Figure:
         for row, role in enumerate(roles):
             axes = panels[row, column]
             _gamma_lines(axes, table, role)
-            axes.set(ylim=(-1.05, 1.05), xlabel="gamma", ylabel=f"rho, {role}" if column == 0 else "")
+            axes.set(ylim=_rho_limits(tables, roles), xlabel="gamma", ylabel=f"rho, {role}" if column == 0 else "")
             axes.set_title(_what(table), fontsize=9)
-    panels[0, 0].legend(fontsize=6.5, loc="lower left")
+    panels[-1, 0].legend(fontsize=6.5, loc="lower left", handlelength=3.5)
     return figure
+
+
+def _rho_limits(tables: Sequence[Table], roles: Sequence[str]) -> tuple[float, float]:
+    """From 0, or -1 where some rho or its interval is below, to 1."""
+    cells = [cell for table in tables for role in roles for cell in table.column(role) if cell is not None]
+    return (-1.05 if any(end is not None and end < 0.0 for cell in cells for end in cell) else 0.0), 1.05
 
 
 def _gamma_lines(axes: Any, table: Table, role: str) -> None:
@@ -73,14 +87,19 @@ def _gamma_lines(axes: Any, table: Table, role: str) -> None:
 
 def heights(table: Table) -> Figure:
     """Detection against mounting height: a panel a detector and measure, a line a junction, held-out ones in bold."""
-    shown = zip(table.column("detector"), table.column("measure"), strict=True)
-    kinds = [kind for kind in dict.fromkeys(shown) if " " not in kind[0]]  # no differences
-    figure, panels = _panels(1, len(kinds), 4.0, 3.4)
+    pairs = dict.fromkeys(zip(table.column("detector"), table.column("measure"), strict=True))
+    kinds = [(name, its) for name, its in pairs if its == WORDS[measures_of(name)[0]] and " " not in name]
+    rows = -(-len(kinds) // _ABREAST)
+    figure, panels = _panels(rows, min(len(kinds), _ABREAST), 4.0, 3.4)
     marks = [
         column.heading for column in table.columns if column.heading.endswith(" m") and "less" not in column.heading
     ]
     metres = [float(mark.split()[0]) for mark in marks]
-    for axes, (detector, measure) in zip(panels[0], kinds, strict=True):
+    lines = [name for name in dict.fromkeys(table.column("junction")) if name not in ("training", "held out")]
+    colours = {name: f"C{number}" for number, name in enumerate(lines)}
+    for axes in panels.ravel()[len(kinds) :]:
+        axes.remove()
+    for axes, (detector, measure) in zip(panels.ravel(), kinds, strict=False):
         for row in range(len(table.rows)):
             if (table.column("detector")[row], table.column("measure")[row]) != (detector, measure):
                 continue
@@ -93,9 +112,9 @@ def heights(table: Table) -> Figure:
                 known = [(at, cell) for at, cell in zip(metres, cells, strict=True) if cell[1] is not None]
                 for at, cell in known:
                     axes.plot([at, at], cell[1:], color="black", linewidth=1.2)
-            else:
-                axes.plot(metres, values, linewidth=1.0, marker=".", label=name)
-        axes.set(xlabel="height above the ground, m", ylabel=f"{measure}, %")
+            elif name != "training":
+                axes.plot(metres, values, color=colours[name], linewidth=1.0, marker=".", label=name)
+        axes.set(xlabel="height above the ground, m", ylabel=f"{measure}, %", ylim=(0.0, None))
         axes.set_title(detector, fontsize=9)
     panels[0, 0].legend(fontsize=6.5)
     return figure

@@ -16,6 +16,7 @@ import numpy as np
 
 from benchmarks.validity import low_models
 from benchmarks.validity.record import Estimates, Record, StudySite, beside_of, measures_of
+from pipeline.artefacts.traffic_frames import TrafficFrame
 from pipeline.core import code_digest, files
 from pipeline.core.progress import Progress, silent
 from pipeline.scenario.models import Scenario
@@ -24,7 +25,6 @@ from pipeline.sensing.sites import Site
 from pipeline.validation import detection
 from pipeline.validation.agreement import ScoreName
 from pipeline.validation.detection import ALL, SiteDetection
-from pipeline.validation.frames import TrafficFrame
 from pipeline.validation.looking import Look, look_from
 from pipeline.validation.site_findings import POINTS, Found
 from pipeline.validation.surrogates import gathering

@@ -19,6 +19,7 @@ from benchmarks.validity.pools import SEED, Pools
 from benchmarks.validity.record import BESIDE_BOXED, Record, measures_of
 from benchmarks.validity.tables import Cell, Column, Table, number
 from pipeline.sensing.sites import Site
+from pipeline.validation.agreement import ScoreName
 from pipeline.validation.site_findings import POINTS
 from pipeline.validation.statistics.correlation import RESAMPLES
 
@@ -155,7 +156,7 @@ def costs(folder: Path, names: Sequence[str]) -> Table:
     for path in (folder / f"{name}.costs.json" for name in names):
         for score, by in json.loads(path.read_text(encoding="utf-8")).items():
             for parameters, ms in by.items():
-                each.setdefault(f"{score} {parameters}" if parameters != "{}" else score, []).append(ms)
+                each.setdefault(str(ScoreName(score, parameters)), []).append(ms)
     rows: list[list[Cell]] = [[name, round(statistics.mean(its), 1)] for name, its in each.items()]
     caption = "Milliseconds of one core a site, each as if it were the only score; another machine measures others."
     return Table("costs", "Milliseconds a site", caption, [Column("score"), Column("ms a site", "one")], rows)
