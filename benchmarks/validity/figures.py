@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from benchmarks.validity import junctions
 from benchmarks.validity.agreement import WORDS
 from benchmarks.validity.record import measures_of
 from benchmarks.validity.tables import Table
@@ -86,7 +87,8 @@ def _gamma_lines(axes: Any, table: Table, role: str) -> None:
 
 
 def heights(table: Table) -> Figure:
-    """Detection against mounting height: a panel a detector and measure, a line a junction, held-out ones in bold."""
+    """Detection against mounting height: a panel a detector and measure, a line a junction, training ones dashed,
+    held-out ones together in bold."""
     pairs = dict.fromkeys(zip(table.column("detector"), table.column("measure"), strict=True))
     kinds = [(name, its) for name, its in pairs if its == WORDS[measures_of(name)[0]] and " " not in name]
     rows = -(-len(kinds) // _ABREAST)
@@ -97,6 +99,7 @@ def heights(table: Table) -> Figure:
     metres = [float(mark.split()[0]) for mark in marks]
     lines = [name for name in dict.fromkeys(table.column("junction")) if name not in ("training", "held out")]
     colours = {name: f"C{number}" for number, name in enumerate(lines)}
+    roles = junctions.SHIPPED | {name: role for role, name in junctions.OSM.items()}
     for axes in panels.ravel()[len(kinds) :]:
         axes.remove()
     for axes, (detector, measure) in zip(panels.ravel(), kinds, strict=False):
@@ -113,10 +116,12 @@ def heights(table: Table) -> Figure:
                 for at, cell in known:
                     axes.plot([at, at], cell[1:], color="black", linewidth=1.2)
             elif name != "training":
-                axes.plot(metres, values, color=colours[name], linewidth=1.0, marker=".", label=name)
-        axes.set(xlabel="height above the ground, m", ylabel=f"{measure}, %", ylim=(0.0, None))
+                line = "-" if roles.get(name) == "held out" else "--"
+                axes.plot(metres, values, line, color=colours[name], linewidth=1.0, marker=".", label=name)
+        axes.set(xlabel="height above the ground, m", ylabel=f"{measure}, %", xticks=metres)
+        axes.set_ylim(0.0, 100.0 if detector == POINTS else 200.0)
         axes.set_title(detector, fontsize=9)
-    panels[0, 0].legend(fontsize=6.5)
+    panels[0, 0].legend(fontsize=6.5, loc="lower left")
     return figure
 
 
@@ -151,5 +156,6 @@ def _panels(rows: int, columns: int, width: float, height: float) -> tuple[Figur
     panels = figure.subplots(rows, columns, squeeze=False)
     for axes in panels.ravel():
         axes.grid(True, color="0.9", linewidth=0.6)
+        axes.set_axisbelow(True)
         axes.tick_params(labelsize=7)
     return figure, panels

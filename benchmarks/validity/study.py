@@ -158,5 +158,8 @@ def costs(folder: Path, names: Sequence[str]) -> Table:
             for parameters, ms in by.items():
                 each.setdefault(str(ScoreName(score, parameters)), []).append(ms)
     rows: list[list[Cell]] = [[name, round(statistics.mean(its), 1)] for name, its in each.items()]
-    caption = "Milliseconds of one core a site, each as if it were the only score; another machine measures others."
+    caption = (
+        "Milliseconds of one core a site, each as if it were the only score, in the mean of the study's junctions, on a"
+        " machine that was busy with it; another machine, or a later version, measures others."
+    )
     return Table("costs", "Milliseconds a site", caption, [Column("score"), Column("ms a site", "one")], rows)

@@ -34,7 +34,7 @@ AROUND_M = 8.0
 """Points this far from the region of interest, or nearer, are looked at: half a long vehicle."""
 
 MANY_POINTS, MUCH_COST = 100.0, 10.0
-"""Points with which a score has gone 63 % of the way to 1; cost of completing that takes as much of it away."""
+"""Points with which a score has gone 63 % of the way to 1; cost of completing that takes 63 % of it away."""
 
 
 @dataclass(frozen=True)
