@@ -1,6 +1,7 @@
-"""Pictures of the study, drawn from its tables: rho by gamma, detection by height, all scores. Readable in grey.
+"""Pictures of the study, drawn from its tables: rho by gamma, detection by height, all scores.
 
-Each shows the first measure of each detector, the one by which things are chosen; tables have them all."""
+Each shows the first measure of each detector, the one by which things are chosen; tables have them all.
+"""
 
 from __future__ import annotations
 
@@ -27,9 +28,8 @@ def draw(folder: Path, tables: Sequence[Table]) -> list[Path]:
     """Write the figures as PNG; those whose tables are there."""
     of = {table.name: table for table in tables}
     first = {measures_of(POINTS)[0], measures_of("")[0]}
-    by_setting = [
-        of[name] for name in of if name.startswith("A ") and name.split()[-1] in first and len(name.split()) == 3
-    ]
+    settings = [name for name in of if name.startswith("A ") and not name.startswith("A sites")]
+    by_setting = [of[name] for name in settings if name.split()[-1] in first]
     ranked = [of[name] for name in of if name.startswith("D ") and name.split()[-1] in first]
     made = {
         "validity-gamma.png": gamma(by_setting) if by_setting else None,
