@@ -38,7 +38,8 @@ from pipeline.importers.junctions import HEIGHTS_M, ROI_HEIGHT_M, Junction, Kerb
 from pipeline.importers.mapped_solids import BUILDING_M, ImportCounts, MappedSolid
 from pipeline.importers.shapes import XY
 from pipeline.scenario.loading import load
-from pipeline.scenario.models import FILE, RoiModel, ScoreModel
+from pipeline.scenario.models import FILE, RoiModel
+from pipeline.scenario.score import ScoreModel
 from pipeline.scenario.traffic import FRAMES, WARMUP_S, CountModel, TrafficModel
 from pipeline.scenario.types import Name
 from pipeline.traffic import sumo, sumo_folder

@@ -1,8 +1,8 @@
 """The definition of a scenario: each key with its unit in its name, its limits and its default, written once.
 
-A scenario is a folder with a ``scenario.toml`` and the files that it names. ``[traffic]``, ``[sensors]`` and
-``[effects]`` have modules of their own beside this one. ``data_schemas/scenario.schema.json`` is made from these
-models; :mod:`pipeline.scenario.loading` reads the file.
+A scenario is a folder with a ``scenario.toml`` and the files that it names. ``[traffic]``, ``[sensors]``,
+``[score]`` and ``[effects]`` have modules of their own beside this one. ``data_schemas/scenario.schema.json`` is made
+from these models; :mod:`pipeline.scenario.loading` reads the file.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from pipeline.core.strict_model import StrictModel
 from pipeline.core.sumo_home import sumo_home
 from pipeline.scenario.crs import CrsModel
 from pipeline.scenario.effects import EffectsModel
+from pipeline.scenario.score import ScoreModel
 from pipeline.scenario.sensors import SensorModel
 from pipeline.scenario.traffic import TrafficModel
 from pipeline.scenario.types import Latitude, Longitude, Name, Point2, Point3, Positive
@@ -220,18 +221,6 @@ class ScanModel(StrictModel):
     keep: bool = Field(
         True, description="false: no scans.parquet; score casts as it goes, for sweeps over thousands of sites"
     )
-
-
-class ScoreModel(StrictModel):
-    """How a site is scored."""
-
-    gamma: float = Field(
-        10.0, ge=0, allow_inf_nan=True, description="Beams in a voxel above this number count no more; may be inf"
-    )
-    keep_visibility: tuple[str, ...] | Literal["all"] = Field(
-        (), description="Sites whose hits in every voxel are written to visibility.parquet"
-    )
-    standard_error: bool = Field(True, description="Say how far each score may be off because the traffic was short")
 
 
 class Scenario(StrictModel):

@@ -131,6 +131,16 @@ class LeaveOut:
         march.tally(hits, self.cells, self.classes, gamma * unit, capped, below, seen)
         return self._sum((0.0 if math.isinf(gamma) else gamma) * capped + below / unit)
 
+    def shares_seen(self, hits: NDArray[np.uint32] | NDArray[np.int64]) -> NDArray[np.float64]:
+        """The share of the entropy in voxels that one site's ``hits`` see, of all frames, and with each group left
+        out, (1 + k,) float64; 0 where there is no entropy."""
+        capped, below, seen = (np.zeros(len(self.entropies_bit), dtype=np.int64) for _ in range(3))
+        march.tally(hits, self.cells, self.classes, 1.0, capped, below, seen)
+        total = self.limits(1.0)
+        shares, seen_bit = np.zeros(len(total)), self._sum(seen.astype(np.float64))
+        np.divide(seen_bit, total, out=shares, where=total > 0)
+        return shares
+
     def limits(self, gamma: float) -> NDArray[np.float64]:
         """The same sums with gamma in every voxel."""
         if math.isinf(gamma):

@@ -41,6 +41,8 @@ class SiteScore:
     egvs: float
     entropy_seen: float
     left_out: NDArray[np.float64] | None = None
+    seen_left_out: NDArray[np.float64] | None = None
+    """The same of ``entropy_seen``, where the scenario asks for that score."""
     by_period: tuple[SiteScore, ...] = ()
     """The same for each period alone, where the TPOG is a mix of some and that was asked for."""
 
@@ -83,6 +85,7 @@ class Scorer:
         fields = (EntropyField.of(its.tpog.counts, its.tpog.frames, its.tpog.grid) for its in periods)
         self._periods = tuple(zip(fields, (its.leave_out for its in periods), strict=True))
         self._leave_out, self._gamma = leave_out, scene.scenario.score.gamma
+        self._asks_entropy_seen = "entropy_seen" in scene.scenario.score.asked
         self.field = EntropyField.of(tpog.counts, tpog.frames, tpog.grid)
         self._visibility = Visibility(scene, tpog, trajectories)
 
@@ -117,7 +120,9 @@ class Scorer:
 
     def _worth(self, hits: Hits) -> SiteScore:
         apart = tuple(self._against(hits, field, leave_out) for field, leave_out in self._periods)
-        return replace(self._against(hits, self.field, self._leave_out), by_period=apart)
+        whole, leave_out = self._against(hits, self.field, self._leave_out), self._leave_out
+        seen = leave_out.shares_seen(hits) if self._asks_entropy_seen and leave_out is not None else None
+        return replace(whole, seen_left_out=seen, by_period=apart)
 
     def _against(self, hits: Hits, field: EntropyField, leave_out: LeaveOut | None) -> SiteScore:
         unit = self._visibility.unit

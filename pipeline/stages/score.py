@@ -1,8 +1,9 @@
 """The score stage: which site sees most of what is uncertain, as ``scores.parquet``.
 
-Steps: read ``tpog.parquet``; take the scans site by site (:mod:`pipeline.stages.shared.scans`); score each
-(:mod:`pipeline.scoring.scorer`); rank; say how far each score may be off because the traffic was short. Another gamma,
-voxel size or TPOG needs this stage alone.
+Steps: read ``tpog.parquet``, and the vehicles of some frames where a score asks for them; take the scans site by site
+(:mod:`pipeline.stages.shared.scans`); score each (:mod:`pipeline.scoring.scorer`,
+:mod:`pipeline.stages.shared.target_scores`); rank by the score that the scenario names; say how far each score may be
+off because the traffic was short. Another gamma, voxel size, score or TPOG needs this stage alone.
 """
 
 from __future__ import annotations
@@ -20,36 +21,39 @@ from pipeline.artefacts.foreign_columns import foreign_columns
 from pipeline.artefacts.period_ranking import PERIOD_SCORES
 from pipeline.artefacts.readers import read_tpog
 from pipeline.checks import recorded
-from pipeline.core.findings import WARNINGS
+from pipeline.core.findings import WARNINGS, Finding
 from pipeline.core.grid import Grid
 from pipeline.core.parallel import in_order
 from pipeline.effects import registry
 from pipeline.effects.base import Effect
 from pipeline.formats.georeference import Georeference
 from pipeline.kernels import march
-from pipeline.scenario.models import FILE
+from pipeline.scenario.models import FILE, Scenario
 from pipeline.scoring import uncertainty
 from pipeline.scoring.leave_out import LeaveOut
-from pipeline.scoring.scorer import Scorer, SiteScore, ranks
+from pipeline.scoring.scorer import Scorer, SiteScore
+from pipeline.scoring.targets.named import WORTHS
 from pipeline.scoring.visibility import Beams, in_voxels
 from pipeline.sensing.sites import ScannedSite
 from pipeline.stages.base import StageInputs, Summary, Workspace
 from pipeline.stages.shared import period_scores
+from pipeline.stages.shared.judged import Judged
 from pipeline.stages.shared.scans import SiteBeams, scans
 from pipeline.stages.shared.scene import SCANS, scan_inputs, scene_of, sensor_digests, sensor_settings
+from pipeline.stages.shared.target_scores import TPOG, TRAJECTORIES, SiteTargets, Targets
 from pipeline.world import world_frame
 
 NAME = "score"
 ARTEFACTS = ("scores.parquet", "visibility.parquet", PERIOD_SCORES)
-TRAJECTORIES = "trajectories.parquet"
 
 
 @dataclass(frozen=True)
 class ScoredSite:
-    """A site, its score, and what else was asked for: an audit of its beams, its hits in the voxels that it sees."""
+    """A site, its scores, and what else was asked for: an audit of its beams, its hits in the voxels that it sees."""
 
     site: ScannedSite
     score: SiteScore
+    targets: SiteTargets | None
     audit: BeamAudit | None
     visible: dict[str, NDArray[Any]] | None
 
@@ -74,7 +78,9 @@ def inputs(work: Workspace) -> StageInputs:
     if live:
         settings["effects"] = registry.settings(live)
         settings["sensors"] = sensor_settings(scenario)
-    hashes = work.digests("tpog.parquet", *(name for effect in live for name in effect.reads))
+    hashes = work.digests(TPOG, *(name for effect in live for name in effect.reads))
+    if _asks_targets(work):
+        hashes |= work.digests(TRAJECTORIES)
     if live:
         hashes |= sensor_digests(scenario, scene_of(work).sites)
     modules = registry.modules(live)
@@ -103,17 +109,19 @@ def run(
     dict
         ``sites``, ``best`` (names), ``egvs_limit``; with ``audit`` the worst case found.
     """
-    tpog, wanted = read_tpog(work.path("tpog.parquet")), work.scenario.score
-    leave_out = LeaveOut.of(work.path("tpog.parquet"), tpog) if wanted.standard_error else None
-    periods = period_scores.period_tpogs(work.path("tpog.parquet"), standard_errors=wanted.standard_error)
+    tpog, wanted = read_tpog(work.path(TPOG)), work.scenario.score
+    leave_out = LeaveOut.of(work.path(TPOG), tpog) if wanted.standard_error else None
+    periods = period_scores.period_tpogs(work.path(TPOG), standard_errors=wanted.standard_error)
     scorer = Scorer(scene_of(work), tpog, work.path(TRAJECTORIES), leave_out, periods)
+    targets = Targets(work, tpog.grid) if _asks_targets(work) else None
 
     def score(scan: SiteBeams) -> ScoredSite:
         checked = audit_beams(scan.beams, tpog.grid) if audit else None
+        its = targets.scores(targets.see(scan)) if targets is not None else None
         if wanted.keep_visibility == "all" or scan.site.name in wanted.keep_visibility:
             worth, hits = scorer.score_and_hits(scan.beams)
-            return ScoredSite(scan.site, worth, checked, _sparse(hits))
-        return ScoredSite(scan.site, scorer.score(scan.beams), checked, None)
+            return ScoredSite(scan.site, worth, its, checked, _sparse(hits))
+        return ScoredSite(scan.site, scorer.score(scan.beams), its, checked, None)
 
     done: list[ScoredSite] = []
     for scored in in_order(score, scans(work), work.threads):
@@ -121,31 +129,29 @@ def run(
         work.progress("sites", len(done), 0)
         if observe is not None:
             observe(scored)
+    judged = {name: _judged(name, done, leave_out) for name in ("egvs", *wanted.asked)}
+    ranking, others = judged[wanted.rank_by], [judged[name] for name in wanted.asked]
     sites = [d.site.to_json() for d in done]
-    about = work.metadata(inputs, gamma=wanted.gamma, grid=tpog.grid.to_json(), frames=tpog.frames, sites=sites)
+    about = work.metadata(
+        inputs, gamma=wanted.gamma, rank_by=wanted.rank_by, grid=tpog.grid.to_json(), frames=tpog.frames, sites=sites
+    )
     _write_visibility(work, done, about)
-    estimate = _estimate(done, leave_out)
-    more, own = _degrees(done, world_frame.of(work.scenario)) | _error_columns(estimate), _own_columns(work)
-    columns = _columns(done, scorer.limit) | more
-    with tables.writer(work.path(ARTEFACTS[0]), "scores", tuple(more), foreign=own) as file:
-        file.write(columns | own)
-        file.describe(about)
+    _write_scores(work, done, judged, scorer.limit, about)
     names, worths = [d.site.name for d in done], [d.score for d in done]
-    period_scores.write(work.path(ARTEFACTS[2]), names, worths, periods, scorer.limits_by_period, about)
-    best = [d.site.name for d, rank in zip(done, columns["rank"], strict=True) if rank == 1]
-    summary: Summary = {"sites": len(done), "best": best, "egvs_limit": scorer.limit}
+    apart = [other for other in others if other.name in WORTHS]
+    limits = scorer.limits_by_period
+    period_scores.write(work.path(ARTEFACTS[2]), names, worths, ranking, apart, periods, limits, about)
+    best = [name for name, rank in zip(names, ranking.rank, strict=True) if rank == 1]
+    summary: Summary = {"sites": len(done), "best": best, "rank_by": wanted.rank_by, "egvs_limit": scorer.limit}
     if skipped := scene_of(work).skipped(NAME):
         summary["skipped"] = skipped
-    doubts = period_scores.disagreements(names, worths, periods)
-    if estimate is not None:
+    doubts = period_scores.disagreements(names, ranking, periods)
+    doubts += targets.doubts() if targets is not None else []
+    doubts += [doubt for its in judged.values() for doubt in its.doubts()]
+    if ranking.estimate is not None:
         records = [period.name for period in periods] or [""]
-        summary |= uncertainty.in_words(estimate, records)
-        traffic = work.scenario.traffic
-        place, period_s = f"{FILE}: traffic.frames", traffic.frame_period_s
-        own = {
-            p.name: f"{FILE}: traffic.periods ({p.name}).length_s" for p in traffic.periods if p.length_s is not None
-        }
-        doubts = uncertainty.doubts(estimate, place, period_s, records, own) + doubts
+        summary |= uncertainty.in_words(ranking.estimate, records)
+        doubts = _doubts_of_errors(work.scenario, ranking.estimate, records) + doubts
     if audit:
         summary["audit"] = _worst([d.audit for d in done if d.audit is not None])
     if work.scenario.is_recorded:  # without a network, the record alone knows the road
@@ -153,6 +159,21 @@ def run(
     if doubts:
         summary[WARNINGS] = [doubt.to_json() for doubt in doubts]
     return summary
+
+
+def _asks_targets(work: Workspace) -> bool:
+    """Whether a score is asked for that looks at the vehicles of recorded frames."""
+    return any(name in WORTHS for name in work.scenario.score.asked)
+
+
+def _judged(name: str, done: list[ScoredSite], leave_out: LeaveOut | None) -> Judged:
+    return Judged.of(name, [(d.score, d.targets) for d in done], None if leave_out is None else leave_out.groups)
+
+
+def _doubts_of_errors(scenario: Scenario, estimate: uncertainty.Estimate, records: list[str]) -> list[Finding]:
+    traffic = scenario.traffic
+    own = {p.name: f"{FILE}: traffic.periods ({p.name}).length_s" for p in traffic.periods if p.length_s is not None}
+    return uncertainty.doubts(estimate, f"{FILE}: traffic.frames", traffic.frame_period_s, records, own)
 
 
 def _sparse(hits: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
@@ -168,15 +189,27 @@ def audit_beams(beams: Beams, grid: Grid) -> BeamAudit:
     return BeamAudit(*march.audit(o, d, shape, grid.voxel_m, np.zeros(int(np.prod(grid.shape)), dtype=np.uint32)))
 
 
-def _columns(done: list[ScoredSite], limit: float) -> dict[str, Any]:
-    scores, sites = np.array([d.score.egvs for d in done]), [d.site.to_json() for d in done]
+def _write_scores(
+    work: Workspace, done: list[ScoredSite], judged: dict[str, Judged], limit: float, about: dict[str, Any]
+) -> None:
+    """Write ``scores.parquet``."""
+    ranking, sites = judged[work.scenario.score.rank_by], [d.site.to_json() for d in done]
     columns: dict[str, Any] = {name: [site[name] for site in sites] for name in sites[0]} if sites else {}
-    return columns | {
-        "egvs": scores,
+    columns |= {
+        "egvs": judged["egvs"].values,
         "egvs_limit": np.full(len(done), limit),
-        "rank": ranks(scores),
+        "rank": ranking.rank,
         "entropy_seen": np.array([d.score.entropy_seen for d in done]),
     }
+    more = _degrees(done, world_frame.of(work.scenario))
+    more |= {name: its.values for name, its in judged.items() if name not in columns}
+    if judged["egvs"].estimate is not None:
+        more |= {f"{name}_se": its.se for name, its in judged.items()}
+        more |= {"egvs_bias": judged["egvs"].estimate.bias, "beats_next": ranking.beats_next}
+    own = _own_columns(work)
+    with tables.writer(work.path(ARTEFACTS[0]), "scores", tuple(more), foreign=own) as file:
+        file.write(columns | more | own)
+        file.describe(about)
 
 
 def _own_columns(work: Workspace) -> dict[str, pa.Array]:
@@ -189,20 +222,6 @@ def _degrees(done: list[ScoredSite], world: Georeference) -> dict[str, Any]:
     places = [[d.site.pose.x_m, d.site.pose.y_m] for d in done]
     lon_lat_deg = world.lon_lat_deg(np.array(places).reshape(-1, 2))
     return {} if lon_lat_deg is None else {"longitude_deg": lon_lat_deg[:, 0], "latitude_deg": lon_lat_deg[:, 1]}
-
-
-def _estimate(done: list[ScoredSite], leave_out: LeaveOut | None) -> uncertainty.Estimate | None:
-    """What leaving blocks out says of all sites; None when it is not asked for, or there is one block only."""
-    if leave_out is None:
-        return None
-    return uncertainty.Estimate.of(np.array([d.score.left_out for d in done]).reshape(len(done), -1), leave_out.groups)
-
-
-def _error_columns(estimate: uncertainty.Estimate | None) -> dict[str, Any]:
-    """The columns of ``scores.parquet`` that say how far a score may be off."""
-    if estimate is None:
-        return {}
-    return {"egvs_se": estimate.se, "egvs_bias": estimate.bias, "beats_next": uncertainty.beats_next(estimate)}
 
 
 def _worst(audits: list[BeamAudit]) -> dict[str, float]:

@@ -5,6 +5,7 @@ groups out; and each wrong use with its message."""
 
 from __future__ import annotations
 
+import math
 import re
 from fractions import Fraction
 from pathlib import Path
@@ -23,11 +24,11 @@ from pipeline.core.findings import Finding, warnings_of
 from pipeline.core.grid import Grid
 from pipeline.scoring.egvs import EntropyField, binary_entropy
 from pipeline.scoring.leave_out import Groups, LeaveOut
-from pipeline.scoring.scorer import SiteScore
 from pipeline.scoring.uncertainty import Estimate
 from pipeline.stages import traffic
 from pipeline.stages.base import Workspace
 from pipeline.stages.shared import period_scores
+from pipeline.stages.shared.judged import Judged
 from pipeline.studies.effect_overview import called
 
 PERIODS = """
@@ -87,7 +88,7 @@ def test_each_period_is_scored_as_if_it_were_alone(split: Path, tmp_path: Path) 
         pipeline.run(pipeline.load(split, [f"traffic.frames={frames}", f"traffic.begin_s={begin_s}"]), alone)
         rows = of(pipeline.read_scores(alone / "scores.parquet"))
         for row, its in zip(rows, (row for row in by_period if row["period"] == name), strict=True):
-            assert all(row[key] == its[key] for key in its if key != "period")
+            assert {key: row[key] for key in its if key != "period"} == {k: v for k, v in its.items() if k != "period"}
         assert not (alone / "scores_by_period.parquet").exists()
         theirs, own = read_tpog(tmp_path / "both" / "tpog.parquet", name), read_tpog(alone / "tpog.parquet")
         assert (theirs.counts == own.counts).all()
@@ -203,12 +204,16 @@ def test_a_period_whose_best_site_is_another_is_told() -> None:
         Grid.from_json({"origin_m": [0.0] * 3, "voxel_m": 1.0, "shape": [1, 1, 1]}), 1, np.zeros((1, 1, 1), np.int64)
     )
     named = [period_scores.PeriodTpog(name, tpog) for name in ("morning", "night")]
-    worth = lambda *values: SiteScore(values[0], 1.0, None, tuple(SiteScore(v, 1.0) for v in values[1:]))  # noqa: E731
-    (found,) = period_scores.disagreements(["a", "b"], [worth(9.0, 9.0, 3.0), worth(7.0, 6.0, 4.0)], named)
+
+    def judged(*sites: tuple[float, ...]) -> Judged:
+        mix, *apart = (np.array(values) for values in zip(*sites, strict=True))
+        return Judged("egvs", mix, None, (), tuple(apart))
+
+    (found,) = period_scores.disagreements(["a", "b"], judged((9.0, 9.0, 3.0), (7.0, 6.0, 4.0)), named)
     assert found.place == "scenario.toml: traffic.periods (night)"
     assert found.found == "b is the best site, not a of the mix, which is rank 2 there and scores 25.0% less"
-    assert period_scores.disagreements(["a", "b"], [worth(9.0, 9.0, 4.0), worth(7.0, 6.0, 4.0)], named) == []
-    assert period_scores.disagreements(["a"], [worth(9.0, 0.0, 0.0)], named) == []
+    assert period_scores.disagreements(["a", "b"], judged((9.0, 9.0, 4.0), (7.0, 6.0, 4.0)), named) == []
+    assert period_scores.disagreements(["a"], judged((9.0, 0.0, math.nan)), named) == []
 
 
 def test_periods_disagree_without_standard_errors_too(

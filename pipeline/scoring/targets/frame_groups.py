@@ -28,6 +28,24 @@ from pipeline.scoring.targets.record import Floats, Ints, TargetRecord
 from pipeline.scoring.targets.scores import mean
 
 
+def recorded_frames(trajectories: Path) -> list[int]:
+    """How many frames ``trajectories.parquet`` has of each record, one where there are no periods."""
+    about = tables.read_metadata(trajectories, "trajectories")
+    return [int(its["frames"]) for its in about.get("periods", [about])]
+
+
+def weights_in_mix(periods: Sequence[PeriodBlocks], recorded: Sequence[int], record: TargetRecord) -> Floats:
+    """How much each vehicle-frame counts, (n,) float64, where traffic is a mix of records of so many frames each; 1
+    where there is one alone."""
+    weight, offset = np.ones(len(record.numbers)), 0
+    for period, frames in zip(periods, recorded, strict=True):
+        here = (record.numbers >= offset) & (record.numbers < offset + frames)
+        if len(periods) > 1 and here.any():
+            weight[here] = period.times * period.frames / here.sum()
+        offset += frames
+    return weight[record.frame]
+
+
 @dataclass(frozen=True, eq=False)
 class FrameGroups:
     """Which group of blocks each vehicle-frame of a record belongs to, and how much it counts.
@@ -50,25 +68,22 @@ class FrameGroups:
     def read(cls, tpog: Path, trajectories: Path, record: TargetRecord) -> FrameGroups | None:
         """From ``tpog.parquet`` and the ``trajectories.parquet`` that it was counted from; None when a record has one
         block only, which tells nothing."""
-        about, periods = tables.read_metadata(trajectories, "trajectories"), read_periods(tpog)
-        recorded = [int(its["frames"]) for its in about.get("periods", [about])]
-        return None if any(its.blocks < 2 for its in periods) else cls.of(periods, recorded, record)
+        periods = read_periods(tpog)
+        if any(its.blocks < 2 for its in periods):
+            return None
+        return cls.of(periods, recorded_frames(trajectories), record)
 
     @classmethod
     def of(cls, periods: Sequence[PeriodBlocks], recorded: Sequence[int], record: TargetRecord) -> FrameGroups:
         """From the blocks of each record, two or more, and the frames that were recorded in it: those at its end that
         fill no block belong to its last group. A record of which no frame is replayed has no say."""
         groups = tuple(groups_of(period) for period in periods)
-        starts, offset = [], 0
-        weight = np.ones(len(record.numbers))
-        for period, its, frames in zip(periods, groups, recorded, strict=True):
-            starts += [offset + np.append(0, np.cumsum(its.frames[:-1]))]
-            here = (record.numbers >= offset) & (record.numbers < offset + frames)
-            if len(periods) > 1 and here.any():
-                weight[here] = period.times * period.frames / here.sum()
-            offset += frames
+        offsets = np.append(0, np.cumsum(recorded[:-1]))
+        starts = [
+            offset + np.append(0, np.cumsum(its.frames[:-1])) for offset, its in zip(offsets, groups, strict=True)
+        ]
         at = np.searchsorted(record.numbers[record.frame], np.concatenate(starts))
-        return cls(groups, np.append(at, len(record)), weight[record.frame])
+        return cls(groups, np.append(at, len(record)), weights_in_mix(periods, recorded, record))
 
     def means(self, values: Floats, weight: Floats | None = None) -> Floats:
         """The mean of all vehicle-frames, and with each group left out, (1 + k,) float64, as

@@ -15,6 +15,7 @@ from pipeline.scenario.models import FILE
 from pipeline.scoring.leave_out import LeaveOut
 from pipeline.scoring.scorer import PeriodTpog, SiteScore, ranks
 from pipeline.scoring.uncertainty import Estimate
+from pipeline.stages.shared.judged import Judged
 
 
 def period_tpogs(path: Path, *, standard_errors: bool) -> tuple[PeriodTpog, ...]:
@@ -30,16 +31,23 @@ def write(
     path: Path,
     sites: Sequence[str],
     scores: Sequence[SiteScore],
+    ranking: Judged,
+    others: Sequence[Judged],
     periods: Sequence[PeriodTpog],
     limits: Sequence[float],
     about: dict[str, Any],
 ) -> None:
-    """Write one row group a period; remove the file of an earlier run where there are no periods."""
+    """Write one row group a period; remove the file of an earlier run where there are no periods.
+
+    ``ranking`` is the score that ranks, ``others`` are those that get a column of their own beside what always stands
+    there.
+    """
     if not periods:
         path.unlink(missing_ok=True)
         return
     has_errors = all(period.leave_out is not None for period in periods)
-    with tables.writer(path, "scores_by_period", ("egvs_se", "egvs_bias") if has_errors else ()) as file:
+    more = (*(("egvs_se", "egvs_bias") if has_errors else ()), *(other.name for other in others))
+    with tables.writer(path, "scores_by_period", more) as file:
         for number, (period, limit) in enumerate(zip(periods, limits, strict=True)):
             worths = [score.by_period[number] for score in scores]
             egvs = np.array([worth.egvs for worth in worths])
@@ -48,30 +56,30 @@ def write(
                 "site": list(sites),
                 "egvs": egvs,
                 "egvs_limit": np.full(len(sites), limit),
-                "rank": ranks(egvs),
+                "rank": ranks(ranking.by_period[number]),
                 "entropy_seen": np.array([worth.entropy_seen for worth in worths]),
             }
             if has_errors and period.leave_out is not None:
                 left_out = np.array([worth.left_out for worth in worths]).reshape(len(sites), -1)
                 estimate = Estimate.of(left_out, period.leave_out.groups)
                 columns |= {"egvs_se": estimate.se, "egvs_bias": estimate.bias}
+            columns |= {other.name: other.by_period[number] for other in others}
             file.write(columns)
         file.describe(about)
 
 
-def disagreements(sites: Sequence[str], scores: Sequence[SiteScore], periods: Sequence[PeriodTpog]) -> list[Finding]:
-    """A warning for each period whose best site is another than the mix's."""
+def disagreements(sites: Sequence[str], ranking: Judged, periods: Sequence[PeriodTpog]) -> list[Finding]:
+    """A warning for each period whose best site, by the score that ranks, is another than the mix's."""
     if not sites:
         return []
-    best = _best(np.array([score.egvs for score in scores]))
+    best = _best(ranking.values)
     found = []
-    for number, period in enumerate(periods):
-        egvs = np.array([score.by_period[number].egvs for score in scores])
-        its = _best(egvs)
-        if best & its or not egvs.max() > 0:
+    for period, values in zip(periods, ranking.by_period, strict=True):
+        its = _best(values)
+        if best & its or not values.max() > 0:
             continue
         first, there = min(best), min(its)
-        lost, rank = 1.0 - egvs[first] / egvs.max(), int(ranks(egvs)[first])
+        lost, rank = 1.0 - values[first] / values.max(), int(ranks(values)[first])
         what = f"{sites[there]} is the best site, not {sites[first]} of the mix, which is rank {rank} there"
         cure = "weigh which period counts: the best of the mix need not be the best at any hour"
         place = f"{FILE}: traffic.periods ({period.name})"
@@ -79,5 +87,5 @@ def disagreements(sites: Sequence[str], scores: Sequence[SiteScore], periods: Se
     return found
 
 
-def _best(egvs: np.ndarray[Any, np.dtype[np.float64]]) -> set[int]:
-    return set(np.flatnonzero(egvs == egvs.max()).tolist())
+def _best(values: np.ndarray[Any, np.dtype[np.float64]]) -> set[int]:
+    return set(np.flatnonzero(values == values.max()).tolist())

@@ -1,0 +1,107 @@
+"""What all sites are worth by one score: values, how far they may be off, and the same in each period."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from pipeline.core.findings import Finding
+from pipeline.scenario.models import FILE
+from pipeline.scoring.leave_out import Groups
+from pipeline.scoring.scorer import SiteScore, ranks
+from pipeline.scoring.targets.record import Floats
+from pipeline.scoring.uncertainty import Estimate, beats_next
+from pipeline.stages.shared.target_scores import SiteTargets
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """The sites by one score, n of them.
+
+    Attributes
+    ----------
+    name
+        Of the score.
+    values
+        (n,) float64; not numbers where the score is not defined.
+    left_out
+        Of all traffic, then with each group of it left out, (n, 1 + k) float64; None where there are no standard
+        errors.
+    groups
+        That were left out.
+    by_period
+        Values in each period alone, (n,) float64 each.
+    """
+
+    name: str
+    values: Floats
+    left_out: Floats | None
+    groups: tuple[Groups, ...]
+    by_period: tuple[Floats, ...]
+
+    @classmethod
+    def of(
+        cls, name: str, sites: Sequence[tuple[SiteScore, SiteTargets | None]], groups: tuple[Groups, ...] | None
+    ) -> Judged:
+        """From the scores of all sites; ``groups`` are None where there are no standard errors."""
+        values = np.array([_value(name, *site) for site in sites])
+        left_out = None
+        if groups is not None:
+            columns = 1 + sum(len(its.frames) for its in groups)
+            left_out = np.array([_left_out(name, *site) for site in sites]).reshape(len(sites), columns)
+        apart = zip(*(_by_period(name, *site) for site in sites), strict=True)
+        return cls(name, values, left_out, groups or (), tuple(np.array(period) for period in apart))
+
+    def doubts(self) -> list[Finding]:
+        """A warning where it has values whose errors should be known and are not."""
+        if self.left_out is None or self.estimate is not None or np.isnan(self.values).any():
+            return []
+        groups = sum(len(its.frames) for its in self.groups)
+        found = f"all vehicles in the region are in one of the {groups} groups of frames"
+        cure = "traffic that lasts longer"
+        return [Finding("no standard error", f"{FILE}: traffic", f"{found}: {self.name} has no standard error", cure)]
+
+    @property
+    def rank(self) -> np.ndarray[Any, np.dtype[np.uint32]]:
+        """1 for the best, (n,)."""
+        return ranks(self.values)
+
+    @cached_property
+    def estimate(self) -> Estimate | None:
+        """How far the values may be off; None where that is not known."""
+        if self.left_out is None or np.isnan(self.left_out).any():
+            return None
+        return Estimate.of(self.left_out, self.groups)
+
+    @property
+    def se(self) -> Floats:
+        """Standard errors, (n,) float64; not numbers where they are not known."""
+        return np.full(len(self.values), math.nan) if self.estimate is None else self.estimate.se
+
+    @property
+    def beats_next(self) -> Floats:
+        """As :func:`pipeline.scoring.uncertainty.beats_next`; not numbers where it is not known."""
+        return np.full(len(self.values), math.nan) if self.estimate is None else beats_next(self.estimate)
+
+
+def _value(name: str, score: SiteScore, targets: SiteTargets | None) -> float:
+    if targets is not None and name in targets.scores:
+        return float(targets.scores[name][0])
+    return score.egvs if name == "egvs" else score.entropy_seen
+
+
+def _left_out(name: str, score: SiteScore, targets: SiteTargets | None) -> Floats | None:
+    if targets is not None and name in targets.scores:
+        return targets.scores[name]
+    return score.left_out if name == "egvs" else score.seen_left_out
+
+
+def _by_period(name: str, score: SiteScore, targets: SiteTargets | None) -> list[float]:
+    if targets is not None and name in targets.scores:
+        return [period[name] for period in targets.by_period]
+    return [period.egvs if name == "egvs" else period.entropy_seen for period in score.by_period]

@@ -1,0 +1,126 @@
+"""What sites see of the vehicles of recorded frames, and the scores over them that a scenario asks for.
+
+Steps: read some frames of ``trajectories.parquet`` once for all sites; count what a site sees of each vehicle; take the
+mean of what that is worth, of all vehicles, with each group of frames left out, and in each period alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.artefacts.periods import PeriodBlocks
+from pipeline.artefacts.readers import read_periods
+from pipeline.core.errors import InputError
+from pipeline.core.findings import Finding
+from pipeline.core.grid import Grid
+from pipeline.scenario.models import FILE
+from pipeline.scoring.targets.frame_groups import FrameGroups, recorded_frames, weights_in_mix
+from pipeline.scoring.targets.named import WORTHS
+from pipeline.scoring.targets.record import Floats, TargetRecord
+from pipeline.scoring.targets.scores import mean
+from pipeline.scoring.targets.seen import SeenTargets, noticed_in, see
+from pipeline.stages.base import Workspace
+from pipeline.stages.shared.scans import SiteBeams
+from pipeline.stages.shared.scene import scene_of
+
+TRAJECTORIES = "trajectories.parquet"
+TPOG = "tpog.parquet"
+
+
+@dataclass(frozen=True)
+class SiteTargets:
+    """The scores of one site over vehicles, by name.
+
+    Attributes
+    ----------
+    scores
+        Of all vehicle-frames, then with each group of frames left out, (1 + k,) float64; the first alone where there
+        are no standard errors. Not a number where no vehicle counts.
+    by_period
+        Of each period alone, in their order; empty where there are none.
+    """
+
+    scores: Mapping[str, Floats]
+    by_period: tuple[Mapping[str, float], ...] = ()
+
+
+class Targets:
+    """The vehicles of recorded frames, and what they are asked for. Threads may share one.
+
+    Parameters
+    ----------
+    work
+        Holds ``trajectories.parquet`` and the ``tpog.parquet`` that was counted from it.
+    grid
+        Its region of interest is where vehicles are to be seen.
+
+    Raises
+    ------
+    InputError
+        When one of these scores is to rank the sites, and no vehicle counts.
+    """
+
+    def __init__(self, work: Workspace, grid: Grid) -> None:
+        wanted, trajectories, tpog = work.scenario.score, work.path(TRAJECTORIES), work.path(TPOG)
+        self.record = TargetRecord.read(trajectories, grid)
+        self._scene = scene_of(work)
+        self._names: tuple[str, ...] = tuple(name for name in wanted.asked if name in WORTHS)
+        periods, recorded = read_periods(tpog), recorded_frames(trajectories)
+        self._weight = weights_in_mix(periods, recorded, self.record)
+        self._groups = FrameGroups.read(tpog, trajectories, self.record) if wanted.standard_error else None
+        self._periods = _rows_of_periods(periods, recorded, self.record)
+        if self.is_empty and wanted.rank_by in WORTHS:
+            place = f"{work.scenario.file}: score.rank_by = {wanted.rank_by!r}"
+            raise InputError(place, self._nobody, 'traffic that passes the region of interest, or rank_by = "egvs"')
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no vehicle counts."""
+        return not math.fsum(self._weight) > 0.0
+
+    def see(self, scan: SiteBeams) -> SeenTargets:
+        """What a site sees of each vehicle."""
+        return see(self.record, scan.beams, noticed_in(self._scene, scan.beams.sensor))
+
+    def scores(self, seen: SeenTargets) -> SiteTargets:
+        """The scores that are asked for, of what a site sees."""
+        worths = {name: WORTHS[name](seen) for name in self._names}
+        whole = {name: self._means(worth) for name, worth in worths.items()}
+        apart = ({name: mean(worth[rows]) for name, worth in worths.items()} for _, rows in self._periods)
+        return SiteTargets(whole, tuple(apart))
+
+    def doubts(self) -> list[Finding]:
+        """A warning where scores are no numbers: for want of vehicles in the region, at all or in a period."""
+        names = " and ".join(self._names)
+        if not names:
+            return []
+        cure = "the region of interest should hold the road"
+        if self.is_empty:
+            return [Finding("no vehicles", f"{FILE}: roi", f"{self._nobody}: {names} is no number", cure)]
+        return [
+            Finding("no vehicles", f"{FILE}: traffic.periods ({name})", f"{self._nobody}: {names} is no number", cure)
+            for name, rows in self._periods
+            if rows.start == rows.stop
+        ]
+
+    @property
+    def _nobody(self) -> str:
+        return f"no vehicle has its centre in the region of interest in the {len(self.record.numbers)} frames looked at"
+
+    def _means(self, worth: Floats) -> Floats:
+        if self._groups is None:
+            return np.array([mean(worth, self._weight)])
+        return self._groups.means(worth)
+
+
+def _rows_of_periods(
+    periods: tuple[PeriodBlocks, ...], recorded: list[int], record: TargetRecord
+) -> tuple[tuple[str, slice], ...]:
+    """The vehicle-frames of each period; none where there are no periods."""
+    ends = np.searchsorted(record.numbers[record.frame], np.append(0, np.cumsum(recorded))).tolist()
+    named = zip(periods, ends[:-1], ends[1:], strict=True)
+    return tuple((period.name, slice(a, b)) for period, a, b in named if period.name)

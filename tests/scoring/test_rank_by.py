@@ -1,0 +1,187 @@
+"""Do sites rank by the score that the scenario names, and is each score its definition?
+
+Evidence: means over vehicle-frames from the slow twin that puts every beam to every box; entropies voxel by voxel; each
+wrong use with its message."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pipeline
+from pipeline.artefacts import tables
+from pipeline.artefacts.readers import read_scores, read_scores_by_period, read_tpog, read_visibility
+from pipeline.artefacts.traffic_frames import read
+from pipeline.core.findings import warnings_of
+from pipeline.scenario import loading
+from pipeline.scenario.score import ScoreModel
+from pipeline.scoring.egvs import binary_entropy
+from pipeline.scoring.targets.named import WORTHS
+from pipeline.scoring.visibility import Beams
+from pipeline.sensing.scanner import Scanner
+from pipeline.stages import score
+from tests.scoring.targets import scenes
+from tests.stages import inputs_of, run_stage
+
+ALL = 'score.others=["seen_well", "points_on_target", "entropy_seen"]'
+SITES = "site,x_m,y_m,z_m\n" + "".join(f"s{n},{5 + 6 * n},{11 - 22 * (n % 2)},{2 + n}\n" for n in range(5))
+
+
+def run(folder: Path, out: Path, *overrides: str) -> dict[str, dict[str, float]]:
+    pipeline.run(loading.load(folder, overrides), out, jobs=2)
+    return {row["site"]: row for row in read_scores(out / "scores.parquet").to_pylist()}
+
+
+def by_rank(rows: dict[str, dict[str, float]], name: str) -> bool:
+    """Whether the ranks are those of a score."""
+    return all(row["rank"] == 1 + sum(other[name] > row[name] for other in rows.values()) for row in rows.values())
+
+
+def test_means_over_vehicles_are_those_of_the_slow_twin(
+    mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = run(mini, tmp_path / "run", ALL)
+    scenario = loading.load(mini)
+    frames = list(read(tmp_path / "run" / "trajectories.parquet", np.arange(40)))
+    monkeypatch.setattr(scenes, "GRID", scenario.roi.grid)
+    scanner = Scanner(pipeline.build_scene(scenario))
+    blocks = np.repeat([one.number // 10 for one in frames], [len(one.wanted(scenes.GRID.roi)) for one in frames])
+    widened = []
+    for site in scanner.scene.sites:
+        points = np.array(scenes.seen_slowly(frames, Beams.of(scanner.scan_site(site)))["points"])
+        assert len(points) == len(blocks) == 76
+        for name, worth in (("points_on_target", np.log(1 + points)), ("seen_well", 1 - np.exp(-points / 20))):
+            assert rows[site.name][name] == pytest.approx(worth.mean(), rel=1e-12)
+            left = np.array([worth[blocks != block].mean() for block in range(4)])
+            widened.append(rows[site.name][f"{name}_se"] / np.sqrt(3 / 4 * ((left - left.mean()) ** 2).sum()))
+    assert widened == pytest.approx([widened[0]] * 4)  # for the traffic's memory
+    assert 1.0 <= widened[0] < 2.0
+
+
+@pytest.mark.parametrize("name", ["egvs", "entropy_seen", "points_on_target", "seen_well"])
+def test_sites_rank_by_the_score_that_is_named(mini: Path, tmp_path: Path, name: str) -> None:
+    (mini / "sites.csv").write_text(SITES)
+    rows = run(mini, tmp_path / "run", f"score.rank_by={name}", "score.others=[]")
+    assert by_rank(rows, name)
+    columns = set(next(iter(rows.values())))
+    assert {name, f"{name}_se", "egvs_se", "beats_next"} <= columns
+    assert columns.isdisjoint(set(WORTHS) - {name})
+    assert tables.read_metadata(tmp_path / "run" / "scores.parquet", "scores")["rank_by"] == name
+    ranked = sorted(rows.values(), key=lambda row: row["rank"])
+    assert ranked[-1]["beats_next"] == 1.0
+    assert all(0.5 <= row["beats_next"] <= 1.0 for row in ranked)
+
+
+def test_what_ranks_changes_no_score(mini: Path, tmp_path: Path) -> None:
+    (mini / "sites.csv").write_text(SITES)
+    plain, other = run(mini, tmp_path / "a"), run(mini, tmp_path / "b", "score.rank_by=points_on_target", ALL)
+    shared = set(plain["s0"]) - {"rank", "beats_next"}
+    assert {"egvs", "egvs_se", "seen_well", "seen_well_se"} <= shared
+    assert all(other[site][key] == row[key] for site, row in plain.items() for key in shared)
+
+
+def test_the_error_of_the_entropy_seen_is_that_of_its_groups(mini: Path, tmp_path: Path) -> None:
+    """With two blocks a group left out is the other block: its share by hand, voxel by voxel."""
+    more = ("tpog.blocks=2", "score.keep_visibility=all")
+    rows = run(mini, tmp_path / "run", 'score.others=["entropy_seen"]', *more)
+    path = tmp_path / "run" / "tpog.parquet"
+    counts = {}
+    for row in tables.read(path, "tpog")[0].to_pylist():
+        counts.setdefault((row["ix"], row["iy"], row["iz"]), [0, 0])[row["block"]] += row["count"]
+    for site, row in rows.items():
+        hits = read_visibility(tmp_path / "run" / "visibility.parquet", site)
+        shares = []
+        for kept in ((0,), (1,), (0, 1)):
+            bits = {cell: binary_entropy(sum(its[b] for b in kept), 20 * len(kept)) for cell, its in counts.items()}
+            shares.append(sum(h for cell, h in bits.items() if hits[cell]) / sum(bits.values()))
+        assert row["entropy_seen"] == pytest.approx(shares[2])
+        # two equal groups: the pseudo-values are 2 S - S_(g), so their halved squared distances from their mean
+        scatter = abs(shares[0] - shares[1]) / 2
+        assert row["entropy_seen_se"] >= scatter * (1 - 1e-9)
+        assert row["entropy_seen_se"] < 3 * scatter
+
+
+def test_without_standard_errors_there_are_none(mini: Path, tmp_path: Path) -> None:
+    for number, override in enumerate(("score.standard_error=false", "tpog.blocks=1")):
+        rows = run(mini, tmp_path / str(number), ALL, override, "score.rank_by=seen_well")
+        assert by_rank(rows, "seen_well")
+        assert not [name for name in rows["pole_a"] if name.endswith(("_se", "beats_next"))]
+
+
+def test_a_mix_of_periods_weighs_vehicles_with_and_without_errors(mini: Path, tmp_path: Path) -> None:
+    periods = 'traffic.periods=[{name="a", length_s=12, weight=3}, {name="b", begin_s=12, length_s=8}]'
+    rank = ("score.rank_by=seen_well", periods)
+    rows, plain = run(mini, tmp_path / "a", *rank), run(mini, tmp_path / "b", *rank, "score.standard_error=false")
+    apart = read_scores_by_period(tmp_path / "a" / "scores_by_period.parquet").to_pylist()
+    frames = read(tmp_path / "a" / "trajectories.parquet", np.arange(40))
+    vehicles = np.array([len(one.wanted(loading.load(mini).roi.box)) for one in frames])
+    share = [3 * vehicles[:24].sum() / 24, vehicles[24:].sum() / 16]
+    for site, row in rows.items():
+        assert plain[site]["seen_well"] == row["seen_well"]
+        a, b = (next(its for its in apart if (its["site"], its["period"]) == (site, name)) for name in "ab")
+        wanted = (share[0] * a["seen_well"] + share[1] * b["seen_well"]) / sum(share)
+        assert row["seen_well"] == pytest.approx(wanted, rel=1e-12)
+    for name in "ab":
+        assert by_rank({its["site"]: its for its in apart if its["period"] == name}, "seen_well")
+
+
+def test_no_vehicle_in_the_region_is_refused_where_vehicles_rank(mini: Path, tmp_path: Path, egvs) -> None:  # type: ignore[no-untyped-def]
+    away = ("--set", "roi.center_m=[20, 60, 2.5]", "--set", "sites.file=far.csv")
+    (mini / "far.csv").write_text("site,x_m,y_m,z_m\nfar,20,72,3\n")
+    code, _, told = egvs("run", mini, "--out", tmp_path / "a", *away, "--set", "score.rank_by=seen_well")
+    assert code == 2
+    assert "scenario.toml: score.rank_by = 'seen_well': no vehicle has its centre in the region of interest" in told
+    assert 'or rank_by = "egvs"' in told
+    assert not (tmp_path / "a" / "scores.parquet").exists()
+    record = pipeline.run(loading.load(mini, away[1::2]), tmp_path / "b", jobs=1)
+    (doubt,) = (it for it in warnings_of([record.stages["score"].summary]) if it.rule == "no vehicles")
+    assert "in the 40 frames looked at: seen_well is no number" in doubt.found
+    assert math.isnan(read_scores(tmp_path / "b" / "scores.parquet")["seen_well"][0].as_py())
+
+
+def test_errors_that_are_not_known_are_told_as_such(mini: Path, tmp_path: Path) -> None:
+    """All vehicles are in one block of frames: without it there are none."""
+    lines = (mini / "fcd.csv").read_text().splitlines()
+    late = [line.replace(";-2.0;", ";40.0;") if float(line.split(";")[0]) >= 5.0 else line for line in lines[1:]]
+    kept = [line for line in late if not (";west;" in line and float(line.split(";")[0]) >= 5.0)]
+    (mini / "fcd.csv").write_text("\n".join([lines[0], *kept]) + "\n")
+    rows = run(mini, tmp_path / "run", "score.rank_by=seen_well", "score.others=[]")
+    assert by_rank(rows, "seen_well")
+    assert all(math.isnan(row["seen_well_se"]) and math.isnan(row["beats_next"]) for row in rows.values())
+    record = pipeline.run(loading.load(mini, ["score.rank_by=seen_well"]), tmp_path / "run", jobs=1)
+    (doubt,) = (it for it in warnings_of([record.stages["score"].summary]) if it.rule == "no standard error")
+    assert "all vehicles in the region are in one of the 4 groups of frames" in doubt.found
+
+
+def test_only_scores_over_vehicles_read_trajectories(mini: Path, tmp_path: Path) -> None:
+    plain = ["score.others=[]"]
+    pipeline.run(loading.load(mini, plain), tmp_path, jobs=1)
+    assert "trajectories.parquet" not in inputs_of(score, loading.load(mini, plain), tmp_path).files
+    assert "trajectories.parquet" in inputs_of(score, loading.load(mini), tmp_path).files
+    (tmp_path / "trajectories.parquet").unlink()
+    run_stage(score, loading.load(mini, plain), tmp_path)
+    assert "seen_well" not in read_scores(tmp_path / "scores.parquet").column_names
+    assert read_tpog(tmp_path / "tpog.parquet").frames == 40
+
+
+def test_what_is_asked_for_comes_once() -> None:
+    model = ScoreModel(rank_by="seen_well", others=("entropy_seen", "seen_well"))
+    assert model.asked == ("seen_well", "entropy_seen")
+    assert ScoreModel(others=()).asked == ()
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("score.rank_by=detections", "score.rank_by: 'detections'; input should be 'egvs'"),
+        ('score.others=["egvs"]', "score.others.0: 'egvs'; input should be 'entropy_seen'"),
+        ('score.others=["seen_well","seen_well"]', "seen_well stands there twice"),
+    ],
+)
+def test_unknown_scores_are_refused(mini: Path, tmp_path: Path, egvs, override: str, message: str) -> None:  # type: ignore[no-untyped-def]
+    code, _, told = egvs("run", mini, "--out", tmp_path / "run", "--set", override)
+    assert code == 2
+    assert message in told, told
