@@ -217,7 +217,7 @@ class Junction:
         scenario = pipeline.load(SCENARIO, [f"traffic.frames={FRAMES}"])
         grid, scene = scenario.roi.grid, pipeline.build_scene(scenario)
         filled = static_voxels(scene.world, grid)
-        return cls(grid, scenario.score.gamma, scene.world, scene, recorded_boxes(scenario), filled)
+        return cls(grid, scenario.gamma, scene.world, scene, recorded_boxes(scenario), filled)
 
     @property
     def sites(self) -> list[Site]:

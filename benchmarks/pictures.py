@@ -70,7 +70,7 @@ def seen(scenario: Scenario, out: Path, site: str) -> tuple[np.ndarray, np.ndarr
     work = Workspace(scenario, out)
     scan = next(scans(work, [site]))
     hits = Scorer(scene_of(work), tpog, out / "trajectories.parquet").hits(scan.beams)
-    worth = field.per_cell_bit * np.minimum(hits.ravel()[field.cells], scenario.score.gamma)
+    worth = field.per_cell_bit * np.minimum(hits.ravel()[field.cells], scenario.gamma)
     nx, ny, nz = tpog.grid.shape
     return np.bincount(field.cells // nz, weights=worth, minlength=nx * ny).reshape(nx, ny), hits > 0
 

@@ -107,7 +107,8 @@ def _shown(scenario: Scenario) -> dict[str, Any]:
         "roi": scenario.roi.model_dump(mode="json"),
         "frame_period_s": scenario.traffic.frame_period_s,
         "vehicles": scenario.traffic.vehicles,
-        "gamma": repr(scenario.score.gamma),
+        "gamma": repr(scenario.gamma),
+        "gamma_auto": scenario.score.gamma == "auto",
         "effects": scenario.effects.model_dump(mode="json"),
     }
 
@@ -165,7 +166,7 @@ def page(
         "plain": wording.plain,
         "degrees": wording.degrees,
     }
-    sites, effects, gamma = ranking.sites, list(scenario.effects.named), scenario.score.gamma
+    sites, effects, gamma = ranking.sites, list(scenario.effects.named), scenario.gamma
     (first, last), has_traffic = _listed(ranking), bool(tpog.counts.any())
     seconds = [stage.cost.seconds for stage in stages.values()]
     frames = tpog.frames if by_period is None else by_period.frames
@@ -198,6 +199,7 @@ def page(
         choose=Markup((TEMPLATES / "choose.js").read_text(encoding="utf-8")),
         gamma="∞" if math.isinf(gamma) else f"{gamma:g}",
         uncapped=math.isinf(gamma),
+        gamma_auto=scenario.score.gamma == "auto",
         by_period=by_period,
         frames=frames,
         watched=wording.duration(frames * scenario.traffic.frame_period_s),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -12,13 +13,28 @@ from pipeline.core.errors import InputError
 from pipeline.scenario.models import Scenario
 from pipeline.scenario.types import NAME_IN_WORDS
 
+_ALTERNATIVE = re.compile(r"\.(?:(?:constrained-)?(?:float|int|str)|(?:literal|tuple)\[.*\])$")
+"""How pydantic's place of an error ends in a value that may be of several types."""
+
+_SHOULD = "input should be "
+
 
 def explain(error: ValidationError, place: str) -> InputError:
     """One line for each thing that is wrong: key, value, what would be right."""
-    lines = list(_lines(error, Scenario, ()))
+    lines = list(_joined(_lines(error, Scenario, ())))
     key, found, right = lines[0]
     more = "".join(f"\n{place}: {k}: {f}" + (f"; {r}" if r else "") for k, f, r in lines[1:])
     return InputError(f"{place}: {key}", found, right + more)
+
+
+def _joined(lines: Iterator[tuple[str, str, str]]) -> Iterator[tuple[str, str, str]]:
+    """What every alternative of a value says, in one line: "a valid number or 'auto'"."""
+    said: dict[tuple[str, str], list[str]] = {}
+    for key, found, right in lines:
+        said.setdefault((_ALTERNATIVE.sub("", key), found), []).append(right)
+    for (key, found), rights in said.items():
+        first, *others = dict.fromkeys(rights)
+        yield key, found, " or ".join([first, *(other.removeprefix(_SHOULD) for other in others)])
 
 
 def _lines(error: ValidationError, model: type[BaseModel], above: tuple[str, ...]) -> Iterator[tuple[str, str, str]]:

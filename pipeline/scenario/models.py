@@ -22,7 +22,7 @@ from pipeline.core.strict_model import StrictModel
 from pipeline.core.sumo_home import sumo_home
 from pipeline.scenario.crs import CrsModel
 from pipeline.scenario.effects import EffectsModel
-from pipeline.scenario.score import ScoreModel
+from pipeline.scenario.score import ScoreModel, gamma_for
 from pipeline.scenario.sensors import SensorModel
 from pipeline.scenario.traffic import TrafficModel
 from pipeline.scenario.types import Latitude, Longitude, Name, Point2, Point3, Positive
@@ -283,6 +283,13 @@ class Scenario(StrictModel):
         return scenarios
 
     @property
+    def gamma(self) -> float:
+        """``score.gamma``, or the number that "auto" stands for in this scenario."""
+        if self.score.gamma != "auto":
+            return self.score.gamma
+        return gamma_for(self.roi.voxel_m, moving_occlusion="moving_occlusion" in self.effects.named)
+
+    @property
     def is_recorded(self) -> bool:
         """Whether its traffic, or that of a period, is a finished file."""
         return any(traffic.fcd is not None for _, traffic in self._traffic_by_period())
@@ -303,8 +310,9 @@ class Scenario(StrictModel):
         return self.folder / FILE
 
     def with_effects(self, effects: EffectsModel) -> Scenario:
-        """The same scenario with these effects instead of its own."""
-        other = self.model_copy(update={"effects": effects})
+        """The same scenario with these effects instead of its own; gamma stays the number that it is."""
+        score = self.score.model_copy(update={"gamma": self.gamma})
+        other = self.model_copy(update={"effects": effects, "score": score})
         other._folders, other._period = self._folders, self._period
         return other
 

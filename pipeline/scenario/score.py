@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 
@@ -12,11 +12,25 @@ OtherScore = Literal["entropy_seen", "points_on_target", "seen_well"]
 """Scores beside the EGVS."""
 
 
+_AT_ONE_METRE, _POWER = 10.0, 1.16
+"""Through the gammas that rank best on the study's training junctions (docs/validity.md, B): 2, 5 and 10 for voxels of
+0.25, 0.5 and 1 m; 1, 2 and 5 with moving occlusion. A line through three points each, of one sensor, no law."""
+
+
+def gamma_for(voxel_m: float, *, moving_occlusion: bool) -> float:
+    r"""The gamma that ``"auto"`` stands for: :math:`10 (d / 1 m)^{1.16}` for voxels of d metres, half of that with
+    moving occlusion; to two significant digits."""
+    gamma = _AT_ONE_METRE * voxel_m**_POWER
+    return float(f"{gamma / 2 if moving_occlusion else gamma:.2g}")
+
+
 class ScoreModel(StrictModel):
     """How a site is scored."""
 
-    gamma: float = Field(
-        10.0, ge=0, allow_inf_nan=True, description="Beams in a voxel above this number count no more; may be inf"
+    gamma: Annotated[float, Field(ge=0, allow_inf_nan=True)] | Literal["auto"] = Field(
+        "auto",
+        description="Beams in a voxel above this number count no more; may be inf. 'auto': by the size of the voxels, "
+        "10 (voxel_m / 1 m)^1.16 (2 for 0.25 m, 10 for 1 m), half of that with moving_occlusion",
     )
     rank_by: Literal["egvs", OtherScore] = Field("egvs", description="The score that sites are ranked by")
     others: tuple[OtherScore, ...] = Field(

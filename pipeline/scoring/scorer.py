@@ -84,7 +84,7 @@ class Scorer:
         self._built_from = (scene, tpog, trajectories, leave_out, periods)
         fields = (EntropyField.of(its.tpog.counts, its.tpog.frames, its.tpog.grid) for its in periods)
         self._periods = tuple(zip(fields, (its.leave_out for its in periods), strict=True))
-        self._leave_out, self._gamma = leave_out, scene.scenario.score.gamma
+        self._leave_out, self._gamma = leave_out, scene.scenario.gamma
         self._asks_entropy_seen = "entropy_seen" in scene.scenario.score.asked
         self.field = EntropyField.of(tpog.counts, tpog.frames, tpog.grid)
         self._visibility = Visibility(scene, tpog, trajectories)

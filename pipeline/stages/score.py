@@ -71,7 +71,8 @@ class BeamAudit:
 def inputs(work: Workspace) -> StageInputs:
     """Gamma and what to keep; TPOG and scans by hash (without kept scans: what a scan depends on)."""
     scenario, live = work.scenario, scene_of(work).acting(Effect, "score")
-    settings: dict[str, Any] = {"name": scenario.name, "score": scenario.score.model_dump(mode="json")}
+    as_number = scenario.score.model_copy(update={"gamma": scenario.gamma})
+    settings: dict[str, Any] = {"name": scenario.name, "score": as_number.model_dump(mode="json")}
     if own := _own_columns(work):
         settings["own_columns"] = {name: column.to_pylist() for name, column in own.items()}
     settings |= world_frame.key(scenario)
@@ -133,7 +134,12 @@ def run(
     ranking, others = judged[wanted.rank_by], [judged[name] for name in wanted.asked]
     sites = [d.site.to_json() for d in done]
     about = work.metadata(
-        inputs, gamma=wanted.gamma, rank_by=wanted.rank_by, grid=tpog.grid.to_json(), frames=tpog.frames, sites=sites
+        inputs,
+        gamma=work.scenario.gamma,
+        rank_by=wanted.rank_by,
+        grid=tpog.grid.to_json(),
+        frames=tpog.frames,
+        sites=sites,
     )
     _write_visibility(work, done, about)
     _write_scores(work, done, judged, scorer.limit, about)
@@ -143,6 +149,8 @@ def run(
     period_scores.write(work.path(ARTEFACTS[2]), names, worths, ranking, apart, periods, limits, about)
     best = [name for name, rank in zip(names, ranking.rank, strict=True) if rank == 1]
     summary: Summary = {"sites": len(done), "best": best, "rank_by": wanted.rank_by, "egvs_limit": scorer.limit}
+    if wanted.gamma == "auto":
+        summary["gamma_auto"] = work.scenario.gamma
     if skipped := scene_of(work).skipped(NAME):
         summary["skipped"] = skipped
     doubts = period_scores.disagreements(names, ranking, periods)

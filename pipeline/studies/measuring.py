@@ -124,10 +124,14 @@ class SettingRunner:
         except OSError as error:
             raise InputError(self._kept, f"is no folder to work in ({error.strerror})", "remove it") from None
         self._results: dict[Setting, Path] = {}
+        self._gamma: float | None = None
 
     def scenario(self, setting: Setting) -> Scenario:
-        """The scenario as this setting has it."""
-        scenario = load(self._path, [*self._sets, *setting.overrides])
+        """The scenario as this setting has it; gamma stays the number that the study's own scenario has, unless the
+        setting names another."""
+        if self._gamma is None:
+            self._gamma = load(self._path, self._sets).gamma
+        scenario = load(self._path, [*self._sets, f"score.gamma={self._gamma}", *setting.overrides])
         if setting.without is None:
             return scenario
         return scenario.with_effects(scenario.effects.without(setting.without))
@@ -303,7 +307,7 @@ def _with_one_site(scenario: Scenario) -> Scenario:
 def _scores(work: Workspace, keys: dict[str, str], weight: float, scored: list[ScoredSite]) -> SettingScores:
     """What came of all stages; ``scored`` are the sites as the score stage scored them, none where it was fetched."""
     table = tables.read(work.path("scores.parquet"), "scores")[0].to_pydict()
-    tpog, gamma = read_tpog(work.path("tpog.parquet")), work.scenario.score.gamma
+    tpog, gamma = read_tpog(work.path("tpog.parquet")), work.scenario.gamma
     names, scores = table["site"], np.array(table["egvs"])
     unit = 1.0 / weight if math.isinf(gamma) else gamma  # a finite gamma is divided by the weight already
     most = EntropyField.of(tpog.counts, tpog.frames, tpog.grid).limit(unit)

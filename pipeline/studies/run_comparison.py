@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.artefacts import tables
 from pipeline.artefacts.readers import read_scores
 from pipeline.artefacts.run_record import RECORD, RunRecord
 from pipeline.core import files
@@ -127,6 +128,8 @@ def _read(folder: Path, label: str) -> ComparedRun:
         if name not in made
     }
     settings = {**dict(_flat(record.scenario)), "egvs (version)": record.egvs}
+    if settings.get("score.gamma") == "auto":  # the number that it stood for
+        settings["score.gamma"] = tables.read_metadata(path, "scores")["gamma"]
     if (version := record.stages["traffic"].summary.get("sumo") if "traffic" in record.stages else None) is not None:
         settings["sumo (version)"] = version
     return ComparedRun(label, folder, {row["site"]: _result(row) for row in rows}, settings, read)

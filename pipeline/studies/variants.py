@@ -183,7 +183,7 @@ def _thinned(scenario: Scenario) -> Iterator[Setting]:
 
 
 def _weighted(scenario: Scenario, name: str, knob: str, changes: list[str], weight: float) -> Setting:
-    gamma = f"score.gamma={scenario.score.gamma / weight}"
+    gamma = f"score.gamma={scenario.gamma / weight}"
     return Setting(name, APPROXIMATES, knob, (*changes, gamma), weight=weight)
 
 
@@ -210,7 +210,7 @@ def _sensor(scenario: Scenario, sensor: Sensor, factor: int, rings: range | list
 
 def _measures(scenario: Scenario) -> Iterator[Setting]:
     """Other voxels (with gamma as it is, and scaled by the face of a voxel), other caps, without an effect."""
-    own, gamma = scenario.roi.voxel_m, scenario.score.gamma
+    own, gamma = scenario.roi.voxel_m, scenario.gamma
     for voxel_m in VOXELS_M:
         if voxel_m == own or not _fits(scenario, voxel_m):
             continue

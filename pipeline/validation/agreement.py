@@ -89,7 +89,7 @@ class Validation:
     def own_score(self, scenario: Scenario) -> ScoreName:
         """EGVS as the scenario has it."""
         own = {
-            "gamma": "inf" if scenario.score.gamma == float("inf") else scenario.score.gamma,
+            "gamma": "inf" if scenario.gamma == float("inf") else scenario.gamma,
             "voxel_m": scenario.roi.voxel_m,
             "moving_occlusion": "moving_occlusion" in scenario.effects.named,
         }

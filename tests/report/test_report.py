@@ -94,7 +94,8 @@ def lane(grid):
 
 
 def finished(folder, sites=SITES, counts=lane, record=True, **keys):
-    """The folder of a run up to the scores, and its scenario."""
+    """The folder of a run up to the scores, and its scenario; it holds no trajectories."""
+    keys["score"] = {"gamma": 10.0, "others": []} | keys.get("score", {})
     about = scenario(folder / "scenario", sites, **keys)
     out, grid = folder / "out", about.roi.grid
     counted = counts(grid)

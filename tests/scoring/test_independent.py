@@ -67,7 +67,7 @@ class Scene:
         self.voxel = values["roi"].get("voxel_m", 0.25)
         centre, size = np.array(values["roi"]["center_m"]), np.array(values["roi"]["size_m"])
         self.origin, self.shape = centre - size / 2, np.round(size / self.voxel).astype(np.int64)
-        self.gamma = values.get("score", {}).get("gamma", 10)
+        self.gamma = values.get("score", {}).get("gamma", 2)  # what "auto" is for voxels of 0.25 m
         with (folder / "sites.csv").open() as file:
             self.sites = {row["site"]: row for row in csv.DictReader(file)}
 

@@ -198,7 +198,7 @@ def _chosen(names: Sequence[str] | None) -> tuple[list[Score], list[Finding]]:
 
 def _tasks(scenario: Scenario, chosen: Sequence[Score]) -> tuple[list[_Task], list[Finding]]:
     """What is tried; settings whose voxels do not fit the region of interest are left out, and told."""
-    own: dict[str, Value] = {VOXEL: scenario.roi.voxel_m, GAMMA: scenario.score.gamma}
+    own: dict[str, Value] = {VOXEL: scenario.roi.voxel_m, GAMMA: scenario.gamma}
     named = "moving_occlusion" in scenario.effects.named
     tasks, unfit = [], dict[float, Finding]()
     for score in chosen:
