@@ -5,14 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.artefacts.readers import read_periods, read_scores, read_scores_by_period
+from pipeline.artefacts import tables
+from pipeline.artefacts.readers import read_periods, read_scores
 
 PERIOD_SCORES = "scores_by_period.parquet"
 
 
 @dataclass(frozen=True)
 class InPeriod:
-    """A site in one period: its rank, and its score as a share of the best score there; 0 where that is 0."""
+    """A site in one period: its rank, and its score, the one that ranks, as a share of the best there; 0 where that is
+    0."""
 
     rank: int
     of_best: float
@@ -36,14 +38,15 @@ class PeriodRanking:
         if not (folder / PERIOD_SCORES).is_file():
             return None
         periods = read_periods(folder / "tpog.parquet")
-        rows = read_scores_by_period(folder / PERIOD_SCORES).to_pylist()
+        table, about = tables.read(folder / PERIOD_SCORES, "scores_by_period")
+        rows, by = table.to_pylist(), about.get("rank_by", "egvs")
         most: dict[str, float] = {}
         for row in rows:
-            most[row["period"]] = max(most.get(row["period"], 0.0), row["egvs"])
+            most[row["period"]] = max(most.get(row["period"], 0.0), row[by])
         of_site: dict[str, list[InPeriod]] = {}
         for row in rows:
             best = most[row["period"]]
-            of_best = row["egvs"] / best if best > 0 else 0.0
+            of_best = row[by] / best if best > 0 else 0.0
             of_site.setdefault(row["site"], []).append(InPeriod(row["rank"], of_best))
         mix = sorted(read_scores(folder / "scores.parquet").to_pylist(), key=lambda row: int(row["rank"]))
         weight = sum(period.weight for period in periods)

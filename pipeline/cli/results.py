@@ -9,11 +9,14 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.table import Table
 
+from pipeline.artefacts import tables
 from pipeline.artefacts.period_ranking import PeriodRanking
-from pipeline.artefacts.readers import SEPARABLE, read_scores
+from pipeline.artefacts.readers import SEPARABLE
 from pipeline.artefacts.run_record import RunRecord
 from pipeline.cli.terminal import NARROW, WIDE, console, in_words, table, value_in_words
-from pipeline.report.ranking import ScoredSite, poles_of
+from pipeline.report.evidence import disagreement, setting_of
+from pipeline.report.ranking import ScoredSite, beside, poles_of
+from pipeline.report.score_words import SCORES, ScoreWords
 
 if TYPE_CHECKING:
     from pipeline.checks.checking import Checked
@@ -21,37 +24,50 @@ if TYPE_CHECKING:
 
 _FILE_WIDTH = 150
 
+_ROOMY = 130
+"""Terminals with so many columns get another score beside the one that ranks."""
+
 
 def ranking_table(sites: Sequence[ScoredSite], width: int = WIDE, top: int | None = None) -> Table:
     """The ``top`` sites (all by default) by rank; without poses and sensors where the terminal is narrow."""
     is_wide, has_errors = width >= NARROW, any(site.egvs_se is not None for site in sites)
-    names = ["rank", "site", *(["x m", "y m", "z m", "sensor"] if is_wide else []), "EGVS bit"]
+    by, other = SCORES[sites[0].rank_by if sites else "egvs"], beside(sites) if width >= _ROOMY else None
+    names = ["rank", "site", *(["x m", "y m", "z m", "sensor"] if is_wide else []), by.head]
     names += ["std error", "beats next"] if has_errors else []
-    names += ["of best", "entropy seen", *(["beams in ROI"] if is_wide else [])]
+    names += ["of best", *([other.head] if other is not None else []), "entropy seen"]
+    names = [*dict.fromkeys(names), *(["beams in ROI"] if is_wide else [])]
     ranking = table(names, left=("site", "sensor"), whole=[name for name in names if name != "site"])
     by_rank = sorted(sites, key=lambda site: site.rank)
     shown = by_rank[:top]
     if not all(site.is_separable for site in shown):
         chance = f"the chance that it truly scores higher is below {SEPARABLE:.0%}"
         ranking.caption = f"~ not separable from the next site: {chance}"
-    best = max((site.egvs for site in sites), default=0.0)
+    best = max((site.score for site in sites), default=0.0)
     for site in shown:
         sure = "" if site.is_separable else "~ "
         cells = {
             "rank": str(site.rank), "site": site.site, "x m": f"{site.x_m:.2f}", "y m": f"{site.y_m:.2f}",
-            "z m": f"{site.z_m:.2f}", "sensor": site.sensor, "EGVS bit": f"{site.egvs:.1f}",
-            "std error": "-" if site.relative_se is None else f"{site.relative_se:.1%}",
+            "z m": f"{site.z_m:.2f}", "sensor": site.sensor, "entropy seen": f"{site.entropy_seen:.1%}",
+            **{its.head: _value(its, site) for its in (other, by) if its is not None},
+            "std error": by.error(site.score, site.score_se),
             "beats next": "-" if site.beats_next is None or site is by_rank[-1] else f"{sure}{site.beats_next:.0%}",
-            "of best": f"{site.egvs / best:.1%}" if best > 0 else "-", "entropy seen": f"{site.entropy_seen:.1%}",
+            "of best": f"{site.score / best:.1%}" if best > 0 else "-",
             "beams in ROI": str(site.beams_in_roi),
         }  # fmt: skip
         ranking.add_row(*(cells[name] for name in names))
     return ranking
 
 
+def _value(by: ScoreWords, site: ScoredSite) -> str:
+    """A site's value of a score; of the EGVS to a tenth of a bit."""
+    value = site.value_of(by.name)
+    return "-" if value is None else f"{value:.1f}" if by.name == "egvs" else by.value(value)
+
+
 def poles_table(sites: Sequence[ScoredSite], top: int | None = None) -> Table:
     """The ``top`` poles' best candidates, how they are mounted, and by how much they beat the worst ones there."""
-    names = ("rank", "pole", "best candidate", "z m", "yaw deg", "pitch deg", "EGVS bit", "of", "beats worst by")
+    by = SCORES[sites[0].rank_by if sites else "egvs"]
+    names = ("rank", "pole", "best candidate", "z m", "yaw deg", "pitch deg", by.head, "of", "beats worst by")
     rows = table(
         names, left=("pole", "best candidate"), whole=[n for n in names if n not in ("pole", "best candidate")]
     )
@@ -60,7 +76,7 @@ def poles_table(sites: Sequence[ScoredSite], top: int | None = None) -> Table:
         best = pole.best
         rows.add_row(
             str(best.rank), pole.name, best.site, f"{best.z_m:g}", f"{best.yaw_deg:.1f}", f"{best.pitch_deg:.1f}",
-            f"{best.egvs:.1f}", str(len(pole.sites)), "-" if pole.gain is None else f"{pole.gain:.1%}",
+            _value(by, best), str(len(pole.sites)), "-" if pole.gain is None else f"{pole.gain:.1%}",
         )  # fmt: skip
     return rows
 
@@ -134,10 +150,21 @@ def _weights(weights: Iterable[tuple[str, float]]) -> list[str]:
     return [f"{name} {share:.1%}" for name, share in weights]
 
 
+def _in_sentences(folder: Path, sites: Sequence[ScoredSite]) -> list[str]:
+    """What the best site does, where its score says that in words; and where another score has others first."""
+    about = tables.read_metadata(folder / "scores.parquet", "scores")
+    best = next((site for site in sites if site.rank == 1), None)
+    first = [] if best is None or best.rank_by == "egvs" else [f"{best.site} {best.by.sentence(best.score)}"]
+    other = disagreement(sites, setting_of(about["gamma"], about["grid"]["voxel_m"]))
+    return [*first, *([other] if other else [])]
+
+
 def _print_scores(out: Console, folder: Path, record: RunRecord, top: int | None) -> None:
     """The ranking of the ``top`` sites, the best of each pole, and the audit's worst case where there was one."""
-    sites = ScoredSite.all_of(read_scores(folder / "scores.parquet"))
+    sites = ScoredSite.read(folder / "scores.parquet")
     out.print(ranking_table(sites, out.width, top))
+    for line in _in_sentences(folder, sites):
+        out.print(line)
     if top is not None and len(sites) > top:
         out.print(f"... and {len(sites) - top} more: without --top, in {folder / 'scores.parquet'} or in the report")
     if len({site.pole for site in sites}) < len(sites):

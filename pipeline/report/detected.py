@@ -1,4 +1,4 @@
-"""What validation found of the sites of a run: how far the order by score and the order by detection agree."""
+"""What validation found of the sites of a run: how far the order by EGVS and the order by detection agree."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class DetectorSummary:
         share = sum(turn > 0 for turn in turns) / len(turns)
         between = "" if math.isnan(low) else f", between {low:.2f} and {high:.2f} with 95 % confidence"
         return (
-            f"Of {_sites(len(known))}, the order by score and the order by detection agree in {share:.0%} of pairs "
+            f"Of {_sites(len(known))}, the order by EGVS and the order by detection agree in {share:.0%} of pairs "
             f"(Kendall's tau {tau:.2f}{between})."
         )
 

@@ -26,6 +26,7 @@ from pipeline.report.detected import VALIDATION, ValidationSummary
 from pipeline.report.drawing import maps
 from pipeline.report.drawing.colours import STYLE_SHEET
 from pipeline.report.drawing.roads import network_file
+from pipeline.report.evidence import disagreement, setting_of
 from pipeline.report.figures import Figures
 from pipeline.report.ranking import Ranking, ScoredSite
 from pipeline.report.study import ACCURACY, StudySummary
@@ -190,11 +191,14 @@ def page(
         headline=wording.headline(ranking, has_traffic),
         lead=wording.lead(ranking),
         which_to_trust=wording.which_to_trust(ranking),
-        limit_share=wording.share_of_limit(sites[0]),
+        disagreement=disagreement(sites, setting_of(gamma, tpog.grid.voxel_m)),
+        limit_share=wording.share_of_limit(sites[0]) if ranking.by.name == "egvs" else None,
         separable=SEPARABLE,
         has_traffic=has_traffic,
         crowded=maps.is_crowded(sites),
         rings=maps.has_shared_places(sites),
+        by=ranking.by,
+        beside=ranking.beside,
         style=Markup(STYLE_SHEET),
         choose=Markup((TEMPLATES / "choose.js").read_text(encoding="utf-8")),
         gamma="∞" if math.isinf(gamma) else f"{gamma:g}",

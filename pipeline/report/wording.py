@@ -13,24 +13,27 @@ def headline(ranking: Ranking, has_traffic: bool) -> str:
     top = best[0]
     if not has_traffic:
         return "No traffic in the region: the sites cannot be ranked"
-    if not top.egvs > 0:
+    if not top.score > 0:
         return "No site sees anything of the traffic" if others else f"{top.site} sees nothing of the traffic"
     sees = f"sees {share(top.entropy_seen)} of the traffic’s uncertainty"
+    if top.rank_by != "egvs":
+        sees = top.by.sentence(top.score)
     if not others:
         return f"{top.site}, the only site, {sees}"
     if ranking.is_tie:
         same = f"All {len(best)} sites score the same"
-        return f"{same}: each {sees}" if len({site.entropy_seen for site in best}) == 1 else same
+        return f"{same}: each {sees}" if top.rank_by != "egvs" or len({s.entropy_seen for s in best}) == 1 else same
     if len(best) > 1:
         few = len(best) <= 4
         names = ", ".join(s.site for s in best[:-1]) if few else f"{top.site} and {len(best) - 2} others"
         return f"{names} and {best[-1].site} share the first place of {others + 1}: {top.site} {sees}"
-    return f"{top.site} is the best of {others + 1} sites"
+    outcome = f"{top.site} is the best of {others + 1} sites"
+    return outcome if top.rank_by == "egvs" else f"{outcome}: it {sees}"
 
 
 def lead(ranking: Ranking) -> str:
     """By how much the best leads, and who comes close; nothing where nobody leads."""
-    if ranking.is_tie or not ranking.best[0].egvs > 0:
+    if ranking.is_tie or not ranking.best[0].score > 0:
         return ""
     second = ranking.sites[len(ranking.best)]
     behind = 1 - ranking.of_best(second)
@@ -47,9 +50,10 @@ def lead(ranking: Ranking) -> str:
 
 
 def which_to_trust(ranking: Ranking) -> str:
-    """What entropy seen says beside the score, and which of the two to trust where they disagree."""
+    """What entropy seen says beside the EGVS, and which of the two to trust where they disagree; nothing where another
+    score ranks."""
     top, most = (max(sites, key=lambda site: site.entropy_seen) for sites in (ranking.best, ranking.sites))
-    if ranking.is_tie or not top.egvs > 0:
+    if ranking.is_tie or top.rank_by != "egvs" or not top.egvs > 0:
         return ""
     if most.entropy_seen - top.entropy_seen < 0.0005:
         it = "It" if len(ranking.best) == 1 else top.site
@@ -64,7 +68,7 @@ def which_to_trust(ranking: Ranking) -> str:
 def site_caption(site: ScoredSite, voxels_seen: int, voxels: int) -> str:
     """One site in numbers."""
     return (
-        f"{site.site}: rank {site.rank}, EGVS {whole(site.egvs)} bit, at x = {plain(site.x_m)} m, "
+        f"{site.site}: rank {site.rank}, {site.by.told(site.score)}, at x = {plain(site.x_m)} m, "
         f"y = {plain(site.y_m)} m, z = {plain(site.z_m)} m, with a {site.sensor}. "
         f"It sees {whole(voxels_seen)} of {whole(voxels)} uncertain voxels. "
         f"{whole(site.returns)} of its {whole(site.beams_in_roi)} beams towards the region end on the ground "

@@ -154,7 +154,7 @@ def run(
     if skipped := scene_of(work).skipped(NAME):
         summary["skipped"] = skipped
     doubts = period_scores.disagreements(names, ranking, periods)
-    doubts += targets.doubts() if targets is not None else []
+    doubts += targets.doubts(tpog, [period.tpog for period in periods]) if targets is not None else []
     doubts += [doubt for its in judged.values() for doubt in its.doubts()]
     if ranking.estimate is not None:
         records = [period.name for period in periods] or [""]

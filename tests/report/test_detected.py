@@ -25,28 +25,28 @@ def _summary(values, tau):
     [
         (  # five of six pairs go the same way
             (0.9, 0.5, 0.6, 0.1), (0.67, 0.2, 1.0),
-            "Of 4 sites, the order by score and the order by detection agree in 83% of pairs (Kendall's tau 0.67, "
+            "Of 4 sites, the order by EGVS and the order by detection agree in 83% of pairs (Kendall's tau 0.67, "
             "between 0.20 and 1.00 with 95 % confidence).",
             "That is more than chance: a site with a higher score tends to detect more. The best by score, a, has rank "
             "1 by detection.",
         ),
         (  # equal values are no pair that goes one way
             (0.5, 0.5, 0.6, 0.1), (0.18, -0.5, 0.8),
-            "Of 4 sites, the order by score and the order by detection agree in 60% of pairs (Kendall's tau 0.18, "
+            "Of 4 sites, the order by EGVS and the order by detection agree in 60% of pairs (Kendall's tau 0.18, "
             "between -0.50 and 0.80 with 95 % confidence).",
             "4 sites do not tell: the interval holds 0, and chance alone may order sites like this. The best by score, "
             "a, has rank 2 by detection.",
         ),
         (
             (0.1, 0.2, 0.3, 0.4), (-1.0, -1.0, -0.4),
-            "Of 4 sites, the order by score and the order by detection agree in 0% of pairs (Kendall's tau -1.00, "
+            "Of 4 sites, the order by EGVS and the order by detection agree in 0% of pairs (Kendall's tau -1.00, "
             "between -1.00 and -0.40 with 95 % confidence).",
             "The score orders these sites the wrong way round: one with a higher score tends to detect less. The best "
             "by score, a, has rank 4 by detection.",
         ),
         (
             (None, 0.3, 0.2, 0.1), (1.0, NAN, NAN),
-            "Of 3 sites, the order by score and the order by detection agree in 100% of pairs (Kendall's tau 1.00).",
+            "Of 3 sites, the order by EGVS and the order by detection agree in 100% of pairs (Kendall's tau 1.00).",
             "How sure that is cannot be told from 3 sites.",
         ),
         (

@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+from typing import get_args
+
 from pipeline.report import wording
+from pipeline.report.evidence import disagreement, setting_of
 from pipeline.report.ranking import Ranking, ScoredSite
+from pipeline.report.score_words import SCORES
+from pipeline.scenario.score import OtherScore
 
 
 def ranking(*rows: tuple[str, float, int, float, float]) -> Ranking:
@@ -13,6 +20,75 @@ def ranking(*rows: tuple[str, float, int, float, float]) -> Ranking:
         for site, egvs, rank, seen, beats in rows
     )
     return Ranking(sites, tuple(site for site in sites if site.rank == 1), ())
+
+
+def by_vehicles(*rows: tuple[str, float, float], rank_by: str = "expected_detections") -> Ranking:
+    """From (site, EGVS, share of vehicles found), ranked by the latter, best first."""
+    sites = tuple(
+        replace(site, rank_by=rank_by, others=(("expected_detections", found, 0.01),))
+        for site, (_, _, found) in zip(
+            ranking(*((name, egvs, i + 1, 0.5, 0.99) for i, (name, egvs, _) in enumerate(rows))).sites,
+            rows,
+            strict=True,
+        )
+    )
+    return Ranking(sites, sites[:1], ())
+
+
+def test_a_score_over_vehicles_is_told_in_a_planners_words() -> None:
+    found = by_vehicles(("a", 50.0, 0.871), ("b", 90.0, 0.8), ("c", 20.0, 0.4))
+    assert wording.headline(found, has_traffic=True) == "a is the best of 3 sites: it finds 87% of vehicles"
+    assert wording.lead(found) == "It leads b, the next, by 8.2% of its score."
+    assert wording.which_to_trust(found) == ""
+    assert wording.site_caption(found.sites[0], 1, 2).startswith("a: rank 1, the share of vehicles found 87.1%, at x")
+    assert found.sites[0].score_se == 0.01 and found.beside is SCORES["egvs"]
+    assert (
+        wording.headline(by_vehicles(("a", 50.0, 0.871)), has_traffic=True) == "a, the only site, finds 87% of vehicles"
+    )
+    assert by_vehicles(("a", 50.0, 0.9), rank_by="egvs").beside is SCORES["expected_detections"]
+    assert ranking(("a", 50.0, 1, 0.5, 1.0)).beside is None
+
+
+def test_values_and_errors_in_tables() -> None:
+    egvs, found, points = SCORES["egvs"], SCORES["expected_detections"], SCORES["points_on_target"]
+    assert (egvs.value(12345.6), found.value(0.8712), points.value(3.456)) == ("12,346", "87.1%", "3.46")
+    assert (egvs.error(200.0, 3.0), found.error(0.5, 0.012), points.error(2.0, 0.1)) == ("1.5%", "±1.2%", "5.0%")
+    assert (egvs.error(0.0, 3.0), found.error(0.5, math.nan), found.value(math.nan)) == ("-", "-", "-")
+    assert (egvs.title, found.title, points.title) == ("EGVS<br>(bit)", "Found<br>of all", "Log<br>points")
+    assert set(SCORES) >= {"egvs", *get_args(OtherScore)}
+
+
+EGVS = setting_of(2.0, 0.25)
+
+
+def test_where_two_scores_have_other_sites_first() -> None:
+    rows = (("a", 50.0, 0.9), ("b", 90.0, 0.8), ("c", 20.0, 0.7), ("d", 80.0, 0.6))
+    told = disagreement(by_vehicles(*rows).sites, EGVS, {})
+    assert told == (
+        "The EGVS has b, d and a first, the share of vehicles found has a, b and c: which of them goes better with"
+        " detection was not measured for this gamma and voxel size."
+    )
+    assert disagreement(by_vehicles(*rows, rank_by="egvs").sites, EGVS, {}) == told  # whichever ranks
+    rho = {"expected_detections": {"cluster": 0.9, "pointpillars": 0.8}, EGVS: {"cluster": 0.7, "pointpillars": 0.6}}
+    assert disagreement(by_vehicles(*rows).sites, EGVS, rho).endswith(
+        ": detection agrees with the share of vehicles found, rho with what is detected at junctions that chose"
+        " nothing: 0.90 against 0.70 (cluster) and 0.80 against 0.60 (pointpillars); see docs/validity.md."
+    )
+    for worse, who in ((0.5, "the EGVS"), (0.65, "neither")):
+        rho["expected_detections"] = {"cluster": worse, "pointpillars": worse if worse < 0.6 else 0.55}
+        rho["expected_detections"]["pointpillars"] = 0.5 if worse == 0.5 else 0.7
+        assert f"detection agrees with {who}, rho" in disagreement(by_vehicles(*rows).sites, EGVS, rho)
+    assert "was not measured" in disagreement(by_vehicles(*rows).sites, setting_of(10.0, 0.25), rho)
+
+
+def test_scores_that_agree_are_not_told() -> None:
+    same = (("a", 90.0, 0.9), ("b", 60.0, 0.8), ("c", 70.0, 0.7), ("d", 50.0, 0.6))  # the second and the third change
+    assert disagreement(by_vehicles(*same).sites, EGVS, {}) == ""
+    other_first = (("a", 60.0, 0.9), ("b", 90.0, 0.8), ("c", 70.0, 0.7), ("d", 50.0, 0.6))
+    assert disagreement(by_vehicles(*other_first).sites, EGVS, {}).startswith("The EGVS has b, c and a first")
+    assert disagreement(ranking(("a", 9.0, 1, 0.5, 1.0)).sites, EGVS, {}) == ""  # not asked for
+    unknown = by_vehicles(("a", 60.0, math.nan), ("b", 90.0, 0.8)).sites
+    assert disagreement(unknown, EGVS, {}) == ""
 
 
 def test_the_one_beside_the_next_says_whether_the_first_can_be_told_from_it() -> None:

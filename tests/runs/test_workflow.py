@@ -240,21 +240,25 @@ def test_another_seed_in_the_same_folder_changes_no_byte_of_what_is_not_random(
     assert egvs("verify", out)[0] == 0
 
 
+@pytest.mark.parametrize("by", ["egvs", "seen_well", "points_on_target", "entropy_seen"])
 @pytest.mark.parametrize("width", [80, 120, 190])
-def test_a_ranking_fits_the_terminal(mini: Path, tmp_path: Path, width: int) -> None:
+def test_a_ranking_fits_the_terminal(mini: Path, tmp_path: Path, width: int, by: str) -> None:
     """No number is cut, on the narrowest terminal too."""
     from rich.console import Console
 
     from pipeline.cli.results import ranking_table
 
-    pipeline.run(pipeline.load(mini), tmp_path)
+    pipeline.run(pipeline.load(mini, [f"score.rank_by={by}"]), tmp_path)
     table = pipeline.read_scores(tmp_path / "scores.parquet")
     console = Console(width=width, record=True, file=io.StringIO())
-    console.print(ranking_table(ScoredSite.all_of(table), width))
+    console.print(ranking_table(ScoredSite.read(tmp_path / "scores.parquet"), width))
     text = console.export_text()
     assert "…" not in text
     assert all(len(line) <= width for line in text.splitlines())
-    assert all(f"{egvs:.1f}" in text for egvs in table["egvs"].to_pylist())
+    if by == "egvs" or width > 130:
+        assert all(f"{egvs:.1f}" in text for egvs in table["egvs"].to_pylist())
+    told = (lambda value: f"{value:.2f}") if by == "points_on_target" else (lambda value: f"{value:.1%}")
+    assert by == "egvs" or all(told(value) in text for value in table[by].to_pylist())
 
 
 @pytest.mark.parametrize("words", [("run",), ("accuracy", "--budget", "20s")])

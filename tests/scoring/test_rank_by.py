@@ -137,8 +137,9 @@ def test_no_vehicle_in_the_region_is_refused_where_vehicles_rank(mini: Path, tmp
     assert 'or rank_by = "egvs"' in told
     assert not (tmp_path / "a" / "scores.parquet").exists()
     record = pipeline.run(loading.load(mini, away[1::2]), tmp_path / "b", jobs=1)
-    (doubt,) = (it for it in warnings_of([record.stages["score"].summary]) if it.rule == "no vehicles")
-    assert "in the 40 frames looked at: seen_well is no number" in doubt.found
+    assert [it.rule for it in warnings_of(stage.summary for stage in record.stages.values())] == [
+        "traffic in the region"
+    ]
     assert math.isnan(read_scores(tmp_path / "b" / "scores.parquet")["seen_well"][0].as_py())
 
 
@@ -185,3 +186,33 @@ def test_unknown_scores_are_refused(mini: Path, tmp_path: Path, egvs, override: 
     code, _, told = egvs("run", mini, "--out", tmp_path / "run", "--set", override)
     assert code == 2
     assert message in told, told
+
+
+def test_traffic_without_a_vehicles_centre_is_told(mini: Path, tmp_path: Path) -> None:
+    """Cars reach into a narrow region, but none has its centre there."""
+    (mini / "near.csv").write_text("site,x_m,y_m,z_m\nnear,20,12,3\n")
+    edge = ["roi.center_m=[20, 12.9, 2.5]", "roi.size_m=[40, 20, 5]", "sites.file=near.csv"]
+    record = pipeline.run(loading.load(mini, edge), tmp_path / "run", jobs=1)
+    told = [it for it in warnings_of([record.stages["score"].summary]) if it.rule == "no vehicles"]
+    values = read_scores(tmp_path / "run" / "scores.parquet")["seen_well"].to_pylist()
+    assert read_tpog(tmp_path / "run" / "tpog.parquet").counts.any()
+    assert [it.found for it in told] == [
+        "no vehicle has its centre in the region of interest in the 40 frames looked at: seen_well is no number"
+    ]
+    assert math.isnan(values[0])
+
+
+def test_terminal_and_report_show_the_score_that_ranks(mini: Path, tmp_path: Path, egvs) -> None:  # type: ignore[no-untyped-def]
+    code, printed, _ = egvs("run", mini, "--out", tmp_path, "--set", "score.rank_by=seen_well")
+    assert code == 0
+    best = next(row for row in read_scores(tmp_path / "scores.parquet").to_pylist() if row["rank"] == 1)
+    says = f"sees {best['seen_well']:.0%} of vehicles well"
+    head = printed.splitlines()[0].split()
+    assert head.index("well") < head.index("EGVS")
+    assert f"{best['site']} {says}" in printed.splitlines()
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert f"{best['site']} is the best of 2 sites: it {says}" in page
+    assert "Sites are ranked by the share of vehicles that they see well" in page
+    assert 'data-label="seen well"' in page
+    assert 'data-label="EGVS bit"' in page
+    assert egvs("verify", tmp_path)[0] == 0

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from pipeline.core.grid import Grid
 from pipeline.report.drawing.colours import STEPS, STYLE_SHEET, opacity
+from pipeline.report.score_words import SCORES, ScoreWords
 
 Box = tuple[float, float, float, float]
 """x0, y0, x1, y1: in the world frame, metres, or in a figure's units."""
@@ -38,6 +39,16 @@ class MapSite:
     z_m: float
     egvs: float
     rank: int
+
+    @property
+    def score(self) -> float:
+        """Its value of the score that ranks."""
+        return self.egvs
+
+    @property
+    def by(self) -> ScoreWords:
+        """The score that ranks."""
+        return SCORES["egvs"]
 
 
 def extent(grid: Grid, sites: Sequence[MapSite]) -> Box:

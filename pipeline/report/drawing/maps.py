@@ -86,7 +86,7 @@ def site_map(grid: Grid, values: ColumnValues, backdrop: Backdrop, sites: Sequen
     """
     plan = Plan(extent(grid, sites), "sites", north=True)
     places = _places(sites)
-    crowded, low, high = is_crowded(sites), min(s.egvs for s in sites), max(s.egvs for s in sites)
+    crowded, low, high = is_crowded(sites), min(s.score for s in sites), max(s.score for s in sites)
     streets, street_boxes = _street_names(plan, backdrop.roads.names, sites)
     radius = 8.5 if not crowded else 6.0 if len(places) <= 120 else 4.0
     parts = [
@@ -99,7 +99,8 @@ def site_map(grid: Grid, values: ColumnValues, backdrop: Backdrop, sites: Sequen
     parts += [_rings(plan, place, low, high, radius, crowded) for place in reversed(places)]
     named = places if not crowded else [*places[:10], places[-1]]
     parts += _labels(plan, places, named, radius, street_boxes)
-    return plan.svg(parts, alt, bar=ColourBar(low, high, "EGVS (bit)", even=True) if high > low else None)
+    bar = ColourBar(low, high, sites[0].by.label, even=True) if high > low else None
+    return plan.svg(parts, alt, bar=bar)
 
 
 def site_view(grid: Grid, values: ColumnValues, peak: float, view: SiteView, prefix: str, alt: str) -> str:
@@ -216,12 +217,12 @@ def _rings(plan: Plan, place: Place, low: float, high: float, radius: float, cro
     x, y = plan.x(place[0].x_m), plan.y(place[0].y_m)
     shown = [*place[:3], place[-1]] if len(place) > 4 else place
     circles = [
-        f'<circle class="q{colours.step(s.egvs, low, high)}" cx="{x:.1f}" cy="{y:.1f}" r="{radius + 3.5 * i:.1f}"/>'
+        f'<circle class="q{colours.step(s.score, low, high)}" cx="{x:.1f}" cy="{y:.1f}" r="{radius + 3.5 * i:.1f}"/>'
         for i, s in reversed(list(enumerate(shown)))
     ]
-    tone = "high" if 2 * colours.step(place[0].egvs, low, high) > colours.STEPS else "low"
+    tone = "high" if 2 * colours.step(place[0].score, low, high) > colours.STEPS else "low"
     rank = "" if crowded else f'<text class="rank {tone}" x="{x:.1f}" y="{y + 3.4:.1f}">{place[0].rank}</text>'
-    title = "; ".join(f"{s.site}: rank {s.rank}, EGVS {s.egvs:,.0f} bit, height {s.z_m:g} m" for s in place)
+    title = "; ".join(f"{s.site}: rank {s.rank}, {s.by.told(s.score)}, height {s.z_m:g} m" for s in place)
     first = " first" if place[0].rank == 1 else ""
     shown_by = f'class="site{first}" data-site="{escape(place[0].site)}"'
     return f"<g {shown_by}><title>{escape(title)}</title>{''.join(circles)}{rank}</g>"

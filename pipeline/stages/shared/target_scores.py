@@ -7,13 +7,13 @@ mean of what that is worth, of all vehicles, with each group of frames left out,
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from pipeline.artefacts.periods import PeriodBlocks
-from pipeline.artefacts.readers import read_periods
+from pipeline.artefacts.readers import Tpog, read_periods
 from pipeline.core.errors import InputError
 from pipeline.core.findings import Finding
 from pipeline.core.grid import Grid
@@ -93,18 +93,19 @@ class Targets:
         apart = ({name: mean(worth[rows]) for name, worth in worths.items()} for _, rows in self._periods)
         return SiteTargets(whole, tuple(apart))
 
-    def doubts(self) -> list[Finding]:
-        """A warning where scores are no numbers: for want of vehicles in the region, at all or in a period."""
+    def doubts(self, tpog: Tpog, by_period: Sequence[Tpog]) -> list[Finding]:
+        """A warning where scores are no numbers though the region has traffic, at all or in a period; that it has none
+        is told where traffic is counted."""
         names = " and ".join(self._names)
-        if not names:
+        if not names or not tpog.counts.any():
             return []
         cure = "the region of interest should hold the road"
         if self.is_empty:
             return [Finding("no vehicles", f"{FILE}: roi", f"{self._nobody}: {names} is no number", cure)]
         return [
             Finding("no vehicles", f"{FILE}: traffic.periods ({name})", f"{self._nobody}: {names} is no number", cure)
-            for name, rows in self._periods
-            if rows.start == rows.stop
+            for (name, rows), its in zip(self._periods, by_period, strict=True)
+            if rows.start == rows.stop and its.counts.any()
         ]
 
     @property

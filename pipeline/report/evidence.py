@@ -1,0 +1,69 @@
+"""What the study says of scores (docs/validity.md), and where two of them rank the first sites of a run otherwise.
+
+The numbers stand here alone, taken from the study's tables: Spearman's rho of a score with what a detector finds, over
+the sites of the junctions that chose nothing. What is not measured is not there, and nothing is said of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from pipeline.report.ranking import ScoredSite
+from pipeline.report.score_words import RECOMMENDED, SCORES
+
+FIRST = 3
+"""So many of the best sites are held against each other."""
+
+RHO: Mapping[str, Mapping[str, float]] = {}
+"""Score -> detector -> rho on held-out junctions, given sites and grid together. The EGVS goes by its setting, as
+:func:`setting_of` names it, e.g. "egvs, gamma 2, voxels of 0.25 m"."""
+
+
+def setting_of(gamma: float, voxel_m: float) -> str:
+    """The EGVS of a run, as :data:`RHO` names it."""
+    return f"egvs, gamma {gamma:g}, voxels of {voxel_m:g} m"
+
+
+def disagreement(sites: Sequence[ScoredSite], egvs: str, rho: Mapping[str, Mapping[str, float]] | None = None) -> str:
+    """Where the EGVS and the recommended score put other sites first: which ones, and which of the two goes better with
+    detection; nothing where they agree, or a score is not there.
+
+    Parameters
+    ----------
+    egvs
+        The setting of the run's EGVS, see :func:`setting_of`.
+    rho
+        Evidence, :data:`RHO` by default.
+    """
+    by_egvs, by_other = (_first(sites, name) for name in ("egvs", RECOMMENDED))
+    if not by_egvs or not by_other or (by_egvs[0] == by_other[0] and set(by_egvs) == set(by_other)):
+        return ""
+    noun = SCORES[RECOMMENDED].noun
+    what = f"The EGVS has {_listed(by_egvs)} first, {noun} has {_listed(by_other)}"
+    return f"{what}: {_verdict(noun, egvs, RHO if rho is None else rho)}"
+
+
+def _first(sites: Sequence[ScoredSite], name: str) -> tuple[str, ...]:
+    """The best sites by one score, those of equal scores in the order of the sites; none where a value is missing."""
+    values = [site.value_of(name) for site in sites]
+    if any(value is None for value in values):
+        return ()
+    ranked = sorted(zip(sites, values, strict=True), key=lambda its: -float(its[1] or 0.0))
+    return tuple(site.site for site, _ in ranked[:FIRST])
+
+
+def _verdict(noun: str, egvs: str, rho: Mapping[str, Mapping[str, float]]) -> str:
+    """Which of the two detection agrees with, as far as was measured."""
+    theirs, own = rho.get(RECOMMENDED, {}), rho.get(egvs, {})
+    shared = [name for name in theirs if name in own]
+    if not shared:
+        return "which of them goes better with detection was not measured for this gamma and voxel size."
+    numbers = " and ".join(f"{theirs[name]:.2f} against {own[name]:.2f} ({name})" for name in shared)
+    better = [theirs[name] > own[name] for name in shared]
+    who = noun if all(better) else "the EGVS" if not any(better) else "neither"
+    where = "rho with what is detected at junctions that chose nothing"
+    return f"detection agrees with {who}, {where}: {numbers}; see docs/validity.md."
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:-1]) + f" and {names[-1]}" if len(names) > 1 else names[0]
