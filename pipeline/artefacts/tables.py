@@ -125,6 +125,7 @@ _PROMISED: dict[str, tuple[str, ...]] = {
     "tpog": ("grid", "frames", "block_frames", "memory_frames"),
     "scans": ("sites",),
     "visibility": ("grid", "sites"),
+    "blindspots": ("sites", "cells", "points"),
     "accuracy": ("inputs", "tolerance", "stages"),
     "detection": ("inputs", "frames", "stages"),
     "correlation": ("inputs", "frames", "stages", "own_score", "shown"),
@@ -167,11 +168,23 @@ def _is_sound(key: str, value: Any) -> bool:
         return periods.are_sound(value)
     if key == "inputs":
         return isinstance(value, str)
+    if key == "cells":
+        return _are_cells(value)
     if key in ("stages", "own_score", "shown"):
         return isinstance(value, dict)
-    if key in ("tolerance", "memory_frames"):
+    if key in ("tolerance", "memory_frames", "points"):
         return isinstance(value, float) and 0 < value < math.inf
     return isinstance(value, int) and not isinstance(value, bool) and value > 0
+
+
+def _are_cells(value: Any) -> bool:
+    """Whether squares of a region are described: their corner, edge and number."""
+    try:
+        (x, y), edge, (nx, ny) = (value[key] for key in ("origin_m", "cell_m", "shape"))
+        grid = Grid.from_json({"origin_m": [x, y, 0.0], "voxel_m": edge, "shape": [nx, ny, 1]})
+    except (KeyError, TypeError, ValueError):
+        return False
+    return grid.voxel_m > 0 and min(grid.shape) > 0 and math.prod(grid.shape) <= MAX_VOXELS
 
 
 @contextmanager

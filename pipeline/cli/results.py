@@ -172,7 +172,10 @@ def _print_scores(out: Console, folder: Path, record: RunRecord, top: int | None
     by_period = PeriodRanking.read(folder)
     if by_period is not None:
         out.print(period_table(by_period, top))
-    audit = record.stages["score"].summary.get("audit")
+    summary = record.stages["score"].summary
+    if missed := summary.get("missed"):
+        out.print(missed)
+    audit = summary.get("audit")
     if audit:
         out.print(
             f"audit: chords add up to {audit['worst_sum']:.1e} of a beam's length at worst, longest piece in no voxel "

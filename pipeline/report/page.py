@@ -15,6 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from pipeline.artefacts.blindspots import BLINDSPOTS
 from pipeline.artefacts.period_ranking import PERIOD_SCORES, PeriodRanking
 from pipeline.artefacts.readers import SEPARABLE, Tpog, read_tpog
 from pipeline.artefacts.run_record import RECORD, RunRecord, StageRecord
@@ -71,7 +72,7 @@ def inputs(work: Workspace) -> StageInputs:
     else:
         cast = scan_inputs(work)
         settings["scan"], hashes = cast.settings, dict(cast.files)
-    beside = (PERIOD_SCORES, *ACCURACY, *VALIDATION)
+    beside = (PERIOD_SCORES, BLINDSPOTS, *ACCURACY, *VALIDATION)
     hashes |= work.digests(*(name for name in (*read, *beside) if work.path(name).is_file()))
     if (roads := network_file(work.folder)) is not None:
         hashes[roads.relative_to(work.folder).as_posix()] = files.sha256_of(roads)
@@ -110,6 +111,7 @@ def _shown(scenario: Scenario) -> dict[str, Any]:
         "vehicles": scenario.traffic.vehicles,
         "gamma": repr(scenario.gamma),
         "gamma_auto": scenario.score.gamma == "auto",
+        "blindspots": scenario.score.blindspots,
         "effects": scenario.effects.model_dump(mode="json"),
     }
 

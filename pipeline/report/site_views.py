@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core.grid import Grid
-from pipeline.report import wording
+from pipeline.report import blindspots, wording
+from pipeline.report.blindspots import Blindspots, BlindspotView
 from pipeline.report.drawing import maps, raster
 from pipeline.report.drawing.map_frame import Box, extent, shared_scale
 from pipeline.report.drawing.maps import Backdrop, SiteView
@@ -36,6 +37,9 @@ _CELLS = 300
 MANY = 40
 """Sites whose images are kept in full; of more, only those of the best and of the last."""
 
+_PALETTES = {"field": raster.FIELD, "scan": raster.DOTS, "vehicles": raster.SHARES}
+"""Of the images of a site, by the view that they belong to; those of no other view are of the field."""
+
 _COARSE_CELLS, _COARSE_PIXELS = 150, 30_000
 """The same for many sites, and the pixels of a field's image."""
 
@@ -49,16 +53,19 @@ class SitePanel:
     missed: str
     scan: str
     caption: str
+    vehicles: BlindspotView | None
 
 
 @dataclass(frozen=True)
 class SiteViews:
     """The panels of the best and of the last site, their colour scale, and ``data``: JSON from which the page draws
-    those of any other; ``is_coarse`` where it draws them with larger pixels.
+    those of any other; ``is_coarse`` where it draws them with larger pixels; a vehicle with so many ``points`` is seen,
+    0 where that is not shown.
     """
 
     panels: tuple[SitePanel, ...]
     scale: str
+    points: float
     data: str
     is_coarse: bool
 
@@ -81,25 +88,25 @@ def site_views(
     """Figures and data of the ``choosable`` sites; those of the best and of the last site are drawn."""
     grid, box, is_coarse = scorer.field.grid, extent(scorer.field.grid, choosable), len(choosable) > MANY
     peak = float(_columns(scorer.field, np.ones(len(scorer.field.cells), dtype=np.bool_)).max())
-    panels: dict[str, SitePanel] = {}
+    missed, panels = blindspots.read(work, choosable), dict[str, SitePanel]()
     choices: dict[str, dict[str, Any]] = {}
     for seen in _seen(work, choosable, scorer):
         images = _images(seen, peak, box, in_full=not is_coarse or seen.scored in ranking.extremes)
-        choices[seen.scored.site] = _choice(seen, images, box)
+        choices[seen.scored.site] = _choice(seen, images, missed, box)
         if seen.scored in ranking.extremes:
             number = ranking.extremes.index(seen.scored)
-            panels[seen.scored.site] = _panel(seen, grid, peak, images["scan"], backdrop, box, f"view-{number}")
+            panels[seen.scored.site] = _panel(seen, grid, peak, images["scan"], missed, backdrop, box, f"view-{number}")
     drawn = tuple(panels[site.site] for site in ranking.extremes)
     data = {
         "sites": {site.site: choices[site.site] for site in choosable},
-        "palettes": {
-            look: {"field": _text(raster.FIELD[look]), "scan": _text(raster.DOTS[look])} for look in raster.LOOKS
-        }
+        "palettes": {look: {name: _text(palette[look]) for name, palette in _PALETTES.items()} for look in raster.LOOKS}
         | {"shade": _text(raster.SHADE_PALETTE)},
         "end": _text(raster.END),
     }
     text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")  # no name may end the script
-    return SiteViews(drawn, shared_scale(peak, "Entropy in the column (bit)"), text, is_coarse)
+    return SiteViews(
+        drawn, shared_scale(peak, "Entropy in the column (bit)"), missed.points if missed else 0.0, text, is_coarse
+    )
 
 
 def _images(seen: _Seen, peak: float, box: Box, *, in_full: bool) -> dict[str, IndexedImage]:
@@ -131,14 +138,17 @@ def _ends_m(beams: Beams) -> NDArray[np.float64]:
     return ends
 
 
-def _choice(seen: _Seen, images: dict[str, IndexedImage], box: Box) -> dict[str, Any]:
+def _choice(seen: _Seen, images: dict[str, IndexedImage], missed: Blindspots | None, box: Box) -> dict[str, Any]:
     """What the page needs to draw one site's figures itself."""
     plan, site = maps.view_plan(box), seen.scored
+    more = {} if missed is None else {"vehicles": missed.choice(site.site, box)}
+    images = images | ({} if missed is None else {"vehicles": missed.image(site.site)})
     return {
         "at": [round(plan.x(site.x_m), 1), round(plan.y(site.y_m), 1)],
         "share": [wording.share(site.entropy_seen), wording.share(1 - site.entropy_seen)],
         "caption": seen.caption,
         "images": {name: [_text(image.head), _text(image.data)] for name, image in images.items()},
+        **more,
     }
 
 
@@ -147,7 +157,14 @@ def _text(data: bytes) -> str:
 
 
 def _panel(
-    seen: _Seen, grid: Grid, peak: float, scan: IndexedImage, backdrop: Backdrop, box: Box, prefix: str
+    seen: _Seen,
+    grid: Grid,
+    peak: float,
+    scan: IndexedImage,
+    missed: Blindspots | None,
+    backdrop: Backdrop,
+    box: Box,
+    prefix: str,
 ) -> SitePanel:
     site, view = seen.scored, SiteView(seen.scored, seen.crossed, backdrop, box)
     place = f"{site.site} at x = {site.x_m:g} m, y = {site.y_m:g} m"
@@ -158,7 +175,8 @@ def _panel(
 
     drawn = figure("seen", seen.seen_bit, site.entropy_seen), figure("missed", seen.missed_bit, 1 - site.entropy_seen)
     ends = maps.scan_view(grid, scan, view, f"{prefix}-scan", f"From above: where the beams of {place} end.")
-    return SitePanel(site, *drawn, ends, seen.caption)
+    vehicles = missed.view(site, grid, backdrop, box, f"{prefix}-vehicles") if missed else None
+    return SitePanel(site, *drawn, ends, seen.caption, vehicles)
 
 
 def _columns(field: EntropyField, which: NDArray[np.bool_]) -> ColumnValues:

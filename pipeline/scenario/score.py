@@ -39,6 +39,7 @@ class ScoreModel(StrictModel):
     keep_visibility: tuple[str, ...] | Literal["all"] = Field(
         (), description="Sites whose hits in every voxel are written to visibility.parquet"
     )
+    blindspots: bool = Field(True, description="Write blindspots.parquet: where each site misses vehicles")
     standard_error: bool = Field(True, description="Say how far each score may be off because the traffic was short")
 
     @field_validator("others")

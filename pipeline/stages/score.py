@@ -16,7 +16,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from pipeline.artefacts import schemas, tables
+from pipeline.artefacts import blindspots, schemas, tables
+from pipeline.artefacts.blindspots import BLINDSPOTS
 from pipeline.artefacts.foreign_columns import foreign_columns
 from pipeline.artefacts.period_ranking import PERIOD_SCORES
 from pipeline.artefacts.readers import read_tpog
@@ -30,6 +31,7 @@ from pipeline.formats.georeference import Georeference
 from pipeline.kernels import march
 from pipeline.scenario.models import FILE, Scenario
 from pipeline.scoring import uncertainty
+from pipeline.scoring.blindspots import table
 from pipeline.scoring.leave_out import LeaveOut
 from pipeline.scoring.scorer import Scorer, SiteScore
 from pipeline.scoring.targets.named import WORTHS
@@ -37,6 +39,7 @@ from pipeline.scoring.visibility import Beams, in_voxels
 from pipeline.sensing.sites import ScannedSite
 from pipeline.stages.base import StageInputs, Summary, Workspace
 from pipeline.stages.shared import period_scores
+from pipeline.stages.shared.blindspots import network_digests
 from pipeline.stages.shared.judged import Judged
 from pipeline.stages.shared.scans import SiteBeams, scans
 from pipeline.stages.shared.scene import SCANS, scan_inputs, scene_of, sensor_digests, sensor_settings
@@ -44,7 +47,7 @@ from pipeline.stages.shared.target_scores import TPOG, TRAJECTORIES, SiteTargets
 from pipeline.world import world_frame
 
 NAME = "score"
-ARTEFACTS = ("scores.parquet", "visibility.parquet", PERIOD_SCORES)
+ARTEFACTS = ("scores.parquet", "visibility.parquet", PERIOD_SCORES, BLINDSPOTS)
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,8 @@ def inputs(work: Workspace) -> StageInputs:
     hashes = work.digests(TPOG, *(name for effect in live for name in effect.reads))
     if _asks_targets(work):
         hashes |= work.digests(TRAJECTORIES)
+    if scenario.score.blindspots:
+        hashes |= network_digests(scenario)
     if live:
         hashes |= sensor_digests(scenario, scene_of(work).sites)
     modules = registry.modules(live)
@@ -95,8 +100,8 @@ def inputs(work: Workspace) -> StageInputs:
 def run(
     work: Workspace, inputs: StageInputs, audit: bool = False, observe: Callable[[ScoredSite], None] | None = None
 ) -> Summary:
-    """Score and rank all sites; write ``scores.parquet``, ``visibility.parquet`` where sites are to be kept, and
-    ``scores_by_period.parquet`` where the traffic has periods.
+    """Score and rank all sites; write ``scores.parquet``, ``visibility.parquet`` where sites are to be kept,
+    ``scores_by_period.parquet`` where the traffic has periods, and ``blindspots.parquet`` unless it is not wanted.
 
     Parameters
     ----------
@@ -142,6 +147,7 @@ def run(
         sites=sites,
     )
     _write_visibility(work, done, about)
+    _write_blindspots(work, done, targets, about)
     _write_scores(work, done, judged, scorer.limit, about)
     names, worths = [d.site.name for d in done], [d.score for d in done]
     apart = [other for other in others if other.name in WORTHS]
@@ -151,6 +157,8 @@ def run(
     summary: Summary = {"sites": len(done), "best": best, "rank_by": wanted.rank_by, "egvs_limit": scorer.limit}
     if wanted.gamma == "auto":
         summary["gamma_auto"] = work.scenario.gamma
+    if wanted.blindspots and (found := next(blindspots.read(work.path(BLINDSPOTS), best[:1]), None)):
+        summary["missed"] = found.in_words()
     if skipped := scene_of(work).skipped(NAME):
         summary["skipped"] = skipped
     doubts = period_scores.disagreements(names, ranking, periods)
@@ -170,8 +178,8 @@ def run(
 
 
 def _asks_targets(work: Workspace) -> bool:
-    """Whether a score is asked for that looks at the vehicles of recorded frames."""
-    return any(name in WORTHS for name in work.scenario.score.asked)
+    """Whether something is asked for that looks at the vehicles of recorded frames."""
+    return work.scenario.score.blindspots or any(name in WORTHS for name in work.scenario.score.asked)
 
 
 def _judged(name: str, done: list[ScoredSite], leave_out: LeaveOut | None) -> Judged:
@@ -240,6 +248,16 @@ def _worst(audits: list[BeamAudit]) -> dict[str, float]:
         "misplaced_chords": sum(audit.misplaced_chords for audit in audits),
         "voxels_visited_twice": sum(audit.voxels_visited_twice for audit in audits),
     }
+
+
+def _write_blindspots(work: Workspace, done: list[ScoredSite], targets: Targets | None, about: dict[str, Any]) -> None:
+    path = work.path(BLINDSPOTS)
+    if targets is None or targets.spots is None:
+        path.unlink(missing_ok=True)
+        return
+    seen = [d.targets.missed for d in done if d.targets is not None and d.targets.missed is not None]
+    names, mixed = [d.site.name for d in done], bool(work.scenario.traffic.periods)
+    table.write(path, targets.spots, names, seen, about, mixed=mixed)
 
 
 def _write_visibility(work: Workspace, done: list[ScoredSite], about: dict[str, Any]) -> None:

@@ -137,14 +137,16 @@ class Edge:
 
 @dataclass(frozen=True)
 class Connection:
-    """A way from one lane to another; ``source`` and ``target`` are positions in ``Network.edges``."""
+    """A way from one lane to another; ``source`` and ``target`` are positions in ``Network.edges``, ``direction`` is
+    SUMO's ("s", "l", "R" ...), and ``via`` the first lane inside the junction; both empty where none is named."""
 
     source: int
     source_lane: int
     target: int
     target_lane: int
-    turnaround: bool
+    direction: str
     permission: Permission
+    via: str
 
 
 @dataclass(frozen=True)
@@ -227,7 +229,7 @@ class Network:
         """(n, 3) of source edge, target edge, and 1 for a turnaround, for ``vclass``."""
         edges = self.edges
         usable = [
-            (c.source, c.target, int(c.turnaround))
+            (c.source, c.target, int(c.direction in _TURNAROUNDS))
             for c in self.connections
             if edges[c.source].lanes[c.source_lane].permission.admits(vclass)
             and edges[c.target].lanes[c.target_lane].permission.admits(vclass)
@@ -363,8 +365,8 @@ def _road_connections(connections: Iterable[dict[str, str]], roads: Sequence[Edg
             continue  # to or from a walking area or a crossing
         if lanes[0] >= len(roads[source].lanes) or lanes[1] >= len(roads[target].lanes):
             raise InputError(path, f"a <connection> from {start!r} names a lane that is not there", _RIGHT)
-        turnaround = connection.get("dir") in _TURNAROUNDS
-        yield Connection(source, lanes[0], target, lanes[1], turnaround, Permission.of(connection))
+        direction, via = connection.get("dir", ""), connection.get("via", "")
+        yield Connection(source, lanes[0], target, lanes[1], direction, Permission.of(connection), via)
 
 
 def _point(text: str) -> tuple[float, float]:

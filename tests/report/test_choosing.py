@@ -66,7 +66,8 @@ def expected(run: Path, site: str, kind: str) -> list[int]:
     head, pixels = data["sites"][site]["images"][kind]
     import base64
 
-    parts = (head, data["palettes"]["day"]["scan" if kind == "scan" else "field"], pixels, data["end"])
+    palette = data["palettes"]["day"].get(kind, data["palettes"]["day"]["field"])
+    parts = (head, palette, pixels, data["end"])
     joined = base64.b64encode(b"".join(map(base64.b64decode, parts))).decode()
     return decoded(f"data:image/png;base64,{joined}").ravel().tolist()
 
@@ -77,7 +78,7 @@ def test_every_site_can_be_chosen(browser_page: Any, run: Path) -> None:
     images = {}
     for name in names:
         browser_page.locator('[data-panel="1"] select').select_option(name)
-        images[name] = {kind: shown(browser_page, kind) for kind in ("seen", "missed", "scan")}
+        images[name] = {kind: shown(browser_page, kind) for kind in ("seen", "missed", "scan", "vehicles")}
         assert images[name] == {kind: expected(run, name, kind) for kind in images[name]}
         assert browser_page.locator('[data-panel="1"] figcaption').inner_text().startswith(f"{name}: rank ")
     assert len({str(image["seen"]) for image in images.values()}) == len(names)

@@ -93,6 +93,18 @@ def lane(grid):
     return counts
 
 
+def drive(path):
+    """Two cars, one behind the other, to the west along y = 4."""
+    rows = [
+        (frame, name, 11.5 - 0.2 * frame + ahead) for frame in range(FRAMES) for name, ahead in (("a", 0), ("b", -5))
+    ]
+    frame, vehicle, x_m = map(list, zip(*rows, strict=True))
+    fixed = {"part": 0, "kind": "passenger", "y_m": 4.0, "z_m": 0.75, "yaw_rad": np.pi, "pitch_rad": 0.0}
+    fixed |= {"length_m": 4.0, "width_m": 1.8, "height_m": 1.5}
+    columns = {"frame": frame, "vehicle": vehicle, "x_m": x_m} | {name: [v] * len(rows) for name, v in fixed.items()}
+    tables.write(path, "trajectories", columns, {"schema": 1, "frames": FRAMES})
+
+
 def finished(folder, sites=SITES, counts=lane, record=True, **keys):
     """The folder of a run up to the scores, and its scenario; it holds no trajectories."""
     keys["score"] = {"gamma": 10.0, "others": []} | keys.get("score", {})
@@ -104,6 +116,7 @@ def finished(folder, sites=SITES, counts=lane, record=True, **keys):
     columns = {"block": np.zeros(len(flat), dtype=np.uint16), **index, "count": counted.ravel()[flat].astype(np.uint32)}
     more = {"grid": grid.to_json(), "frames": FRAMES, "block_frames": FRAMES, "memory_frames": 1.0}
     tables.write(out / "tpog.parquet", "tpog", columns, {"schema": 1, **more})
+    drive(out / "trajectories.parquet")
     write_ply(out / "statics.ply", world(), {})
     run_stage(scan, about, out, jobs=1)
     run_stage(score, about, out, jobs=1)
@@ -237,7 +250,7 @@ def test_what_users_wrote_is_escaped_and_comes_through(made):
 
 def test_every_figure_says_what_it_shows(made):
     drawn = [values for tag, values in Reader(made[2]).tags if tag == "svg"]
-    assert len(drawn) == 9
+    assert len(drawn) == 11
     assert all(values["role"] == "img" and values["aria-label"] for values in drawn)
     rows = read_scores(made[1] / "scores.parquet").to_pylist()
     best = next(row for row in rows if row["rank"] == 1)
@@ -385,7 +398,7 @@ def test_one_site(tmp_path):
     text = page(*finished(tmp_path, sites=SITES[:1]))
     read = Reader(text)
     assert "north, the only site, sees" in read.text
-    assert sum(tag == "svg" for tag, _ in read.tags) == 6
+    assert sum(tag == "svg" for tag, _ in read.tags) == 7
 
 
 def test_no_traffic(tmp_path):

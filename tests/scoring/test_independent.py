@@ -281,6 +281,7 @@ def moved_run(folder, shift):
     values = json.loads(loaded.model_dump_json(exclude_unset=True))
     values["roi"]["center_m"] = [float(c) for c in np.array(values["roi"]["center_m"]) + shift]
     values["statics"] = {"ground": False}
+    values["score"]["blindspots"] = False  # lanes of a network that is not moved
     with (source / "sites.csv").open() as file:
         rows = list(csv.reader(file))
     for row in rows[1:]:

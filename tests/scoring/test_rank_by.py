@@ -158,13 +158,14 @@ def test_errors_that_are_not_known_are_told_as_such(mini: Path, tmp_path: Path) 
 
 
 def test_only_scores_over_vehicles_read_trajectories(mini: Path, tmp_path: Path) -> None:
-    plain = ["score.others=[]"]
+    plain = ["score.others=[]", "score.blindspots=false"]
     pipeline.run(loading.load(mini, plain), tmp_path, jobs=1)
     assert "trajectories.parquet" not in inputs_of(score, loading.load(mini, plain), tmp_path).files
     assert "trajectories.parquet" in inputs_of(score, loading.load(mini), tmp_path).files
     (tmp_path / "trajectories.parquet").unlink()
     run_stage(score, loading.load(mini, plain), tmp_path)
     assert "seen_well" not in read_scores(tmp_path / "scores.parquet").column_names
+    assert not (tmp_path / "blindspots.parquet").exists()
     assert read_tpog(tmp_path / "tpog.parquet").frames == 40
 
 

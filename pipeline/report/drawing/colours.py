@@ -79,6 +79,9 @@ stroke-linejoin: round; }}
 .plan .spot {{ fill: var(--halo); stroke: currentColor; stroke-width: 1.3; }}
 .plan .lead {{ stroke: currentColor; stroke-width: .9; fill: none; }}
 .plan .sensor {{ fill: #e8590c; stroke: var(--halo); stroke-width: 1.5; }}
+.plan .share {{ opacity: .88; }}
+.plan .worst circle {{ fill: var(--halo); stroke: currentColor; stroke-width: 1.4; }}
+.plan .worst text {{ font-weight: 700; font-size: 11px; text-anchor: middle; }}
 .plan image {{ image-rendering: pixelated; }}
 .plan .night {{ display: none; }}
 {_classes(ON_LIGHT)}

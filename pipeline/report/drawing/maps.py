@@ -4,9 +4,10 @@
 - :func:`site_map`: the sites, coloured by score, numbered by rank;
 - :func:`site_view`: what one site sees or misses; such figures share the colour scale
   :func:`pipeline.report.drawing.map_frame.shared_scale`;
-- :func:`scan_view`: where the beams of its empty scan end.
+- :func:`scan_view`: where the beams of its empty scan end;
+- :func:`missed_view`: the share of the vehicles that it misses, square by square, with the worst places numbered.
 
-Roads lie under all of them but the last.
+Roads lie under all of them but the empty scan.
 
 Names of sites are placed so that they hide little.
 """
@@ -21,6 +22,7 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.artefacts.blindspots import MOST_PLACES, SiteBlindspots
 from pipeline.core.grid import Grid
 from pipeline.report.drawing import colours, raster
 from pipeline.report.drawing.map_frame import Box, ColourBar, MapSite, Plan, extent
@@ -135,6 +137,36 @@ def scan_view(grid: Grid, image: IndexedImage, view: SiteView, prefix: str, alt:
     images = (plan.image(plan.whole, image.uri(raster.DOTS[look]), f"field {look}") for look in raster.LOOKS)
     parts = [_outline_paths(plan, view.backdrop.outlines), *images, plan.roi(grid), _sensor(plan, view.site)]
     return plan.svg(parts, alt)
+
+
+def missed_view(grid: Grid, seen: SiteBlindspots, site: MapSite, backdrop: Backdrop, box: Box, prefix: str) -> str:
+    """Which share of the vehicles over each square one site misses, with its worst places numbered. Its
+    image carries a class by which a page may exchange it; numbers beyond those of the worst places are hidden."""
+    plan, image = view_plan(box, prefix), raster.share_image(seen.share_missed)
+    (x, y), (nx, ny) = seen.origin_m, seen.share_missed.shape
+    place = plan.x(x), plan.y(y + ny * seen.cell_m), nx * seen.cell_m * plan.scale, ny * seen.cell_m * plan.scale
+    parts = [
+        _road_paths(plan, backdrop.roads),
+        *(plan.image(place, image.uri(raster.SHARES[look]), f"field share {look}") for look in raster.LOOKS),
+        _outline_paths(plan, backdrop.outlines),
+        plan.roi(grid),
+        _sensor(plan, site),
+        *(_numbered(number, at) for number, at in enumerate(numbers_at(plan, seen), 1)),
+    ]
+    missed = f"{1.0 - seen.whole.share:.1%} of the vehicles" if seen.whole else "vehicles, of which there are none"
+    bar = ColourBar(0.0, 100.0, "Share of the vehicles that is missed (%)", even=True)
+    return plan.svg(parts, f"From above: where {site.site} misses {missed}, square by square.", bar)
+
+
+def numbers_at(plan: Plan, seen: SiteBlindspots) -> list[tuple[float, float] | None]:
+    """Where the numbers of a site's worst places stand on a figure; None for those that it has not."""
+    worst = [(round(plan.x(place.x_m), 1), round(plan.y(place.y_m), 1)) for place in seen.worst]
+    return [*worst, *[None] * (MOST_PLACES - len(worst))]
+
+
+def _numbered(number: int, at: tuple[float, float] | None) -> str:
+    place = f'transform="translate({at[0]} {at[1]})"' if at else 'display="none"'
+    return f'<g class="worst" {place}><circle r="8.5"/><text y="4">{number}</text></g>'
 
 
 def view_plan(box: Box, prefix: str = "") -> Plan:

@@ -60,6 +60,12 @@ def field_image(values: ColumnValues, peak: float, most_pixels: int = MOST_PIXEL
     return IndexedImage.of(np.where(share > 0, 1 + np.floor(share * 253.999), 0).astype(np.uint8).T[::-1])
 
 
+def share_image(share: ColumnValues) -> IndexedImage:
+    """Shares from 0 to 1 on an even scale, for the palettes ``SHARES``; nothing where one is not a number."""
+    known = np.nan_to_num(share, nan=0.0)
+    return IndexedImage.of(np.where(np.isnan(share), 0, 1 + np.floor(known * 253.999)).astype(np.uint8).T[::-1])
+
+
 def shade_image(shaded: NDArray[np.bool_], most_pixels: int = MOST_PIXELS) -> IndexedImage:
     """A shade over columns of voxels, (nx, ny) bool, for ``SHADE_PALETTE``; where columns share a pixel, all must be
     shaded.
@@ -104,6 +110,10 @@ def _field_palette(stops: Sequence[str]) -> bytes:
     return _palette(b"\0\0\0" + b"".join(mixed(n, 254, stops) for n in range(255)), alpha)
 
 
+def _shares_palette(stops: Sequence[str]) -> bytes:
+    return _palette(b"\0\0\0" + b"".join(mixed(n, 254, stops) for n in range(255)), bytes([0, *[255] * 255]))
+
+
 def _dots_palette(ink: str) -> bytes:
     """One colour, the denser the more points: a single one is visible."""
     return _palette(bytes.fromhex(ink) * 256, bytes([0, *(min(255, 110 + 12 * i) for i in range(255))]))
@@ -117,5 +127,6 @@ def _deflate(data: bytes) -> bytes:
 
 END = _chunk(b"IEND", b"")
 FIELD = {"day": _field_palette(ON_LIGHT), "night": _field_palette(ON_DARK)}
+SHARES = {"day": _shares_palette(ON_LIGHT), "night": _shares_palette(ON_DARK)}
 DOTS = {"day": _dots_palette("1d2430"), "night": _dots_palette("e6e9ef")}
 SHADE_PALETTE = _palette(bytes((*SHADE[:3], *SHADE[:3])), bytes((0, SHADE[3])))

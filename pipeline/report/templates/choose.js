@@ -11,6 +11,21 @@
     element.setAttribute("href", address(image, palette));
     element.dataset.made = 1;
   };
+  const tell = (view, its) => {
+    view.querySelector(".share-vehicles").textContent = its.missed;
+    view.querySelector(".worst-note").textContent = its.note;
+    view.querySelector(".worst-places").replaceChildren(...its.worst.map(([words, rests]) => {
+      const item = document.createElement("li"), small = document.createElement("small");
+      small.textContent = rests;
+      item.append(words, small);
+      return item;
+    }));
+    view.querySelectorAll("g.worst").forEach((mark, number) => {
+      const at = its.numbers[number];
+      if (at) mark.setAttribute("transform", `translate(${at.join(" ")})`);
+      mark.setAttribute("display", at ? "inline" : "none");
+    });
+  };
   const choose = (panel, name) => {
     const site = data.sites[name];
     panel.querySelector("select").value = name;
@@ -18,12 +33,13 @@
     panel.querySelector(".share-seen").textContent = site.share[0];
     panel.querySelector(".share-missed").textContent = site.share[1];
     panel.querySelector("figcaption").textContent = site.caption;
-    for (const kind of ["seen", "missed", "scan"]) {
+    if (site.vehicles) tell(panel.querySelector("[data-view=vehicles]"), site.vehicles);
+    for (const kind of Object.keys(site.images).filter(kind => kind !== "shade")) {
       const svg = panel.querySelector(`[data-view=${kind}] svg`);
       svg.setAttribute("aria-label", `From above, ${kind}: ${site.caption}`);
       svg.querySelector(".sensor").setAttribute("transform", `translate(${site.at.join(" ")})`);
       for (const look of ["day", "night"]) {
-        const palette = data.palettes[look][kind === "scan" ? "scan" : "field"];
+        const palette = data.palettes[look][kind in data.palettes[look] ? kind : "field"];
         set(svg.querySelector(`.field.${look}`), site.images[kind], palette);
       }
       const shade = svg.querySelector(".shade");

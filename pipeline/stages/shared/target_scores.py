@@ -1,7 +1,8 @@
-"""What sites see of the vehicles of recorded frames, and the scores over them that a scenario asks for.
+"""What sites see of the vehicles of recorded frames: the scores over them that a scenario asks for, and blind spots.
 
 Steps: read some frames of ``trajectories.parquet`` once for all sites; count what a site sees of each vehicle; take the
-mean of what that is worth, of all vehicles, with each group of frames left out, and in each period alone.
+mean of what that is worth, of all vehicles, with each group of frames left out, and in each period alone; count at each
+place how many are seen well.
 """
 
 from __future__ import annotations
@@ -18,12 +19,14 @@ from pipeline.core.errors import InputError
 from pipeline.core.findings import Finding
 from pipeline.core.grid import Grid
 from pipeline.scenario.models import FILE
+from pipeline.scoring.blindspots.table import SiteSeen
 from pipeline.scoring.targets.frame_groups import FrameGroups, recorded_frames, weights_in_mix
 from pipeline.scoring.targets.named import WORTHS
 from pipeline.scoring.targets.record import Floats, TargetRecord
 from pipeline.scoring.targets.scores import mean
 from pipeline.scoring.targets.seen import SeenTargets, noticed_in, see
 from pipeline.stages.base import Workspace
+from pipeline.stages.shared.blindspots import spots_of
 from pipeline.stages.shared.scans import SiteBeams
 from pipeline.stages.shared.scene import scene_of
 
@@ -42,10 +45,13 @@ class SiteTargets:
         are no standard errors. Not a number where no vehicle counts.
     by_period
         Of each period alone, in their order; empty where there are none.
+    missed
+        Where it misses vehicles; None where that is not asked for.
     """
 
     scores: Mapping[str, Floats]
     by_period: tuple[Mapping[str, float], ...] = ()
+    missed: SiteSeen | None = None
 
 
 class Targets:
@@ -72,6 +78,7 @@ class Targets:
         periods, recorded = read_periods(tpog), recorded_frames(trajectories)
         self._weight = weights_in_mix(periods, recorded, self.record)
         self._groups = FrameGroups.read(tpog, trajectories, self.record) if wanted.standard_error else None
+        self.spots = spots_of(work, self.record, recorded, self._weight) if wanted.blindspots else None
         self._periods = _rows_of_periods(periods, recorded, self.record)
         if self.is_empty and wanted.rank_by in WORTHS:
             place = f"{work.scenario.file}: score.rank_by = {wanted.rank_by!r}"
@@ -87,11 +94,13 @@ class Targets:
         return see(self.record, scan.beams, noticed_in(self._scene, scan.beams.sensor))
 
     def scores(self, seen: SeenTargets) -> SiteTargets:
-        """The scores that are asked for, of what a site sees."""
+        """The scores that are asked for, of what a site sees, and where it misses vehicles."""
         worths = {name: WORTHS[name](seen) for name in self._names}
         whole = {name: self._means(worth) for name, worth in worths.items()}
         apart = ({name: mean(worth[rows]) for name, worth in worths.items()} for _, rows in self._periods)
-        return SiteTargets(whole, tuple(apart))
+        return SiteTargets(
+            whole, tuple(apart), SiteSeen.of(self.spots, seen.points) if self.spots is not None else None
+        )
 
     def doubts(self, tpog: Tpog, by_period: Sequence[Tpog]) -> list[Finding]:
         """A warning where scores are no numbers though the region has traffic, at all or in a period; that it has none

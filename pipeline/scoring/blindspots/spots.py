@@ -1,0 +1,178 @@
+"""The places at which vehicles were recorded, and how many of them a site sees there.
+
+A *spot* is a square of the region, a lane, a whole approach or exit, a way through a junction, a crossing. A
+vehicle-frame counts for every square that its box covers in plan, for the lane or turn that its front is on and for the
+road of that lane, for each crossing that its box reaches onto; where its front is on no lane, for "no lane". What
+depends on traffic alone is worked out once for all sites. It is seen where it has :data:`SEEN_WELL_POINTS` points.
+
+World frame, in plan, metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.core.grid import Roi
+from pipeline.scoring.blindspots.lanes import Floats, Ints, fronts_m, lanes_of
+from pipeline.scoring.blindspots.road_places import KINDS, Place, RoadPlaces, told_apart
+from pipeline.scoring.targets.record import TargetRecord
+from pipeline.scoring.targets.scores import SEEN_WELL_POINTS
+
+CELL_M = 1.0
+"""Edge of a square of the map."""
+
+ALL, NO_LANE, CELL = "all", "no lane", "cell"
+
+_SHRINK_M = 1e-4
+"""A box is made smaller by this on each side, as everywhere."""
+
+_ORDER = (ALL, NO_LANE, *KINDS)
+
+
+@dataclass(frozen=True, eq=False)
+class Spots:
+    """Where each vehicle-frame of a record is; k spots, in the order of the artefact.
+
+    Attributes
+    ----------
+    places
+        In words, of the first spots.
+    cells
+        Squares from the region's corner to the east and to the north, of the other spots, (c, 2) int64.
+    at_m
+        Middle of the square, or mean of the vehicles' centres there, world frame, (k, 2) float64.
+    row, spot
+        Vehicle-frames and the spots that they are at, (m,) int64 each.
+    weight
+        How much each vehicle-frame of the record counts, (n,) float64.
+    vehicle_frames, vehicles
+        How many, and of how many different vehicles, at each spot, (k,) int64.
+    """
+
+    places: tuple[Place, ...]
+    cells: Ints
+    at_m: Floats
+    row: Ints
+    spot: Ints
+    weight: Floats
+    vehicle_frames: Ints
+    vehicles: Ints
+
+    @classmethod
+    def of(cls, record: TargetRecord, roads: RoadPlaces | None, weight: Floats, period: Ints) -> Spots:
+        """From the vehicle-frames of a record.
+
+        Parameters
+        ----------
+        roads
+            Places of the network; None where there is none, for a map alone.
+        weight
+            How much each vehicle-frame counts, (n,) float64.
+        period
+            The part of the day of each vehicle-frame, (n,) int64: two vehicles of one name may be in different ones.
+        """
+        places, rows, at = _on_roads(record, roads)
+        cell_row, cells = cells_of(record.boxes, record.grid.roi)
+        cell, at_cell = np.unique(cells, axis=0, return_inverse=True)
+        row, spot = np.append(rows, cell_row), np.append(at, len(places) + at_cell.reshape(-1))
+        count, who = len(places) + len(cell), record.vehicle + len(record.vehicles) * period
+        different = np.unique(spot * (int(who.max(initial=0)) + 1) + who[row]) // (int(who.max(initial=0)) + 1)
+        frames, vehicles = (np.bincount(its, minlength=count) for its in (spot, different))
+        sums_m = [np.bincount(spot, record.boxes[row, axis], minlength=count) for axis in (0, 1)]
+        at_m = np.column_stack(sums_m).astype(np.float64) / frames[:, None]
+        at_m[len(places) :] = np.asarray(record.grid.origin_m[:2]) + (cell + 0.5) * CELL_M
+        return cls(places, cell, at_m, row, spot, weight, frames, vehicles)
+
+    def __len__(self) -> int:
+        """How many spots."""
+        return len(self.vehicle_frames)
+
+    @property
+    def weights(self) -> Floats:
+        """Of all vehicle-frames at each spot, (k,) float64."""
+        found: Floats = np.bincount(self.spot, self.weight[self.row], minlength=len(self)).astype(np.float64)
+        return found
+
+    def seen(self, points: Floats) -> tuple[Ints, Floats]:
+        """How many vehicle-frames a site sees at each spot, (k,) int64, and their weights, (k,) float64.
+
+        Parameters
+        ----------
+        points
+            Of the site on each vehicle-frame of the record, (n,) float64.
+        """
+        well = (points >= SEEN_WELL_POINTS)[self.row]
+        spot = self.spot[well]
+        weights = np.bincount(spot, self.weight[self.row[well]], minlength=len(self))
+        return np.bincount(spot, minlength=len(self)), weights.astype(np.float64)
+
+
+def cells_of(boxes: Floats, roi: Roi) -> tuple[Ints, Ints]:
+    """The squares of the region whose middle a box covers in plan, and the one that holds the box's own middle.
+
+    Parameters
+    ----------
+    boxes
+        As :data:`pipeline.artefacts.traffic_frames.BOX`, (n, 7) float64; centres in the region.
+
+    Returns
+    -------
+    row, cell
+        Boxes (m,), ascending, and their squares (m, 2): how many to the east, to the north; int64.
+    """
+    centre, half = boxes[:, :2] - np.asarray(roi.origin_m[:2]), boxes[:, 3:5] / 2.0 - _SHRINK_M
+    cos, sin = np.abs(np.cos(boxes[:, 6])), np.abs(np.sin(boxes[:, 6]))
+    reach = np.column_stack([cos * half[:, 0] + sin * half[:, 1], sin * half[:, 0] + cos * half[:, 1]])
+    last = np.ceil(np.asarray(roi.size_m[:2]) / CELL_M).astype(np.int64) - 1
+    low = np.clip(np.floor((centre - reach) / CELL_M).astype(np.int64), 0, last)
+    span = np.clip(np.floor((centre + reach) / CELL_M).astype(np.int64), 0, last) - low + 1
+    row = np.repeat(np.arange(len(boxes)), span.prod(axis=1))
+    number = np.arange(len(row)) - np.repeat(np.cumsum(span.prod(axis=1)) - span.prod(axis=1), span.prod(axis=1))
+    cell = low[row] + np.column_stack([number // span[row, 1], number % span[row, 1]])
+    off = (cell + 0.5) * CELL_M - centre[row]
+    yaw = boxes[row, 6]
+    along, across = np.cos(yaw) * off[:, 0] + np.sin(yaw) * off[:, 1], np.cos(yaw) * off[:, 1] - np.sin(yaw) * off[:, 0]
+    covered = (np.abs(along) < half[row, 0]) & (np.abs(across) < half[row, 1])
+    covered |= (cell == np.floor(centre[row] / CELL_M)).all(axis=1)
+    return row[covered], cell[covered]
+
+
+def _on_roads(record: TargetRecord, roads: RoadPlaces | None) -> tuple[tuple[Place, ...], Ints, Ints]:
+    """The places that vehicles are at, in order, and pairs of a vehicle-frame and one of them."""
+    found = [(Place(ALL, "", "all vehicles", (0.0, 0.0)), np.arange(len(record)))] if len(record) else []
+    if roads is not None:
+        lane = lanes_of(fronts_m(record.boxes), record.boxes[:, 6], roads.lanes)
+        rows: list[list[Ints]] = [[] for _ in roads.places]
+        for number in np.unique(lane[lane >= 0]).tolist():
+            for place in roads.places_of_lane[number]:
+                rows[place].append(np.flatnonzero(lane == number))
+        for place, its in _on_crossings(record.boxes, roads):
+            rows[place].append(its)
+        at = [(place, np.concatenate(its)) for place, its in zip(roads.places, rows, strict=True) if its]
+        lost = np.flatnonzero(lane < 0)
+        found += [*at, *([(Place(NO_LANE, "", "on no lane", (0.0, 0.0)), lost)] if len(lost) else [])]
+    found.sort(key=lambda pair: (_ORDER.index(pair[0].by), pair[0].name))
+    none = np.empty(0, dtype=np.int64)
+    row = np.concatenate([none, *(its for _, its in found)])
+    spot = np.repeat(np.arange(len(found)), [len(its) for _, its in found])
+    return tuple(told_apart([place for place, _ in found])), row, spot
+
+
+def _on_crossings(boxes: Floats, roads: RoadPlaces) -> Iterator[tuple[int, Ints]]:
+    """The boxes that reach onto each crossing."""
+    import shapely
+
+    if not roads.crossings or not len(boxes):
+        return
+    along = np.column_stack([np.cos(boxes[:, 6]), np.sin(boxes[:, 6])]) * (boxes[:, 3:4] / 2.0 - _SHRINK_M)
+    across = np.column_stack([-np.sin(boxes[:, 6]), np.cos(boxes[:, 6])]) * (boxes[:, 4:5] / 2.0 - _SHRINK_M)
+    signs = ((1, 1), (-1, 1), (-1, -1), (1, -1))
+    corners = np.stack([boxes[:, :2] + a * along + b * across for a, b in signs], axis=1)
+    tree = shapely.STRtree(shapely.polygons(corners))
+    for strip, place in roads.crossings:
+        area = shapely.buffer(shapely.linestrings(strip.points_m), strip.width_m / 2.0, cap_style="flat")
+        if len(on := np.sort(tree.query(area, "intersects"))):
+            yield place, on

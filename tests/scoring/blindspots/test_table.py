@@ -1,0 +1,228 @@
+"""``blindspots.parquet`` of whole runs: what adds up, same bytes, the switch, periods, and files that are not sound."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+import pipeline
+from pipeline.artefacts import blindspots, tables
+from pipeline.core.errors import InputError
+from pipeline.scenario import loading
+from pipeline.scoring.targets.record import TargetRecord
+from pipeline.scoring.targets.seen import see
+from pipeline.stages import scan, score, statics
+from pipeline.stages.base import Workspace
+from pipeline.stages.shared.scans import scans
+from tests.conftest import SITES, write_mini
+from tests.scoring.blindspots.roads import NETWORK
+from tests.scoring.blindspots.test_spots import car
+from tests.stages import inputs_of, run_stage
+
+NET = "made.net.xml"
+
+
+def rows_of(out: Path, site: str) -> list[dict]:  # type: ignore[type-arg]
+    """Of one site."""
+    return [row for row in pq.read_table(out / "blindspots.parquet").to_pylist() if row["site"] == site]
+
+
+@pytest.fixture(scope="module")
+def ran(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A scenario with a finished FCD file, and its run's folder."""
+    folder = tmp_path_factory.mktemp("ran")
+    mini = write_mini(folder / "mini")
+    pipeline.run(loading.load(mini), folder / "run", jobs=1)
+    return mini, folder / "run"
+
+
+@pytest.fixture(scope="module")
+def on_roads(tmp_path_factory: pytest.TempPathFactory) -> tuple[loading.Scenario, Path]:
+    """A scenario that simulates on the made-up network, and a folder with made-up traffic, scans and scores."""
+    folder = tmp_path_factory.mktemp("on_roads")
+    (folder / NET).write_text(NETWORK)
+    (folder / "sites.csv").write_text(SITES)
+    sensor = {"elevations_deg": [-25, 5], "channels": 16, "azimuth_step_deg": 0.5, "range_m": 100}
+    values = {
+        "name": "on_roads",
+        "roi": {"center_m": [30, 0, 2.5], "size_m": [60, 40, 5], "voxel_m": 1},
+        "traffic": {"network": NET, "frames": 40, "warmup_s": 0},
+        "sites": {"file": "sites.csv", "sensor": "small"},
+        "sensors": {"small": sensor},
+    }
+    scenario, out = loading.from_values(values, folder, str(folder / "scenario.toml")), folder / "out"
+    out.mkdir()
+    boxes = [(n, f"v{n % 12}-{lane}", car(17 + n % 11, lane)) for n in range(40) for lane in (-1.6, -4.8)]
+    boxes += [(n, "lost", car(50, 15)) for n in range(0, 40, 4)]
+    boxes.sort(key=lambda its: its[:2])
+    names = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_rad")
+    columns = {name: [box[i] for _, _, box in boxes] for i, name in enumerate(names)}
+    columns |= {"frame": [n for n, *_ in boxes], "vehicle": [name for _, name, _ in boxes]}
+    columns |= {"part": [0] * len(boxes), "kind": ["passenger"] * len(boxes), "pitch_rad": [0.0] * len(boxes)}
+    tables.write(out / "trajectories.parquet", "trajectories", columns, {"schema": 1, "frames": 40})
+    grid = scenario.roi.grid
+    index = {name: np.array([5], dtype=np.int32) for name in ("ix", "iy", "iz")}
+    index["iz"] = np.array([0], dtype=np.int32)
+    counts = {"block": np.array([0], dtype=np.uint16), **index, "count": np.array([20], dtype=np.uint32)}
+    about = {"schema": 1, "grid": grid.to_json(), "frames": 40, "block_frames": 40, "memory_frames": 1.0}
+    tables.write(out / "tpog.parquet", "tpog", counts, about)
+    for stage in (statics, scan, score):
+        run_stage(stage, scenario, out, jobs=1)
+    return scenario, out
+
+
+def test_lanes_turns_and_those_on_none_add_up(on_roads: tuple[loading.Scenario, Path]) -> None:
+    _, out = on_roads
+    for site in ("pole_a", "pole_b"):
+        rows = rows_of(out, site)
+        count = {by: sum(r["vehicle_frames"] for r in rows if r["by"] == by) for by in {r["by"] for r in rows}}
+        assert count["all"] == 90 == count["lane"] + count.get("turn", 0) + count["no lane"]
+        assert count["no lane"] == 10 and count["approach"] == 80
+        seen = {by: sum(r["seen"] for r in rows if r["by"] == by) for by in count}
+        assert 0 < seen["all"] == seen["lane"] + seen.get("turn", 0) + seen["no lane"]
+        for row in rows:
+            assert row["share_seen"] == row["seen"] / row["vehicle_frames"]
+            assert (row["ix"] >= 0) == (row["iy"] >= 0) == (row["by"] == "cell") == (row["words"] == "")
+    keys = [(r["by"], r["place"], r["ix"], r["iy"]) for r in rows_of(out, "pole_a")]
+    assert (
+        keys == [(r["by"], r["place"], r["ix"], r["iy"]) for r in rows_of(out, "pole_b")] == list(dict.fromkeys(keys))
+    )
+
+
+def test_counts_are_those_of_the_points(on_roads: tuple[loading.Scenario, Path]) -> None:
+    scenario, out = on_roads
+    record = TargetRecord.read(out / "trajectories.parquet", scenario.roi.grid)
+    for its in scans(Workspace(scenario, out)):
+        points = see(record, its.beams).points
+        left = record.boxes[:, 1] == -1.6
+        rows = {row["place"]: row for row in rows_of(out, its.site.name) if row["by"] == "lane"}
+        assert rows["near_2"]["seen"] == int((points[left] >= 20).sum())
+        assert rows["near_2"]["words"] == "eastbound left-turn lane, High Street"
+        assert (rows["near_2"]["vehicle_frames"], rows["near_2"]["vehicles"]) == (40, 12)
+
+
+def test_what_it_is_made_from_and_what_it_says_of_itself(on_roads: tuple[loading.Scenario, Path]) -> None:
+    scenario, out = on_roads
+    assert {"network", "trajectories.parquet"} <= inputs_of(score, scenario, out).files.keys()
+    about = tables.read_metadata(out / "blindspots.parquet", "blindspots")
+    assert about["cells"] == {"origin_m": [0.0, -20.0], "cell_m": 1.0, "shape": [60, 40]} and about["points"] == 20.0
+    (site,) = blindspots.read(out / "blindspots.parquet", {"pole_b"})
+    assert (site.site, site.points, site.off_lanes, site.share_missed.shape) == ("pole_b", 20.0, 10, (60, 40))
+
+
+def test_another_number_of_threads_writes_the_same_bytes(
+    on_roads: tuple[loading.Scenario, Path], ran: tuple[Path, Path], tmp_path: Path
+) -> None:
+    scenario, out = on_roads
+    before = (out / "blindspots.parquet").read_bytes()
+    run_stage(score, scenario, out, jobs=3)
+    assert (out / "blindspots.parquet").read_bytes() == before
+    pipeline.run(loading.load(ran[0]), tmp_path / "again", jobs=2)
+    assert (tmp_path / "again" / "blindspots.parquet").read_bytes() == (ran[1] / "blindspots.parquet").read_bytes()
+
+
+def test_recorded_traffic_has_a_map_alone(ran: tuple[Path, Path]) -> None:
+    mini, out = ran
+    assert {row["by"] for row in rows_of(out, "pole_a")} == {"all", "cell"}
+    assert "network" not in inputs_of(score, loading.load(mini), out).files
+    (site, _) = blindspots.read(out / "blindspots.parquet")
+    assert site.whole is not None and site.whole.vehicles == 2 and site.worst == [] and site.off_lanes == 0
+    assert np.isfinite(site.share_missed).sum() == sum(row["by"] == "cell" for row in rows_of(out, "pole_a"))
+
+
+def test_the_switch_acts(ran: tuple[Path, Path], tmp_path: Path) -> None:
+    off = loading.load(ran[0], ["score.blindspots=false"])
+    pipeline.run(loading.load(ran[0]), tmp_path, jobs=1)
+    assert (tmp_path / "blindspots.parquet").is_file() and 'data-view="vehicles"' in (
+        tmp_path / "report.html"
+    ).read_text()
+    record = pipeline.run(off, tmp_path, jobs=1)
+    assert not (tmp_path / "blindspots.parquet").exists() and "missed" not in record.stages["score"].summary
+    assert 'data-view="vehicles"' not in (tmp_path / "report.html").read_text()
+
+
+def test_a_mix_of_periods_weighs_its_vehicles(tmp_path: Path) -> None:
+    halves = '[{name="a", length_s=12, weight=3}, {name="b", begin_s=12, length_s=8}]'
+    mini = write_mini(tmp_path / "mini")
+    pipeline.run(loading.load(mini, [f"traffic.periods={halves}"]), tmp_path / "run", jobs=1)
+    whole = rows_of(tmp_path / "run", "pole_b")[0]
+    scenario = loading.load(mini, [f"traffic.periods={halves}"])
+    record = TargetRecord.read(tmp_path / "run" / "trajectories.parquet", scenario.roi.grid)
+    of_a = record.numbers[record.frame] < 24
+    its = {it.site.name: it for it in scans(Workspace(scenario, tmp_path / "run"))}
+    well = see(record, its["pole_b"].beams).points >= 20
+    parts, weights = [well[of_a].sum(), well[~of_a].sum()], np.array([3 / 24, 1 / 16])
+    assert whole["vehicles"] == len({*record.vehicle[of_a]}) + len({*record.vehicle[~of_a]})
+    assert whole["seen"] == sum(parts) and whole["vehicle_frames"] == len(record)
+    expected = parts @ weights / ([of_a.sum(), (~of_a).sum()] @ weights)
+    assert whole["share_seen"] == pytest.approx(expected)
+    rows = rows_of(tmp_path / "run", "pole_b")
+    assert all(row["weight"] > 0 for row in rows)
+
+
+def test_without_vehicles_there_is_nothing_to_miss(tmp_path: Path) -> None:
+    mini = write_mini(tmp_path / "mini")
+    text = (mini / "fcd.csv").read_text().replace(";-2.0;", ";-200.0;").splitlines()
+    (mini / "fcd.csv").write_text("\n".join(line for line in text if ";west;" not in line) + "\n")
+    record = pipeline.run(loading.load(mini), tmp_path / "run", jobs=1)
+    assert (
+        record.stages["score"].summary["missed"] == "no vehicle in the region of interest, so none that pole_a misses"
+    )
+    assert pq.read_table(tmp_path / "run" / "blindspots.parquet").num_rows == 0
+
+
+def damaged(path: Path, out: Path, change) -> Path:  # type: ignore[no-untyped-def]
+    """A copy of an artefact in which something is changed: its table, and the groups of rows that it is written in."""
+    file = pq.ParquetFile(path)
+    table, per_group = change(file.read(), file.metadata.row_group(0).num_rows)
+    with pq.ParquetWriter(out, table.schema) as writer:
+        for start in range(0, len(table), per_group):
+            writer.write_table(table.slice(start, per_group), row_group_size=per_group)
+        writer.add_key_value_metadata({b"egvs": file.metadata.metadata[b"egvs"]})
+    return out
+
+
+def outside(table: pa.Table, groups: int) -> tuple[pa.Table, int]:
+    """A square beyond the region."""
+    ix = np.where(table.column("ix").to_numpy() >= 0, 60, -1).astype(np.int32)
+    return table.set_column(table.schema.get_field_index("ix"), table.schema.field("ix"), [ix]), groups
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (outside, "a square of site pole_a lies outside the region"),
+        (lambda table, rows: (table, rows * 2), "1 row groups for 2 sites; one a site"),
+        (lambda table, rows: (table.drop_columns(["words"]), rows), "column 'words' is missing"),
+    ],
+)
+def test_a_damaged_file_is_named(  # type: ignore[no-untyped-def]
+    on_roads: tuple[loading.Scenario, Path], tmp_path: Path, change, message: str
+) -> None:
+    path = damaged(on_roads[1] / "blindspots.parquet", tmp_path / "blindspots.parquet", change)
+    with pytest.raises(InputError) as error:
+        list(blindspots.read(path))
+    assert message in str(error.value) and str(path) in str(error.value)
+
+
+@pytest.mark.parametrize("cells", [None, {}, {"origin_m": [0, 0], "cell_m": 0, "shape": [1, 1]}, {"origin_m": [0]}])
+def test_squares_that_metadata_does_not_describe_are_refused(
+    on_roads: tuple[loading.Scenario, Path], tmp_path: Path, cells: object
+) -> None:
+    about = tables.read_metadata(on_roads[1] / "blindspots.parquet", "blindspots") | {"cells": cells}
+    columns = pq.read_table(on_roads[1] / "blindspots.parquet").to_pydict()
+    tables.write(tmp_path / "blindspots.parquet", "blindspots", columns, about)
+    with pytest.raises(InputError, match="its metadata says cells = "):
+        list(blindspots.read(tmp_path / "blindspots.parquet"))
+
+
+def test_a_file_that_is_cut_off_is_refused_by_the_report(ran: tuple[Path, Path], tmp_path: Path, egvs) -> None:  # type: ignore[no-untyped-def]
+    pipeline.run(loading.load(ran[0]), tmp_path, jobs=1)
+    path = tmp_path / "blindspots.parquet"
+    path.write_bytes(path.read_bytes()[:-100])
+    code, _, told = egvs("report", ran[0], "--out", tmp_path)
+    assert code == 2 and "blindspots.parquet: cannot be read as Parquet" in " ".join(told.split())
