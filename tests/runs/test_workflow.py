@@ -25,7 +25,7 @@ from pipeline.world import casting
 from tests import processes
 
 ROOT = Path(__file__).resolve().parents[2]
-DATA = ("statics.ply", "scans.parquet", "trajectories.parquet", "tpog.parquet", "scores.parquet")
+DATA = ("statics.ply", "scans.parquet", "trajectories.parquet", "tpog.parquet", "scores.parquet", "blindspots.parquet")
 
 
 def digests(out: Path) -> dict[str, str]:
