@@ -26,6 +26,12 @@ _inlined = numba.njit(cache=True, nogil=True, error_model="numpy", inline="alway
 _MARGIN_RAD = 1e-9
 """Spans are widened by this: rounding loses no beam."""
 
+SLICES = 64
+"""A vehicle's length is cut into so many slices, to find the longest stretch of it without points."""
+
+_ON_SIDE_M = 1e-6
+"""A beam that ends within this of the plane of a side has met it, not the roof."""
+
 _TINY = 1e-300
 """Stands for a direction of 0 along an axis: a beam so nearly parallel enters and leaves beyond any length."""
 
@@ -109,24 +115,32 @@ def _meet(k, box, beams, runs, owner, range_m, t_m):  # type: ignore[no-untyped-
     return worth
 
 
+@_inlined
+def _note(b, worth, along, across, half_length, half_width, found):  # type: ignore[no-untyped-def]
+    """Add a hit on box b to what is found, as in :func:`first_met`."""
+    total, sides, slices, low, high = found
+    total[b] += worth
+    if worth > 0.0:
+        if abs(along) > half_length - _ON_SIDE_M or abs(across) > half_width - _ON_SIDE_M:
+            sides[b] += worth
+        part = int(SLICES * (0.5 * along / half_length + 0.5))
+        slices[b] |= np.uint64(1) << np.uint64(min(max(part, 0), SLICES - 1))
+        low[b, 0], high[b, 0] = min(low[b, 0], along), max(high[b, 0], along)
+        low[b, 1], high[b, 1] = min(low[b, 1], across), max(high[b, 1], across)
+
+
 @_kernel
-def _add(k, box, beams, runs, owner, range_m, low, high):  # type: ignore[no-untyped-def]
-    """What the beams are worth that end on box k; ``low`` and ``high`` (2,) are filled with the bounds of where they
-    end, along and across the box, of beams that are worth something."""
-    ax, ay, az, ao = box[0], box[1], box[2], box[3]
-    bx, by, bz, bo = box[5], box[6], box[7], box[8]
-    x, y, z, weight, total = beams[3][0], beams[3][1], beams[3][2], beams[5], 0.0
-    a_low, a_high, b_low, b_high = np.inf, -np.inf, np.inf, -np.inf
+def _add(k, b, box, beams, runs, owner, range_m, found):  # type: ignore[no-untyped-def]
+    """Add up the beams that end on box k, which is box b of all frames."""
+    ax, ay, az, ao, ah = box[0], box[1], box[2], box[3], box[4]
+    bx, by, bz, bo, bh = box[5], box[6], box[7], box[8], box[9]
+    x, y, z, weight = beams[3][0], beams[3][1], beams[3][2], beams[5]
     for run in range(runs.shape[0]):
         for n in range(runs[run, 0], runs[run, 1]):
             if owner[n] == k:
-                total += weight[n]
-                if weight[n] > 0.0:
-                    a = ao + range_m[n] * (ax * x[n] + ay * y[n] + az * z[n])
-                    b = bo + range_m[n] * (bx * x[n] + by * y[n] + bz * z[n])
-                    a_low, a_high, b_low, b_high = min(a_low, a), max(a_high, a), min(b_low, b), max(b_high, b)
-    low[0], high[0], low[1], high[1] = a_low, a_high, b_low, b_high
-    return total
+                along = ao + range_m[n] * (ax * x[n] + ay * y[n] + az * z[n])
+                across = bo + range_m[n] * (bx * x[n] + by * y[n] + bz * z[n])
+                _note(b, weight[n], along, across, ah, bh, found)
 
 
 @_kernel
@@ -176,9 +190,11 @@ def first_met(begin, o, size_m, boxes, beams, owner, range_m, found, hits):  # t
         Scratch, (n,) int32 and float64: -1, and where the beam ends, now and afterwards.
     found
         Filled: ``alone``, (b,) float64, the worth of all beams that meet the box, whatever stands before it; 0 at
-        first. Of boxes that are asked about, where nothing is listed: ``total``, (b,) float64, the worth of those that
-        meet it first, and the bounds ``low`` and ``high`` of where these end, (b, 2) float64, along and across the box
-        from its centre.
+        first. And, of boxes that are asked about, where nothing is listed, of the beams that meet it first: ``total``,
+        (b,) float64, what they are worth; ``sides``, the same of those that do not end on its roof; ``slices``, (b,)
+        uint64, a bit for each of the :data:`SLICES` equal slices of its length, from the rear, where one ends; and the
+        bounds ``low`` and ``high`` of where they end, (b, 2) float64, along and across the box from its centre. 0, 0,
+        0, infinity and minus infinity at first.
     hits
         Filled, if long enough for all beams; else without any length: which box is met, which beam meets it, where
         (range; along and across the box). Int64, int64, float64, float64, float64. Hits of a box come together.
@@ -190,7 +206,7 @@ def first_met(begin, o, size_m, boxes, beams, owner, range_m, found, hits):  # t
     """
     starts, values, low, high, listed = boxes
     bands, slopes, azimuth = beams[0], beams[1], beams[2]
-    alone, total, at_low, at_high = found
+    alone, counted = found[0], found[1:]
     most, count, room = 0, 0, hits[0].shape[0]
     for f in range(begin, starts.shape[0] - 1):
         most = max(most, starts[f + 1] - starts[f])
@@ -219,32 +235,41 @@ def first_met(begin, o, size_m, boxes, beams, owner, range_m, found, hits):  # t
             if listed[b] and room > 0:
                 count = _list(k, b, facing[k], beams, its, owner, range_m, hits, count)
             elif listed[b]:
-                total[b] = _add(k, facing[k], beams, its, owner, range_m, at_low[b], at_high[b])
+                _add(k, b, facing[k], beams, its, owner, range_m, counted)
         for k in range(kept):
             _restore(runs[k, : filled[k]], beams[4], owner, range_m)
     return starts.shape[0] - 1, count
 
 
 @_kernel
-def add_up(box, worth, along, across, total, low, high):  # type: ignore[no-untyped-def]
-    """Add up what the hits on each box are worth, and widen what they span of it.
+def add_up(box, worth, along, across, boxes, found):  # type: ignore[no-untyped-def]
+    """Add up hits that :func:`first_met` listed.
 
     Parameters
     ----------
     box, worth, along, across
         Of hits: which box, what it is worth, where along and across the box; (k,) int64 and float64.
-    total
-        Added to, (b,) float64.
-    low, high
-        Widened by hits that are worth something, (b, 2) float64: bounds along and across; infinity and minus infinity
-        at first.
+    boxes
+        As :func:`pipeline.kernels.occlusion.bounds` takes them, (b, 8) float64.
+    found
+        Added to: ``total``, ``sides``, ``slices``, ``low`` and ``high``, as :func:`first_met` fills them.
     """
     for i in range(box.shape[0]):
-        b = box[i]
-        total[b] += worth[i]
-        if worth[i] > 0.0:
-            low[b, 0], high[b, 0] = min(low[b, 0], along[i]), max(high[b, 0], along[i])
-            low[b, 1], high[b, 1] = min(low[b, 1], across[i]), max(high[b, 1], across[i])
+        half_length, half_width = 0.5 * boxes[box[i], 5] - SHRINK_M, 0.5 * boxes[box[i], 6] - SHRINK_M
+        _note(box[i], worth[i], along[i], across[i], half_length, half_width, found)
+
+
+@_kernel
+def holes(slices, share):  # type: ignore[no-untyped-def]
+    """Fill the longest stretch between two slices with points, as a share of the length, (n,) float64."""
+    for i in range(slices.shape[0]):
+        longest, last = 0, -1
+        for part in range(SLICES):
+            if (slices[i] >> np.uint64(part)) & np.uint64(1):
+                if last >= 0:
+                    longest = max(longest, part - last - 1)
+                last = part
+        share[i] = longest / SLICES
 
 
 @_kernel

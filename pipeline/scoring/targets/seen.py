@@ -63,20 +63,34 @@ class SeenTargets:
         number; an expectation where effects weigh beams or lose returns.
     points_alone
         The same with no other box in the way, (n,) float64.
+    points_on_sides
+        Those of ``points`` that are not on its roof (or, from below, its underside), (n,) float64.
     length_share, width_share
         Share of the vehicle's length and of its width between the outermost of its points, along the box's own axes,
         (n,) float64, 0 to 1; 0 without a point. Where effects weigh beams or lose returns, a beam whose point has any
         chance at all counts in full.
+    hole_m
+        Longest stretch of the vehicle's length, between its outermost points, that has none, (n,) float64, to 1/64 of
+        its length; 0 without a point. Counted as the shares are.
     range_m
         From the sensor to the box's centre, (n,) float64.
+    depression_deg
+        How far below the sensor's horizon the box's centre is seen, (n,) float64, -90 to 90.
+    side
+        Sine of the angle in plan between the line of sight and the vehicle's length, (n,) float64: 0 from ahead or
+        behind, 1 broadside.
     """
 
     record: TargetRecord
     points: Floats
     points_alone: Floats
+    points_on_sides: Floats
     length_share: Floats
     width_share: Floats
+    hole_m: Floats
     range_m: Floats
+    depression_deg: Floats
+    side: Floats
 
     def __len__(self) -> int:
         """How many vehicle-frames."""
@@ -97,13 +111,26 @@ def see(record: TargetRecord, beams: Beams, noticed: Callable[[Floats], Floats] 
     """
     sensor_m = record.grid.to_grid_m(np.asarray(beams.pose.position_m))
     row, values = record.row, record.all_boxes.values
-    alone, total, low, high = _counted(record, sensor_m, beams, noticed)
-    range_m = np.sqrt(((values[row, :3] - sensor_m) ** 2).sum(axis=1))
-    seen = high[row] >= low[row]
-    spans = np.zeros((len(row), 2))
+    alone, (total, sides, slices, low, high) = _counted(record, sensor_m, beams, noticed)
+    away = values[row, :3] - sensor_m
+    range_m, run_m = np.sqrt((away**2).sum(axis=1)), np.hypot(away[:, 0], away[:, 1])
+    yaw = values[row, 3]
+    across = np.abs(away[:, 1] * np.cos(yaw) - away[:, 0] * np.sin(yaw))
+    seen, spans, hole = high[row] >= low[row], np.zeros((len(row), 2)), np.zeros(len(row))
     spans[seen] = (high[row][seen] - low[row][seen]) / values[row, 5:7][seen]
-    points_alone = alone[row] if noticed is None else alone[row] * noticed(range_m)
-    return SeenTargets(record, total[row], points_alone, spans[:, 0], spans[:, 1], range_m)
+    kernels.holes(slices[row], hole)
+    return SeenTargets(
+        record=record,
+        points=total[row],
+        points_alone=alone[row] if noticed is None else alone[row] * noticed(range_m),
+        points_on_sides=sides[row],
+        length_share=spans[:, 0],
+        width_share=spans[:, 1],
+        hole_m=hole * values[row, 5],
+        range_m=range_m,
+        depression_deg=np.degrees(np.arctan2(-away[:, 2], run_m)),
+        side=np.divide(across, run_m, out=np.zeros(len(row)), where=run_m > 0.0),
+    )
 
 
 def _in_bands(beams: Beams, bands: int) -> tuple[NDArray[Any], ...]:
@@ -125,15 +152,16 @@ def _in_bands(beams: Beams, bands: int) -> tuple[NDArray[Any], ...]:
 
 def _counted(
     record: TargetRecord, sensor_m: Floats, site: Beams, noticed: Callable[[Floats], Floats] | None
-) -> tuple[Floats, ...]:
-    """Of every box of the record: the points that it would have alone, were all noticed, and those that it has (b,),
-    and between which bounds these lie along and across the box, (b, 2) each."""
+) -> tuple[Floats, tuple[NDArray[Any], ...]]:
+    """Of every box of the record, (b,): the points that it would have alone, were all noticed; and of those that it
+    has, how many, how many on its sides, in which slices of its length, and between which bounds (b, 2)."""
     boxes, count = record.all_boxes, len(record.all_boxes.values)
     whole = site.weight is None and noticed is None
     beams = _in_bands(site, _BANDS if whole else 1)  # in one band, shares are added in the order of azimuths alone
     listed = np.zeros(count, dtype=np.bool_)
     listed[record.row] = True
-    found = np.zeros(count), np.zeros(count), np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
+    spans = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
+    found = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count, dtype=np.uint64), *spans
     length_m, weight = beams[4], beams[5]
     owner, range_m = np.full(len(weight), -1, dtype=np.int32), length_m.copy()
     room = 0 if noticed is None else max(_ROOM, len(weight))
@@ -144,5 +172,5 @@ def _counted(
         frame, filled = kernels.first_met(frame, sensor_m, size_m, every, beams, owner, range_m, found, hits)
         if noticed is not None:
             box, row, at_m, along_m, across_m = (column[:filled] for column in hits)
-            kernels.add_up(box, weight[row] * noticed(at_m), along_m, across_m, *found[1:])
-    return found
+            kernels.add_up(box, weight[row] * noticed(at_m), along_m, across_m, boxes.values, found[1:])
+    return found[0], found[1:]

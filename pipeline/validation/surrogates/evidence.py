@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pipeline.artefacts.readers import Tpog
 from pipeline.kernels.crossings import best_free
 from pipeline.scoring.egvs import EntropyField
+from pipeline.scoring.targets.seen import SeenTargets
 from pipeline.scoring.thinning import Hits
 from pipeline.scoring.visibility import Beams
 from pipeline.sensing import crossings
@@ -79,22 +80,6 @@ class Occupancy:
 
 
 @dataclass(frozen=True, eq=False)
-class VehiclePoints:
-    """Points that vehicles would have: one row a vehicle a frame, in the order of the frames.
-
-    Attributes
-    ----------
-    seen
-        With all other vehicles in the way, (n,) float64: expectations, where effects weigh beams or lose returns.
-    alone
-        The same without any other vehicle.
-    """
-
-    seen: Floats
-    alone: Floats
-
-
-@dataclass(frozen=True, eq=False)
 class SiteEvidence:
     """What a score may ask of one site.
 
@@ -118,7 +103,7 @@ class SiteEvidence:
     beams: Beams
     returned: NDArray[np.bool_]
     count: Callable[[Beams], tuple[Hits, int]]
-    look: Callable[[Beams], VehiclePoints]
+    look: Callable[[Beams], SeenTargets]
     noticed: Callable[[Floats], Floats] = everything
 
     @cached_property
@@ -150,6 +135,6 @@ class SiteEvidence:
         return position + ends, weight * self.noticed(np.sqrt((ends**2).sum(axis=1)))
 
     @cached_property
-    def vehicles(self) -> VehiclePoints:
+    def vehicles(self) -> SeenTargets:
         """Points on the vehicles of the traffic that the TPOG was counted from."""
         return self.look(self.beams)

@@ -36,7 +36,7 @@ from pipeline.runs.workflow import bring
 from pipeline.scenario.effects import MovingOcclusionParameters
 from pipeline.scenario.models import Scenario
 from pipeline.scoring.targets.record import TargetRecord
-from pipeline.scoring.targets.seen import noticed_in, see
+from pipeline.scoring.targets.seen import SeenTargets, noticed_in, see
 from pipeline.scoring.thinning import Hits
 from pipeline.scoring.visibility import Beams, Visibility
 from pipeline.sensing.scene import Scene
@@ -46,7 +46,7 @@ from pipeline.stages.shared.scene import SCANS, scene_of
 from pipeline.studies.measuring import inputs_of
 from pipeline.validation.surrogates import registry
 from pipeline.validation.surrogates.base import GAMMA, OCCLUSION, VOXEL, Score, Value
-from pipeline.validation.surrogates.evidence import Occupancy, SiteEvidence, VehiclePoints, everything
+from pipeline.validation.surrogates.evidence import Occupancy, SiteEvidence, everything
 
 ARTEFACT = "surrogates.parquet"
 _TRAJECTORIES = "trajectories.parquet"
@@ -233,7 +233,7 @@ class _Ready:
         self._work = Workspace(kept, folder, jobs=jobs, progress=progress)
         bring(self._work, "statics", "scan", "traffic")
         self.scene = scene_of(self._work)
-        self._points: dict[str, VehiclePoints] = {}
+        self._seen: dict[str, SeenTargets] = {}
         self._record: TargetRecord | None = None
 
     def scored(
@@ -255,14 +255,13 @@ class _Ready:
             def count(beams: Beams) -> tuple[Hits, int]:
                 return visibility.borrowed_hits(beams).copy(), visibility.unit
 
-            def look(beams: Beams) -> VehiclePoints:
-                if scan.site.name not in self._points:
+            def look(beams: Beams) -> SeenTargets:
+                if scan.site.name not in self._seen:
                     record = self._record
                     if record is None:
                         record = TargetRecord.read(work.path(_TRAJECTORIES), tpog.grid)
-                    seen = see(record, beams, noticed)
-                    self._points[scan.site.name] = VehiclePoints(seen.points, seen.points_alone)
-                return self._points[scan.site.name]
+                    self._seen[scan.site.name] = see(record, beams, noticed)
+                return self._seen[scan.site.name]
 
             evidence = SiteEvidence(occupancy, scan.beams, returned, count, look, noticed or everything)
             return _rows(scan.site.name, evidence, tasks)

@@ -14,6 +14,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.scoring.targets import detectability
+from pipeline.scoring.targets import scores as targets
 from pipeline.validation.surrogates.base import Score
 from pipeline.validation.surrogates.evidence import Floats, SiteEvidence
 
@@ -73,7 +75,7 @@ def perception_entropy(evidence: SiteEvidence, in_traffic: bool) -> float:
     AP reaches 0.999 at 9.4 points. So with no other vehicle in the way, a sensor of 32 rings that sees all of a
     junction gives every vehicle the same entropy, and such sites the same score.
     """
-    m = evidence.vehicles.seen if in_traffic else evidence.vehicles.alone
+    m = evidence.vehicles.points if in_traffic else evidence.vehicles.points_alone
     ap = np.full(len(m), LEAST_AP)
     ap[m > 0] = np.clip(AP_OF_LN_POINTS * np.log(m[m > 0]) + AP_OF_ONE_POINT, LEAST_AP, MOST_AP)
     return _mean(2.0 * np.log(1.0 / ap - 1.0) + 1.0 + math.log(2.0 * math.pi))
@@ -81,7 +83,17 @@ def perception_entropy(evidence: SiteEvidence, in_traffic: bool) -> float:
 
 def points_on_target(evidence: SiteEvidence) -> float:
     r"""Mean over vehicles and frames of :math:`\ln(1 + n)`, n the points on the vehicle with all others in the way."""
-    return _mean(np.log1p(evidence.vehicles.seen))
+    return targets.points_on_target(evidence.vehicles)
+
+
+def seen_well(evidence: SiteEvidence) -> float:
+    r"""Mean over vehicles and frames of :math:`1 - e^{-n / 20}`."""
+    return targets.seen_well(evidence.vehicles)
+
+
+def expected_detections(evidence: SiteEvidence, detectors: str) -> float:
+    """The share of vehicles that some detectors, named with "+" between them, are expected to find."""
+    return detectability.expected_detections(evidence.vehicles, detectors.split("+"))
 
 
 def _mean(values: Floats) -> float:
@@ -120,4 +132,21 @@ POINTS_ON_TARGET = Score(
     1,
     points_on_target,
     ("vehicles",),
+)
+SEEN_WELL = Score(
+    "seen_well",
+    "mean over vehicles and frames of 1 - exp(-points / 20), vehicles hiding one another",
+    "this program",
+    1,
+    seen_well,
+    ("vehicles",),
+)
+EXPECTED_DETECTIONS = Score(
+    "expected_detections",
+    "share of vehicles that detectors are expected to find, from points, spans, neighbours and the line of sight",
+    "this program",
+    1,
+    expected_detections,
+    ("vehicles",),
+    {"detectors": ("+".join(detectability.DETECTORS), *detectability.DETECTORS)},
 )

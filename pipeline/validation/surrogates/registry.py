@@ -12,7 +12,7 @@ GROUP = "egvs.scores"
 
 _OWN = (
     "egvs", "entropy_seen", "coverage", "expected_visibility", "s_mig", "m_sog", "kl_obs", "density", "uniformity",
-    "perception_entropy", "points_on_target",
+    "perception_entropy", "points_on_target", "seen_well", "expected_detections",
 )  # fmt: skip
 """This program's own, in the order in which they are told."""
 

@@ -5,6 +5,8 @@ whether it lies on the face."""
 
 from __future__ import annotations
 
+import cmath
+import itertools
 import math
 from collections.abc import Callable, Sequence
 
@@ -90,11 +92,19 @@ def is_beyond(box, pitch, origin) -> bool:
     )
 
 
+COLUMNS = ("points", "points_alone", "points_on_sides", "length_share", "width_share", "hole_m", "range_m",
+           "depression_deg", "side")  # fmt: skip
+
+
+def hole_slowly(along: Sequence[float]) -> float:
+    """The longest run of empty slices between two with points, as a share; ``along`` from 0 to 1."""
+    slices = sorted({min(max(int(64 * u), 0), 63) for u in along})
+    return max([b - a - 1 for a, b in itertools.pairwise(slices)], default=0) / 64
+
+
 def seen_slowly(frames: Sequence[TrafficFrame], beams: Beams, noticed: Noticed | None = None) -> dict[str, list[float]]:
     """Columns of ``SeenTargets``, beam by beam and box by box."""
-    found: dict[str, list[float]] = {
-        name: [] for name in ("points", "points_alone", "length_share", "width_share", "range_m")
-    }
+    found: dict[str, list[float]] = {name: [] for name in COLUMNS}
     for one in frames:
         for row, column in _of_frame(one, beams, noticed or (lambda r: np.ones(len(r)))).items():
             if row in one.wanted(GRID.roi).tolist():
@@ -122,14 +132,21 @@ def _of_frame(one: TrafficFrame, beams: Beams, noticed: Noticed) -> dict[int, di
         if first is not None and met[first] < length:
             worth = weight * float(noticed(np.array([met[first]]))[0])
             at = origin + end / length * met[first] - one.boxes[first, :3]
-            u, v, _ = axes_of(one.boxes[first, 6], one.pitch_rad[first]) @ at
-            hits[first].append((worth, float(u), float(v)))
+            u, v, _ = (float(value) for value in axes_of(one.boxes[first, 6], one.pitch_rad[first]) @ at)
+            hits[first].append((worth, u, v))
     found = {}
     for row, its in hits.items():
         range_m = float(np.linalg.norm(one.boxes[row, :3] - origin))
         kept = np.array([hit[1:] for hit in its if hit[0] > 0.0]).reshape(-1, 2)
         span = np.ptp(kept, axis=0) / one.boxes[row, 3:5] if len(kept) else (0.0, 0.0)
+        box, half = one.boxes[row], one.boxes[row, 3:5] / 2 - SHRINK_M
+        on_side = [hit[0] for hit in its if abs(hit[1]) > half[0] - 1e-6 or abs(hit[2]) > half[1] - 1e-6]
+        sight = complex(box[0] - origin[0], box[1] - origin[1])
         found[row] = {
+            "points_on_sides": sum(on_side),
+            "hole_m": box[3] * hole_slowly([(u / half[0] + 1) / 2 for u, _ in kept]),
+            "depression_deg": math.degrees(math.asin((origin[2] - box[2]) / range_m)),
+            "side": abs(math.sin(cmath.phase(sight) - box[6])),
             "points": sum(hit[0] for hit in its),
             "points_alone": alone[row] * float(noticed(np.array([range_m]))[0]),
             "length_share": float(span[0]),

@@ -15,7 +15,7 @@ from pipeline.scoring.visibility import Beams
 from pipeline.sensing import sensors
 from pipeline.sensing.sites import Pose
 from tests.conftest import write_mini
-from tests.scoring.targets.scenes import GRID, SENSOR, beams_to, frame, random_boxes, seen, seen_slowly
+from tests.scoring.targets.scenes import COLUMNS, GRID, SENSOR, beams_to, frame, random_boxes, seen, seen_slowly
 
 AT = (101.0, 210.0, 1.0)
 
@@ -40,6 +40,22 @@ def test_a_car_broadside_at_20_m():
     assert found.length_share == pytest.approx([2 * 20.0001 * math.tan(math.radians(5.6)) / 4.0])
     assert found.width_share == pytest.approx([0.0], abs=1e-12)  # all points are on its side
     assert found.range_m == pytest.approx([math.hypot(21.0, 0.25)])
+    assert found.side == pytest.approx([1.0]) and found.depression_deg == pytest.approx(
+        [math.degrees(math.atan(0.25 / 21))]
+    )
+    assert found.points_on_sides.tolist() == [114.0]
+    assert found.hole_m.tolist() == [4.0 / 64]  # columns are 7.0 cm apart there, slices 6.25 cm
+
+
+def test_points_on_the_roof_and_a_hole_between_points():
+    beams = beams_to((101.0, 210.0, 4.0), [[20.0, 0.0, -5.0], [24.0, 0.0, -5.0], [20.0, 3.0, -5.0], [9.0, 0.0, -5.0]])
+    found = seen([frame([(110.0, 210.0, 0.75, 8.0, 2.0, 1.5, 0.0)])], beams)
+    # the roof is at 1.5, from x = 106 to 114: met at x = 111 and 113; the third passes beside; the fourth meets the
+    # rear at x = 106
+    assert found.points.tolist() == [3.0] and found.points_on_sides.tolist() == [1.0]
+    assert found.hole_m.tolist() == [39 * 8.0 / 64]  # slices 0 and 40 (5 m of 8) hold points, 39 between are empty
+    assert found.side == pytest.approx([0.0])
+    assert found.depression_deg == pytest.approx([math.degrees(math.atan2(3.25, 9.0))])
 
 
 def test_a_car_that_turns_its_corner_shows_two_sides():
@@ -150,7 +166,7 @@ def test_scenes_of_the_twin_have_something_to_see():
 def test_the_order_of_beams_is_nothing_and_lists_that_are_short_are_filled_again(monkeypatch):
     frames, beams, _ = scene(6, False)
     turned = beams_to(beams.pose.position_m, beams.ends_m[::-1])
-    for name in ("points", "points_alone", "length_share", "width_share"):
+    for name in COLUMNS[:6]:
         np.testing.assert_array_equal(getattr(seen(frames, beams), name), getattr(seen(frames, turned), name))
     whole = seen(frames, beams, lambda r: 1.0 / r)
     monkeypatch.setattr(module, "_ROOM", 1)  # a list of one frame
@@ -163,7 +179,7 @@ def test_a_chance_of_one_is_no_effect():
     for seed in (0, 3, 1):  # whole beams, and shares of them
         frames, beams, _ = scene(seed, False)
         plain, certain = seen(frames, beams), seen(frames, beams, lambda r: np.ones(len(r)))
-        for name in ("points", "points_alone", "length_share", "width_share"):
+        for name in COLUMNS[:6]:
             np.testing.assert_array_equal(getattr(plain, name), getattr(certain, name))
 
 

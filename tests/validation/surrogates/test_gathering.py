@@ -43,7 +43,7 @@ def values(found, score, **parameters):
 def test_there_is_a_row_for_each_site_score_and_choice_of_parameters(made):
     scenario, _, found = made
     tried = [(row.site, row.score, row.parameters_json) for row in found.rows]
-    assert len(set(tried)) == len(tried) == 2 * (len(GAMMAS) * 3 * 2 + 11)
+    assert len(set(tried)) == len(tried) == 2 * (len(GAMMAS) * 3 * 2 + 15)
     assert list(dict.fromkeys(row.site for row in found.rows)) == ["pole_a", "pole_b"]
     assert list(dict.fromkeys(row.score for row in found.rows)) == registry.names()
     gammas = {row.parameters["gamma"] for row in found.rows if row.score == "egvs"}

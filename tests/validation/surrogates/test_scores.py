@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ from pipeline.scoring.visibility import Beams
 from pipeline.sensing import sensors
 from pipeline.sensing.sites import Pose
 from pipeline.validation.surrogates import registry
-from pipeline.validation.surrogates.evidence import Occupancy, SiteEvidence, VehiclePoints
+from pipeline.validation.surrogates.evidence import Occupancy, SiteEvidence
 
 LN2 = math.log(2.0)
 H_QUARTER = 2.0 - 0.75 * math.log2(3.0)  # H(1/4) = 1/4 * 2 + 3/4 * (2 - log2 3), in bits
@@ -37,7 +38,7 @@ def evidence(counts=(0, 1, 2), hits=(2, 2, 1), ends=ENDS, returned=None, seen=()
     ends = np.array(ends, dtype=np.float64).reshape(-1, 3)
     beams = Beams(Pose(-0.5, 0.5, more.pop("z_m", 0.5)), sensors.CATALOGUE["VLP-16"], ends, more.pop("weight", None))
     counted = np.array(hits, dtype=np.uint32), 1
-    vehicles = VehiclePoints(np.array(seen, dtype=np.float64), np.array(alone, dtype=np.float64))
+    vehicles = SimpleNamespace(points=np.array(seen, dtype=np.float64), points_alone=np.array(alone, dtype=np.float64))
     returned = np.ones(len(ends), dtype=np.bool_) if returned is None else np.array(returned)
     return SiteEvidence(Occupancy(tpog), beams, returned, lambda _: counted, lambda _: vehicles, **more)
 
