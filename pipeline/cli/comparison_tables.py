@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from pipeline.cli.terminal import NARROW, console, table
+from pipeline.report.score_words import SCORES
 from pipeline.studies.run_comparison import ComparedRun, Comparison, SiteResult
 
 _FILE_WIDTH = 190
@@ -44,7 +45,8 @@ def _print_notes(out: Console, notes: Sequence[str]) -> None:
 
 def _columns(run: ComparedRun, is_wide: bool) -> list[str]:
     label = run.label
-    names = [f"{label} bit", *([f"{label} error"] if is_wide else []), f"{label} of limit", f"{label} rank"]
+    first, second = ("bit", "of limit") if run.rank_by == "egvs" else (SCORES[run.rank_by].head, "bit")
+    names = [f"{label} {first}", *([f"{label} error"] if is_wide else []), f"{label} {second}", f"{label} rank"]
     return names if is_wide or len(label) == 1 else names[-2:]
 
 
@@ -74,18 +76,19 @@ def _site_table(found: Comparison, runs: Sequence[ComparedRun], sites: Sequence[
         if site.longitude_deg is not None and site.latitude_deg is not None:
             cells |= {"longitude": f"{site.longitude_deg:.6f}", "latitude": f"{site.latitude_deg:.6f}"}
         for run in runs:
-            cells |= _cells(run.label, run.sites.get(site.site))
+            cells |= _cells(run, run.sites.get(site.site))
         rows.add_row(*(cells[name] for name in (*names, *of_runs)))
     return rows
 
 
-def _cells(label: str, site: SiteResult | None) -> dict[str, str]:
+def _cells(run: ComparedRun, site: SiteResult | None) -> dict[str, str]:
+    label, by = run.label, SCORES[run.rank_by]
     if site is None:
-        return {f"{label} {name}": "-" for name in ("bit", "error", "of limit", "rank")}
-    error = site.egvs_se / site.egvs if site.egvs_se is not None and site.egvs > 0 else None
+        return {f"{label} {name}": "-" for name in ("bit", "error", "of limit", "rank", by.head)}
     return {
+        f"{label} {by.head}": by.value(site.score),
         f"{label} bit": f"{site.egvs:.1f}",
-        f"{label} error": "-" if error is None else f"{error:.1%}",
+        f"{label} error": by.error(site.score, site.egvs_se if site.other is None else site.other_se),
         f"{label} of limit": "-" if site.share is None else f"{site.share:.1%}",
         f"{label} rank": str(site.rank),
     }

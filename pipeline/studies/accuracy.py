@@ -125,6 +125,11 @@ def _check(scenario: Scenario, seeds: int) -> None:
     if seeds and lengths.is_finished(scenario):
         found = "the traffic is a finished file, the same for each seed"
         raise InputError("--seeds", found, "network or sumocfg in [traffic]")
+    if seeds and scenario.score.rank_by != "egvs":
+        found = (
+            f"score.rank_by = {scenario.score.rank_by!r}: what all runs together say is worked out for the EGVS alone"
+        )
+        raise InputError("--seeds", found, "--set score.rank_by=egvs")
     if seeds == 1:
         raise InputError("--seeds", "1", "at least 2")
     if not lengths.is_finished(scenario) and scenario.tpog.blocks == 1:

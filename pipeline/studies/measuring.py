@@ -41,12 +41,15 @@ from pipeline.scenario.models import Scenario, SiteGrid
 from pipeline.scoring.egvs import EntropyField
 from pipeline.scoring.leave_out import LeaveOut
 from pipeline.scoring.scorer import Scorer
+from pipeline.scoring.targets.named import WORTHS
 from pipeline.scoring.uncertainty import Estimate, order
 from pipeline.sensing import sites
 from pipeline.stages.base import Workspace
 from pipeline.stages.score import ScoredSite
+from pipeline.stages.shared.judged import Judged
 from pipeline.stages.shared.scans import scans
 from pipeline.stages.shared.scene import scene_of, site_digests
+from pipeline.stages.shared.target_scores import Targets
 from pipeline.studies.lengths import counted_frames
 from pipeline.studies.variants import Setting
 
@@ -63,11 +66,12 @@ class SettingScores:
     sites
         Names, in the order of the sites.
     shares
-        Scores as shares of ``egvs_limit`` (of the TPOG's entropy where gamma is infinite), (n,) float64.
+        Scores as shares of ``egvs_limit`` (of the TPOG's entropy where gamma is infinite), (n,) float64; where another
+        score than the EGVS ranks, its values.
     share_ses
         Their standard errors, (n,); not a number where the TPOG has one block.
     scores, ses, biases
-        In bits, (n,); the last two not a number where the TPOG has one block.
+        Of the score that ranks, (n,); the last two not a number where the TPOG has one block.
     quantile
         How many standard errors an interval reaches to each side.
     neighbours
@@ -305,29 +309,44 @@ def _with_one_site(scenario: Scenario) -> Scenario:
 
 
 def _scores(work: Workspace, keys: dict[str, str], weight: float, scored: list[ScoredSite]) -> SettingScores:
-    """What came of all stages; ``scored`` are the sites as the score stage scored them, none where it was fetched."""
+    """What came of all stages, by the score that ranks; ``scored`` are the sites as the score stage scored them, none
+    where it was fetched."""
+    rank_by = work.scenario.score.rank_by
     table = tables.read(work.path("scores.parquet"), "scores")[0].to_pydict()
     tpog, gamma = read_tpog(work.path("tpog.parquet")), work.scenario.gamma
-    names, scores = table["site"], np.array(table["egvs"])
-    unit = 1.0 / weight if math.isinf(gamma) else gamma  # a finite gamma is divided by the weight already
-    most = EntropyField.of(tpog.counts, tpog.frames, tpog.grid).limit(unit)
-    shares = scores / most if most > 0 else np.zeros(len(scores))
+    names, scores = table["site"], np.array(table[rank_by])
     leave_out = LeaveOut.of(work.path("tpog.parquet"), tpog)
-    if leave_out is None:
+    shares, limits = scores, np.ones(1)
+    if rank_by == "egvs":
+        unit = 1.0 / weight if math.isinf(gamma) else gamma  # a finite gamma is divided by the weight already
+        most = EntropyField.of(tpog.counts, tpog.frames, tpog.grid).limit(unit)
+        shares = scores / most if most > 0 else np.zeros(len(scores))
+        limits = leave_out.limits(unit) if leave_out is not None else limits
+    judged = _judged(work, tpog, leave_out, scored) if leave_out is not None else None
+    if judged is None or judged.left_out is None or (raw := judged.estimate) is None:
         unknown = [math.nan] * len(names)
         return SettingScores(names, shares.tolist(), unknown, scores.tolist(), unknown, unknown, math.nan, [], keys)
-    worths = [site.score for site in scored]
-    if not worths or worths[0].left_out is None:  # fetched, or the scenario wants no errors
-        scorer = Scorer(scene_of(work), tpog, work.path("trajectories.parquet"), leave_out)
-        worths = [scorer.score(scan.beams) for scan in scans(work)]
-    left_out = np.array([worth.left_out for worth in worths], dtype=np.float64)
-    limits = leave_out.limits(unit)
-    raw = Estimate.of(left_out, leave_out.groups)
-    normal = Estimate.of(left_out / np.where(limits > 0, limits, 1.0), leave_out.groups)
+    normal = Estimate.of(judged.left_out / np.where(limits > 0, limits, 1.0), judged.groups)
     return SettingScores(
         names, shares.tolist(), normal.se.tolist(), scores.tolist(), raw.se.tolist(), raw.bias.tolist(),
         raw.quantile(), _neighbours(raw, names, counted_frames(work.scenario)), keys,
     )  # fmt: skip
+
+
+def _judged(work: Workspace, tpog: Tpog, leave_out: LeaveOut, scored: list[ScoredSite]) -> Judged:
+    """The sites by the score that ranks, with groups of traffic left out, whatever the scenario says of errors."""
+    wanted = work.scenario.score
+    if scored and wanted.standard_error:
+        return Judged.of(wanted.rank_by, [(site.score, site.targets) for site in scored], leave_out.groups)
+    with_errors = {"score": wanted.model_copy(update={"standard_error": True})}
+    again = Workspace(work.scenario.model_copy(update=with_errors), work.folder)
+    scorer = Scorer(scene_of(again), tpog, again.path("trajectories.parquet"), leave_out)
+    targets = Targets(again, tpog.grid) if wanted.rank_by in WORTHS else None
+    found = [
+        (scorer.score(scan.beams), targets.scores(targets.see(scan)) if targets is not None else None)
+        for scan in scans(again)
+    ]
+    return Judged.of(wanted.rank_by, found, leave_out.groups)
 
 
 def _neighbours(estimate: Estimate, names: list[str], frames: int) -> list[tuple[str, str, float, float]]:

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from pipeline.artefacts import tables
-from pipeline.artefacts.readers import read_scores
 from pipeline.artefacts.run_record import RECORD, RunRecord
 from pipeline.core import files
 from pipeline.core.errors import InputError
@@ -41,6 +40,14 @@ class SiteResult:
     rank: int
     share: float | None
     """Of ``egvs_limit``."""
+    other: float | None = None
+    """The score that ranks, and its standard error, where it is not the EGVS."""
+    other_se: float | None = None
+
+    @property
+    def score(self) -> float:
+        """The score that ranks."""
+        return self.egvs if self.other is None else self.other
 
 
 @dataclass(frozen=True)
@@ -52,6 +59,7 @@ class ComparedRun:
     sites: Mapping[str, SiteResult]
     settings: Mapping[str, Any]
     files: Mapping[str, str]
+    rank_by: str = "egvs"
 
 
 @dataclass(frozen=True)
@@ -118,7 +126,8 @@ def _read(folder: Path, label: str) -> ComparedRun:
         raise InputError(folder / RECORD, "the stage score is not done", "a finished run; call egvs run first")
     if files.sha256_of(path) != done.artefacts.get(SCORES):
         raise InputError(path, "is not what the run in its folder made", "the run's own file; call egvs run again")
-    rows = read_scores(path).to_pylist()
+    scores, about = tables.read(path, "scores")
+    rows, rank_by = scores.to_pylist(), about.get("rank_by", "egvs")
     made = {name for stage in record.stages.values() for name in stage.artefacts}
     read = {
         name: digest
@@ -129,14 +138,14 @@ def _read(folder: Path, label: str) -> ComparedRun:
     }
     settings = {**dict(_flat(record.scenario)), "egvs (version)": record.egvs}
     if settings.get("score.gamma") == "auto":  # the number that it stood for
-        settings["score.gamma"] = tables.read_metadata(path, "scores")["gamma"]
+        settings["score.gamma"] = about["gamma"]
     if (version := record.stages["traffic"].summary.get("sumo") if "traffic" in record.stages else None) is not None:
         settings["sumo (version)"] = version
-    return ComparedRun(label, folder, {row["site"]: _result(row) for row in rows}, settings, read)
+    return ComparedRun(label, folder, {row["site"]: _result(row, rank_by) for row in rows}, settings, read, rank_by)
 
 
-def _result(row: dict[str, Any]) -> SiteResult:
-    limit = row["egvs_limit"]
+def _result(row: dict[str, Any], rank_by: str) -> SiteResult:
+    limit, is_other = row["egvs_limit"], rank_by != "egvs"
     return SiteResult(
         site=row["site"],
         pose=tuple(row[name] for name in _WHERE),
@@ -146,6 +155,8 @@ def _result(row: dict[str, Any]) -> SiteResult:
         egvs_se=row.get("egvs_se"),
         rank=row["rank"],
         share=row["egvs"] / limit if 0 < limit < float("inf") else None,
+        other=row[rank_by] if is_other else None,
+        other_se=row.get(f"{rank_by}_se") if is_other else None,
     )
 
 
@@ -171,7 +182,7 @@ def _agreement(a: ComparedRun, b: ComparedRun) -> Agreement:
     shared = [site for site in a.sites if site in b.sites]
     if not shared:
         return Agreement(a.label, b.label, 0)
-    its, others = (np.array([run.sites[site].egvs for site in shared]) for run in (a, b))
+    its, others = (np.array([run.sites[site].score for site in shared]) for run in (a, b))
     first_a, first_b = (tuple(shared[i] for i in sorted(best(scores, 1))) for scores in (its, others))
     tau, rho = (agreement(its, others, kind) if len(shared) > 1 else None for kind in ("tau", "rho"))
     return Agreement(a.label, b.label, len(shared), tau, rho, first_a, first_b, regret(its, others))
@@ -210,7 +221,9 @@ def _notes(a: ComparedRun, b: ComparedRun) -> Iterator[str]:
         names = ", ".join(moved[:4]) + (f" and {len(moved) - 4} more" if len(moved) > 4 else "")
         count = "1 site has" if len(moved) == 1 else f"{len(moved)} sites have"
         yield f"{count} the same name in {a.label} and {b.label} but another place, angle or sensor: {names}"
-    keys = ("roi.center_m", "roi.size_m", "roi.voxel_m", "score.gamma")
+    keys = ["roi.center_m", "roi.size_m", "roi.voxel_m", "score.gamma"]
     other = [key for key in keys if a.settings.get(key) != b.settings.get(key)]
-    if other:
+    if a.rank_by != b.rank_by:
+        yield f"{a.label} ranks by {a.rank_by}, {b.label} by {b.rank_by}: compare ranks alone"
+    elif other and a.rank_by == "egvs":
         yield f"{a.label} and {b.label} differ in {' and '.join(other)}: compare ranks and shares, not bits"

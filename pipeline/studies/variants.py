@@ -162,7 +162,9 @@ def _divides(part: float, whole: float) -> bool:
 
 
 def _thinned(scenario: Scenario) -> Iterator[Setting]:
-    """Every second and fourth azimuth, every second channel; weighted up."""
+    """Every second and fourth azimuth, every second channel; weighted up, which the EGVS alone can be."""
+    if scenario.score.rank_by != "egvs":
+        return
     candidates = sites.of(scenario)
     if any(site.points is not None for site in candidates):
         return
@@ -209,17 +211,18 @@ def _sensor(scenario: Scenario, sensor: Sensor, factor: int, rings: range | list
 
 
 def _measures(scenario: Scenario) -> Iterator[Setting]:
-    """Other voxels (with gamma as it is, and scaled by the face of a voxel), other caps, without an effect."""
-    own, gamma = scenario.roi.voxel_m, scenario.gamma
-    for voxel_m in VOXELS_M:
+    """Other voxels (with gamma as it is, and scaled by the face of a voxel) and other caps, where the score that ranks
+    has these; without an effect."""
+    own, gamma, rank_by = scenario.roi.voxel_m, scenario.gamma, scenario.score.rank_by
+    for voxel_m in VOXELS_M if rank_by in ("egvs", "entropy_seen") else ():
         if voxel_m == own or not _fits(scenario, voxel_m):
             continue
         yield Setting(f"voxel {voxel_m:g} m", MEASURES, "voxel", (f"roi.voxel_m={voxel_m}",))
         scaled = gamma * (voxel_m / own) ** 2
-        if scaled != gamma:
+        if scaled != gamma and rank_by == "egvs":
             overrides = (f"roi.voxel_m={voxel_m}", f"score.gamma={scaled}")
             yield Setting(f"voxel {voxel_m:g} m, gamma {scaled:g}", MEASURES, "voxel and gamma", overrides)
-    for cap in GAMMAS:
+    for cap in GAMMAS if rank_by == "egvs" else ():
         if cap != gamma:
             yield Setting(f"gamma {cap:g}", MEASURES, "gamma", (f"score.gamma={cap}",))
     for name in scenario.effects.named:

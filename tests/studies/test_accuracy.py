@@ -22,7 +22,7 @@ from rich.console import Console
 import pipeline
 from pipeline.artefacts import tables
 from pipeline.cli import study_tables
-from pipeline.core.errors import RunError
+from pipeline.core.errors import InputError, RunError
 from pipeline.runs import stages
 from pipeline.runs.locking import alone
 from pipeline.runs.store import Store
@@ -230,6 +230,29 @@ def test_a_setting_that_fails_is_named_and_the_rest_goes_on(
     assert len(study.rows) > 5
     again = study_of(mini, [], tmp_path / "out")
     assert (again.rows, again.skipped) == (study.rows, study.skipped)
+
+
+@pytest.mark.parametrize("standard_error", ["true", "false"])
+def test_the_score_that_ranks_is_studied(mini: Path, tmp_path: Path, few: None, standard_error: str) -> None:
+    sets = ["score.rank_by=seen_well", f"score.standard_error={standard_error}"]
+    study = study_of(mini, sets, tmp_path / "out")
+    assert {row.knob for row in study.rows} == {"", "period"}  # no gamma, no voxels, no beams that are weighted up
+    pipeline.run(pipeline.load(mini, sets[:1]), tmp_path / "run")
+    rows = pipeline.read_scores(tmp_path / "run" / "scores.parquet").to_pydict()
+    own = SettingRunner(mini, sets, tmp_path / "out", 1, lambda *_: None).known(study_settings.OWN)
+    assert own is not None
+    assert own.shares == own.scores == rows["seen_well"]
+    assert own.ses == pytest.approx(rows["seen_well_se"])
+    assert own.neighbours[0][2] == pytest.approx(rows["beats_next"][rows["rank"].index(1)])
+    other = next(row for row in study.rows if row.knob == "period")
+    pipeline.run(pipeline.load(mini, [*sets, *words(other)]), tmp_path / "other")
+    found = pipeline.read_scores(tmp_path / "other" / "scores.parquet")["seen_well"].to_numpy()
+    assert other.error == pytest.approx(np.abs(found / rows["seen_well"] - 1).max())
+
+
+def test_seeds_are_for_the_egvs_alone(junction: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"--seeds: score\.rank_by = 'seen_well'"):
+        study_of(junction, ["score.rank_by=seen_well"], tmp_path / "out", seeds=2)
 
 
 def test_a_setting_that_is_no_scenario_is_named_and_the_rest_goes_on(

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from rich.console import Console
+from scipy.stats import kendalltau
 
 import pipeline
 from pipeline.cli import comparison_tables
@@ -56,6 +57,22 @@ def test_a_run_beside_itself_agrees_and_differs_in_nothing(two: tuple[Path, Path
     (pair,) = found.agreements
     assert (pair.tau, pair.rho, pair.regret_a) == pytest.approx((1.0, 1.0, 0.0))
     assert (found.differences, found.notes) == ((), ())
+
+
+def test_runs_agree_by_the_scores_that_rank_them(mini: Path, tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]
+    rows = "".join(f"p{n},{4 + 7 * n},{12 - 24 * (n % 2)},{2 + n}\n" for n in range(5))
+    (mini / "sites.csv").write_text(f"site,x_m,y_m,z_m\n{rows}")
+    for name, by in (("a", "egvs"), ("b", "seen_well"), ("c", "seen_well")):
+        pipeline.run(pipeline.load(mini, [f"score.rank_by={by}"]), tmp_path / name)
+    found = compare([tmp_path / name for name in "abc"])
+    scores = [pipeline.read_scores(tmp_path / name / "scores.parquet").to_pydict() for name in "ab"]
+    assert found.agreements[0].tau == pytest.approx(kendalltau(scores[0]["egvs"], scores[1]["seen_well"]).statistic)
+    assert found.agreements[2].tau == pytest.approx(1.0)
+    assert found.notes == tuple(f"A ranks by egvs, {other} by seen_well: compare ranks alone" for other in "BC")
+    comparison_tables.print_comparison(found)
+    told = capsys.readouterr().out
+    assert "B seen well" in told
+    assert all(f"{value:.1%}" in told for value in scores[1]["seen_well"])
 
 
 def row(site: str, egvs: float, rank: int) -> SiteResult:
