@@ -34,8 +34,8 @@ class PlaceSeen:
         As in the artefact.
     vehicle_frames, vehicles
         Vehicles there, counted in each frame; how many different ones.
-    share
-        Of them that is seen, 0 to 1.
+    share, se
+        Of them that is seen, 0 to 1, and its standard error; not a number of one vehicle.
     x_m, y_m
         Where they were on average, world frame.
     """
@@ -47,6 +47,7 @@ class PlaceSeen:
     vehicle_frames: int
     vehicles: int
     share: float
+    se: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +132,7 @@ def _of_site(site: str, columns: Mapping[str, list[Any]], about: Mapping[str, An
     if index.size and not ((index >= 0) & (index < np.array([cells["shape"]]).T)).all():
         raise InputError(path, f"a square of site {site} lies outside the region", "an unaltered file; make it again")
     share_missed[tuple(index)] = 1.0 - share[by == "cell"]
-    names = ("by", "words", "x_m", "y_m", "vehicle_frames", "vehicles", "share_seen")
+    names = ("by", "words", "x_m", "y_m", "vehicle_frames", "vehicles", "share_seen", "share_se")
     rows = zip(*(columns[name] for name in names), strict=True)
     places = tuple(PlaceSeen(*row) for row in rows if row[0] != "cell")
     x, y = cells["origin_m"]

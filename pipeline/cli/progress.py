@@ -12,6 +12,9 @@ from pipeline.artefacts.run_record import StageRecord
 from pipeline.cli.terminal import in_words
 from pipeline.core.findings import WARNINGS, warnings_of
 
+_TOLD_APART = ("flags", "missed", WARNINGS)
+"""Of a stage's summary, what its line leaves out: told elsewhere, or by nobody."""
+
 
 class Screen:
     """Shows a run as it goes on.
@@ -61,7 +64,7 @@ class Screen:
         if self._has_bar:
             self._bar.update(self._task, visible=False)
         took = {"skipped": "unchanged", "fetched": "from store"}.get(state) or f"{record.cost.seconds:.2f} s"
-        summary = {key: value for key, value in record.summary.items() if key not in ("flags", WARNINGS)}
+        summary = {key: value for key, value in record.summary.items() if key not in _TOLD_APART}
         if counts := summary.pop("counts", None):
             summary["worst GEH of counts"] = max(count["geh"] for count in counts)
         periods = summary.pop("periods", {}) if stage == "traffic" else {}

@@ -86,7 +86,8 @@ def note(its: SiteBlindspots) -> str:
         listed = "; ".join(f"{place.words}: {_per_cent(place)}" for place in approaches)
         found.append(f"Whole approaches, seen: {listed}.")
     if its.off_lanes:
-        found.append(f"Of {its.whole.vehicle_frames:,} vehicles looked at, {its.off_lanes:,} were on no lane.")
+        were = "was" if its.off_lanes == 1 else "were"
+        found.append(f"Of {its.whole.vehicle_frames:,} vehicles looked at, {its.off_lanes:,} {were} on no lane.")
     return " ".join(found)
 
 
@@ -95,4 +96,4 @@ def _per_cent(place: PlaceSeen) -> str:
 
 
 def _rests_on(place: PlaceSeen) -> str:
-    return f"{place.vehicles:,} vehicles, looked at {place.vehicle_frames:,} times"
+    return f"± {100.0 * place.se:.0f} %, from {place.vehicles:,} vehicles looked at {place.vehicle_frames:,} times"

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -33,6 +34,24 @@ _ORDER = (ALL, NO_LANE, *KINDS)
 
 
 @dataclass(frozen=True, eq=False)
+class SiteSeen:
+    """What one site sees at each of k spots.
+
+    Attributes
+    ----------
+    seen
+        Vehicle-frames that it sees, (k,) int64.
+    share, se
+        Which share of the weight there these are, (k,) float64, and its standard error: of a ratio of sums over
+        vehicles that are independent of one another; not a number of one vehicle.
+    """
+
+    seen: Ints
+    share: Floats
+    se: Floats
+
+
+@dataclass(frozen=True, eq=False)
 class Spots:
     """Where each vehicle-frame of a record is; k spots, in the order of the artefact.
 
@@ -44,22 +63,22 @@ class Spots:
         Squares from the region's corner to the east and to the north, of the other spots, (c, 2) int64.
     at_m
         Middle of the square, or mean of the vehicles' centres there, world frame, (k, 2) float64.
-    row, spot
-        Vehicle-frames and the spots that they are at, (m,) int64 each.
+    row, visit
+        Vehicle-frames, and the visits that they are part of, (m,) int64 each; a visit is all that one vehicle is at
+        one spot.
+    spot
+        Of each visit, (v,) int64, ascending.
     weight
         How much each vehicle-frame of the record counts, (n,) float64.
-    vehicle_frames, vehicles
-        How many, and of how many different vehicles, at each spot, (k,) int64.
     """
 
     places: tuple[Place, ...]
     cells: Ints
     at_m: Floats
     row: Ints
+    visit: Ints
     spot: Ints
     weight: Floats
-    vehicle_frames: Ints
-    vehicles: Ints
 
     @classmethod
     def of(cls, record: TargetRecord, roads: RoadPlaces | None, weight: Floats, period: Ints) -> Spots:
@@ -78,36 +97,60 @@ class Spots:
         cell_row, cells = cells_of(record.boxes, record.grid.roi)
         cell, at_cell = np.unique(cells, axis=0, return_inverse=True)
         row, spot = np.append(rows, cell_row), np.append(at, len(places) + at_cell.reshape(-1))
-        count, who = len(places) + len(cell), record.vehicle + len(record.vehicles) * period
-        different = np.unique(spot * (int(who.max(initial=0)) + 1) + who[row]) // (int(who.max(initial=0)) + 1)
-        frames, vehicles = (np.bincount(its, minlength=count) for its in (spot, different))
-        sums_m = [np.bincount(spot, record.boxes[row, axis], minlength=count) for axis in (0, 1)]
-        at_m = np.column_stack(sums_m).astype(np.float64) / frames[:, None]
+        who = record.vehicle + len(record.vehicles) * period
+        names = int(who.max(initial=0)) + 1
+        visits, visit = np.unique(spot * names + who[row], return_inverse=True)
+        at_m = np.column_stack([np.bincount(spot, record.boxes[row, axis]) for axis in (0, 1)]).astype(np.float64)
+        at_m /= np.bincount(spot)[:, None]
         at_m[len(places) :] = np.asarray(record.grid.origin_m[:2]) + (cell + 0.5) * CELL_M
-        return cls(places, cell, at_m, row, spot, weight, frames, vehicles)
+        return cls(places, cell, at_m, row, visit.reshape(-1), visits // names, weight)
 
     def __len__(self) -> int:
         """How many spots."""
-        return len(self.vehicle_frames)
+        return len(self.at_m)
 
     @property
+    def vehicle_frames(self) -> Ints:
+        """How many there are at each spot, (k,) int64."""
+        return np.bincount(self.spot[self.visit], minlength=len(self))
+
+    @property
+    def vehicles(self) -> Ints:
+        """Of how many different vehicles, (k,) int64."""
+        return np.bincount(self.spot, minlength=len(self))
+
+    @cached_property
+    def _visit_weights(self) -> Floats:
+        return self._of_visits(self.visit, self.weight[self.row])
+
+    @cached_property
     def weights(self) -> Floats:
         """Of all vehicle-frames at each spot, (k,) float64."""
-        found: Floats = np.bincount(self.spot, self.weight[self.row], minlength=len(self)).astype(np.float64)
-        return found
+        return self._of_spots(self._visit_weights)
 
-    def seen(self, points: Floats) -> tuple[Ints, Floats]:
-        """How many vehicle-frames a site sees at each spot, (k,) int64, and their weights, (k,) float64.
+    def by(self, points: Floats) -> SiteSeen:
+        """What a site sees of them.
 
         Parameters
         ----------
         points
             Of the site on each vehicle-frame of the record, (n,) float64.
         """
-        well = (points >= SEEN_WELL_POINTS)[self.row]
-        spot = self.spot[well]
-        weights = np.bincount(spot, self.weight[self.row[well]], minlength=len(self))
-        return np.bincount(spot, minlength=len(self)), weights.astype(np.float64)
+        at = (points >= SEEN_WELL_POINTS)[self.row]
+        visit, weights = self.visit[at], self._visit_weights
+        of_visits = self._of_visits(visit, self.weight[self.row[at]])
+        share = self._of_spots(of_visits) / self.weights
+        squares = self._of_spots((of_visits - share[self.spot] * weights) ** 2)
+        vehicles = self.vehicles
+        more = np.divide(vehicles, vehicles - 1, out=np.full(len(self), np.nan), where=vehicles > 1)
+        seen = np.bincount(self.spot[visit], minlength=len(self))
+        return SiteSeen(seen, share, np.sqrt(squares * more) / self.weights)
+
+    def _of_visits(self, visit: Ints, weight: Floats) -> Floats:
+        return np.bincount(visit, weight, minlength=len(self.spot)).astype(np.float64)
+
+    def _of_spots(self, of_visits: Floats) -> Floats:
+        return np.bincount(self.spot, of_visits, minlength=len(self)).astype(np.float64)
 
 
 def cells_of(boxes: Floats, roi: Roi) -> tuple[Ints, Ints]:

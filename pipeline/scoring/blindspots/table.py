@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,24 +10,10 @@ import numpy as np
 
 from pipeline.artefacts import tables
 from pipeline.core.grid import Grid
-from pipeline.scoring.blindspots.lanes import Floats, Ints
-from pipeline.scoring.blindspots.spots import CELL, CELL_M, Spots
+from pipeline.scoring.blindspots.spots import CELL, CELL_M, SiteSeen, Spots
 from pipeline.scoring.targets.scores import SEEN_WELL_POINTS
 
 ARTEFACT = "blindspots"
-
-
-@dataclass(frozen=True, eq=False)
-class SiteSeen:
-    """How many vehicle-frames a site sees at each of k spots, (k,) int64, and their weights, (k,) float64."""
-
-    seen: Ints
-    weights: Floats
-
-    @classmethod
-    def of(cls, spots: Spots, points: Floats) -> SiteSeen:
-        """From the site's points on each vehicle-frame of the record, (n,) float64."""
-        return cls(*spots.seen(points))
 
 
 def write(
@@ -46,7 +31,7 @@ def write(
     where, weights = _where(spots), spots.weights
     with tables.writer(path, ARTEFACT, ("weight",) if mixed else ()) as file:
         for site, its in zip(sites, seen, strict=True):
-            shares = {"seen": its.seen, "share_seen": its.weights / weights, "weight": weights}
+            shares = {"seen": its.seen, "share_seen": its.share, "share_se": its.se, "weight": weights}
             file.write({"site": [site] * len(spots), **where, **shares})
         grid = Grid.from_json(about["grid"])
         cells = {"origin_m": list(grid.origin_m[:2]), "cell_m": CELL_M, "shape": list(cells_over(grid))}

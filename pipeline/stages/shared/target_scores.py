@@ -19,7 +19,7 @@ from pipeline.core.errors import InputError
 from pipeline.core.findings import Finding
 from pipeline.core.grid import Grid
 from pipeline.scenario.models import FILE
-from pipeline.scoring.blindspots.table import SiteSeen
+from pipeline.scoring.blindspots.spots import SiteSeen
 from pipeline.scoring.targets.frame_groups import FrameGroups, recorded_frames, weights_in_mix
 from pipeline.scoring.targets.named import WORTHS
 from pipeline.scoring.targets.record import Floats, TargetRecord
@@ -98,9 +98,7 @@ class Targets:
         worths = {name: WORTHS[name](seen) for name in self._names}
         whole = {name: self._means(worth) for name, worth in worths.items()}
         apart = ({name: mean(worth[rows]) for name, worth in worths.items()} for _, rows in self._periods)
-        return SiteTargets(
-            whole, tuple(apart), SiteSeen.of(self.spots, seen.points) if self.spots is not None else None
-        )
+        return SiteTargets(whole, tuple(apart), self.spots.by(seen.points) if self.spots is not None else None)
 
     def doubts(self, tpog: Tpog, by_period: Sequence[Tpog]) -> list[Finding]:
         """A warning where scores are no numbers though the region has traffic, at all or in a period; that it has none

@@ -45,7 +45,7 @@ def test_a_hidden_lane_by_hand(tmp_path: Path) -> None:
     later = frame([car(29, -1.6), car(20, 10), car(41, -4.8)], number=9, vehicles=("b", "e", "c"))
     record = TargetRecord.of([first, later], GRID)
     spots = spots_of(record, RoadPlaces.of(read(tmp_path), GRID.roi))
-    seen, weights = spots.seen(np.array([19.0, 20.0, 25.0, 1000.0, 0.0, 21.0, 20.0]))
+    found = spots.by(np.array([19.0, 20.0, 25.0, 1000.0, 0.0, 21.0, 20.0]))
     assert by_place(spots, spots.vehicle_frames) == {
         ("all", ""): 7,
         ("no lane", ""): 1,
@@ -68,7 +68,7 @@ def test_a_hidden_lane_by_hand(tmp_path: Path) -> None:
         ("turn", "near:straight"): 1,
         ("crossing", ":j_c0_0"): 1,
     }
-    assert by_place(spots, seen) == {
+    assert by_place(spots, found.seen) == {
         ("all", ""): 5,
         ("no lane", ""): 1,
         ("approach", "near"): 2,
@@ -79,7 +79,7 @@ def test_a_hidden_lane_by_hand(tmp_path: Path) -> None:
         ("turn", "near:straight"): 1,
         ("crossing", ":j_c0_0"): 1,
     }
-    assert weights.tolist() == seen.tolist()
+    assert found.share.tolist() == (found.seen / spots.vehicle_frames).tolist()
     left = [place.name for place in spots.places].index("near_2")
     assert spots.at_m[left].tolist() == pytest.approx([(23 + 18 + 27) / 3, -1.6])
 
@@ -140,23 +140,47 @@ def test_counts_against_plain_python(seed):
     points, weight = rng.integers(0, 40, len(record)).astype(np.float64), rng.uniform(0.5, 3, len(record))
     period = (record.frame > 0).astype(np.int64)
     spots = spots_of(record, weight=weight, period=period)
-    seen, weights = spots.seen(points)
-    who, counted, well, weighed = defaultdict(set), defaultdict(int), defaultdict(int), defaultdict(float)
+    found = spots.by(points)
+    who, counted, well, weighed = defaultdict(set), defaultdict(int), defaultdict(int), defaultdict(list)
     for i in range(len(record)):
         for cell in slow_cells(record.boxes[i], small.roi):
             who[cell].add((record.vehicle[i], record.frame[i] > 0))
             counted[cell] += 1
             well[cell] += int(points[i] >= 20)
-            weighed[cell] += float(weight[i]) * (points[i] >= 20)
+            weighed[cell] += [(record.vehicle[i], record.frame[i] > 0, weight[i], points[i] >= 20)]
     first = len(spots.places)
     assert first == (1 if len(record) else 0)
     cells = list(map(tuple, spots.cells.tolist()))
     assert cells == sorted(counted)
     assert spots.vehicle_frames[first:].tolist() == [counted[cell] for cell in cells]
     assert spots.vehicles[first:].tolist() == [len(who[cell]) for cell in cells]
-    assert seen[first:].tolist() == [well[cell] for cell in cells]
-    assert weights[first:] == pytest.approx([weighed[cell] for cell in cells])
-    assert seen[:first].tolist() == [int((points >= 20).sum())] * first
+    assert found.seen[first:].tolist() == [well[cell] for cell in cells]
+    assert found.seen[:first].tolist() == [int((points >= 20).sum())] * first
+    slow = [share_slowly(weighed[cell]) for cell in cells]
+    assert found.share[first:] == pytest.approx([share for share, _ in slow])
+    assert found.se[first:] == pytest.approx([se for _, se in slow], nan_ok=True)
+
+
+def share_slowly(rows):
+    """A ratio of sums over vehicles, and its textbook error, of (vehicle, period, weight, seen)."""
+    total = math.fsum(weight for *_, weight, _ in rows)
+    share = math.fsum(weight * seen for *_, weight, seen in rows) / total
+    vehicles = {row[:2] for row in rows}
+    squares = [math.fsum(w * (seen - share) for *who, w, seen in rows if tuple(who) == its) ** 2 for its in vehicles]
+    count = len(vehicles)
+    return share, math.sqrt(math.fsum(squares) * count / (count - 1)) / total if count > 1 else math.nan
+
+
+def test_the_standard_error_is_that_of_vehicles_looked_at_once_or_always_alike() -> None:
+    """Ten cars, of which four are missed: as of ten throws of a coin, however often each is looked at."""
+    cars = [car(5 + 5 * i, 10) for i in range(10)]
+    once = TargetRecord.of([frame(cars)], GRID)
+    often = TargetRecord.of([frame(cars, number=number) for number in range(7)], GRID)
+    points = np.where(np.arange(10) < 4, 0.0, 50.0)
+    for record, its in ((once, points), (often, np.tile(points, 7))):
+        found = spots_of(record).by(its)
+        assert (found.share[0], found.se[0]) == pytest.approx((0.6, math.sqrt(0.6 * 0.4 / 9)))
+    assert np.isnan(spots_of(once).by(points).se[1:]).all()  # one car over each square
 
 
 def test_cars_of_one_name_in_two_periods_are_two() -> None:
@@ -169,8 +193,8 @@ def test_cars_of_one_name_in_two_periods_are_two() -> None:
 def test_weights_count_in_shares() -> None:
     record = TargetRecord.of([frame([car(20, 10), car(40, 10)])], GRID)
     spots = spots_of(record, weight=[3.0, 1.0])
-    seen, weights = spots.seen(np.array([20.0, 0.0]))
-    assert (seen[0], weights[0], spots.weights[0]) == (1, 3.0, 4.0)
+    found = spots.by(np.array([20.0, 0.0]))
+    assert (found.seen[0], found.share[0], spots.weights[0]) == (1, 0.75, 4.0)
 
 
 def test_a_rear_part_is_where_its_own_front_is(tmp_path: Path) -> None:
@@ -207,4 +231,4 @@ def test_crossings_against_shapely(tmp_path: Path) -> None:
 def test_nobody(tmp_path: Path) -> None:
     record = TargetRecord.of([frame([])], GRID)
     spots = spots_of(record, RoadPlaces.of(read(tmp_path), GRID.roi))
-    assert len(spots) == 0 and spots.seen(np.empty(0))[0].shape == (0,)
+    assert len(spots) == 0 and spots.by(np.empty(0)).share.shape == (0,)
