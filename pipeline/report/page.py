@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.artefacts.blindspots import BLINDSPOTS
+from pipeline.artefacts.blindspots import BLINDSPOTS, FEWEST_VEHICLES
 from pipeline.artefacts.period_ranking import PERIOD_SCORES, PeriodRanking
 from pipeline.artefacts.readers import SEPARABLE, Tpog, read_tpog
 from pipeline.artefacts.run_record import RECORD, RunRecord, StageRecord
@@ -210,6 +210,7 @@ def page(
         frames=frames,
         watched=wording.duration(frames * scenario.traffic.frame_period_s),
         effects=effects,
+        fewest_vehicles=FEWEST_VEHICLES,
         left_out=[what for what, effect in _LEFT_OUT if effect not in effects],
         warnings=warnings_of(stage.summary for stage in stages.values()),
         version=__version__,
