@@ -7,7 +7,7 @@ the site's fault. People on foot and on bicycles are in the frame, and in the wa
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -63,11 +63,13 @@ class TrafficFrame:
         """Which boxes are vehicles or parts of them, (n,)."""
         return np.array([kind not in NO_VEHICLES for kind in self.kinds], dtype=np.bool_)
 
-    def wanted(self, roi: Roi) -> NDArray[np.int64]:
-        """The rows that are to be seen: vehicles whose centre is in the region of interest (half-open, as voxels)."""
+    def wanted(self, roi: Roi, people: Collection[str] = ()) -> NDArray[np.int64]:
+        """The rows that are to be seen: vehicles whose centre is in the region of interest (half-open, as voxels), and
+        those of :data:`NO_VEHICLES` that ``people`` names."""
         centre = self.boxes[:, :3] - np.asarray(roi.origin_m)
         inside = ((centre >= 0.0) & (centre < np.asarray(roi.size_m))).all(axis=1)
-        return np.flatnonzero(inside & self.are_vehicles())
+        named = np.array([kind in people for kind in self.kinds], dtype=np.bool_)
+        return np.flatnonzero(inside & (self.are_vehicles() | named))
 
 
 def spread(recorded: int, wanted: int) -> NDArray[np.int64]:

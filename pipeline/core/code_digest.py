@@ -86,9 +86,10 @@ def _version(distribution: str) -> str | None:
 
 @cache
 def _read(path: Path, package: str) -> tuple[str, tuple[str, ...]]:
-    """A file's digest, and what it imports."""
-    content = path.read_bytes()
-    return hashlib.sha256(content).hexdigest(), tuple(imported(content.decode("utf-8"), package))
+    """A file's digest, that of its numbers in a JSON file of its name included, and what it imports."""
+    content, data = path.read_bytes(), path.with_suffix(".json")
+    digest = hashlib.sha256(content + (data.read_bytes() if data.is_file() else b"")).hexdigest()
+    return digest, tuple(imported(content.decode("utf-8"), package))
 
 
 def imported(text: str, package: str) -> Iterator[str]:

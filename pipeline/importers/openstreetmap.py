@@ -39,7 +39,7 @@ from pipeline.importers.mapped_solids import BUILDING_M, ImportCounts, MappedSol
 from pipeline.importers.shapes import XY
 from pipeline.scenario.loading import load
 from pipeline.scenario.models import FILE, RoiModel
-from pipeline.scenario.score import ScoreModel
+from pipeline.scenario.score import RECOMMENDED, ScoreModel
 from pipeline.scenario.traffic import FRAMES, WARMUP_S, CountModel, TrafficModel
 from pipeline.scenario.types import Name
 from pipeline.traffic import sumo, sumo_folder
@@ -309,7 +309,7 @@ def _toml(name: str, made: NewScenario) -> str:
         "sites": (f"poles {junctions.KERB_M:g} m behind the kerbs of the junction; add or remove rows at will", {
             "file": SITES, "sensor": SENSOR, "heights_m": list(HEIGHTS_M), "aim": "roi", "pitch_deg": list(PITCHES_DEG),
         }),
-        "score": ("", {"gamma": ScoreModel.model_fields["gamma"].default}),
+        "score": ("", {"gamma": ScoreModel.model_fields["gamma"].default, "rank_by": RECOMMENDED}),
     }  # fmt: skip
     for key, (comment, values) in tables.items():
         table = tomlkit.item(values)
@@ -321,6 +321,7 @@ def _toml(name: str, made: NewScenario) -> str:
         document["traffic"]["counts"].comment(
             "assumed by the class of the streets: put what was counted in their place"
         )
+    document["score"]["rank_by"].comment("the share of vehicles that detectors are expected to find; docs/validity.md")
     document["sites"]["aim"].comment("sensors are turned towards the middle of the region")
     document["sites"]["pitch_deg"].comment("each height with each tilt is a candidate; 'aim': the middle ray meets it")
     return tomlkit.dumps(document)

@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from pipeline.report.ranking import ScoredSite
-from pipeline.report.score_words import RECOMMENDED, SCORES
+from pipeline.report.score_words import SCORES
+from pipeline.scenario.score import RECOMMENDED
 
 FIRST = 3
 """So many of the best sites are held against each other."""

@@ -111,6 +111,7 @@ def _shown(scenario: Scenario) -> dict[str, Any]:
         "vehicles": scenario.traffic.vehicles,
         "gamma": repr(scenario.gamma),
         "gamma_auto": scenario.score.gamma == "auto",
+        "weights": scenario.score.weights.in_words,
         "blindspots": scenario.score.blindspots,
         "effects": scenario.effects.model_dump(mode="json"),
     }
@@ -200,6 +201,7 @@ def page(
         crowded=maps.is_crowded(sites),
         rings=maps.has_shared_places(sites),
         by=ranking.by,
+        weights=scenario.score.weights.in_words,
         beside=ranking.beside,
         style=Markup(STYLE_SHEET),
         choose=Markup((TEMPLATES / "choose.js").read_text(encoding="utf-8")),

@@ -16,7 +16,8 @@ from pipeline.artefacts import schemas, tables
 from pipeline.artefacts.readers import SEPARABLE
 from pipeline.core.errors import InputError
 from pipeline.report.drawing.map_frame import MapSite
-from pipeline.report.score_words import RECOMMENDED, SCORES, ScoreWords
+from pipeline.report.score_words import SCORES, ScoreWords
+from pipeline.scenario.score import RECOMMENDED
 
 CLOSE = 0.01
 """Sites within this share of the best score are named beside it."""

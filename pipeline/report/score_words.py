@@ -38,6 +38,11 @@ class ScoreWords:
     unit: str = ""
 
     @property
+    def counts_vehicles(self) -> bool:
+        """Whether it is a mean over vehicles."""
+        return self.means.endswith(_VEHICLES)
+
+    @property
     def title(self) -> str:
         """At the head of a column of the report, two lines of HTML."""
         first, _, rest = self.head.partition(" ")
@@ -101,6 +106,3 @@ SCORES = {
     )
 }  # fmt: skip
 """By name."""
-
-RECOMMENDED = "expected_detections"
-"""The score that the study recommends (docs/validity.md)."""

@@ -7,9 +7,22 @@ from typing import Annotated, Literal
 from pydantic import Field, field_validator
 
 from pipeline.core.strict_model import StrictModel
+from pipeline.scenario.types import Name, Point2
 
-OtherScore = Literal["entropy_seen", "points_on_target", "seen_well"]
+VehicleClass = Literal[
+    "pedestrian", "wheelchair", "bicycle", "scooter", "moped", "motorcycle", "passenger", "private", "hov", "taxi",
+    "bus", "coach", "delivery", "truck", "trailer", "evehicle", "emergency", "authority", "army", "vip", "tram",
+    "rail_urban",
+    "subway", "rail", "rail_electric", "rail_fast", "ship", "container", "cable_car", "aircraft", "drone", "custom1",
+    "custom2",
+]  # fmt: skip
+"""SUMO's vClasses."""
+
+OtherScore = Literal["expected_detections", "seen_well", "points_on_target", "entropy_seen"]
 """Scores beside the EGVS."""
+
+RECOMMENDED: OtherScore = "expected_detections"
+"""The score that the study recommends (docs/validity.md), and that new scenarios rank by."""
 
 
 _AT_ONE_METRE, _POWER = 10.0, 1.16
@@ -24,6 +37,44 @@ def gamma_for(voxel_m: float, *, moving_occlusion: bool) -> float:
     return float(f"{gamma / 2 if moving_occlusion else gamma:.2g}")
 
 
+class ZoneModel(StrictModel):
+    """A part of the region in which vehicles count more, or less."""
+
+    polygon_m: tuple[Point2, ...] = Field(min_length=3, description="Its corners in the world frame, in order")
+    weight: float = Field(ge=0, description="How much a vehicle counts whose centre is in it; 1 elsewhere")
+
+    @field_validator("polygon_m")
+    @classmethod
+    def _encloses(cls, polygon_m: tuple[Point2, ...]) -> tuple[Point2, ...]:
+        import shapely
+
+        if (why := shapely.is_valid_reason(shapely.Polygon(polygon_m))) != "Valid Geometry":
+            raise ValueError(f"no polygon that encloses an area ({why})")
+        return polygon_m
+
+
+class WeightsModel(StrictModel):
+    """How much vehicles count in the scores over vehicles: a vehicle's kind times every zone that holds its centre."""
+
+    kinds: dict[VehicleClass, Annotated[float, Field(ge=0)]] = Field(
+        default_factory=dict,
+        description="Weight of each SUMO vClass, 1 where none stands here; people on foot and on bicycles are to be "
+        "seen only where they have one, as in pedestrian = 2",
+    )
+    zones: dict[Name, ZoneModel] = Field(default_factory=dict, description="Parts of the region by a name of your own")
+
+    @property
+    def are_given(self) -> bool:
+        """Whether there are any."""
+        return bool(self.kinds or self.zones)
+
+    @property
+    def in_words(self) -> str:
+        """Names and weights: "bus 3, zone crosswalk 2"."""
+        kinds = [f"{kind} {weight:g}" for kind, weight in self.kinds.items()]
+        return ", ".join([*kinds, *(f"zone {name} {zone.weight:g}" for name, zone in self.zones.items())])
+
+
 class ScoreModel(StrictModel):
     """How a site is scored."""
 
@@ -34,8 +85,10 @@ class ScoreModel(StrictModel):
     )
     rank_by: Literal["egvs", OtherScore] = Field("egvs", description="The score that sites are ranked by")
     others: tuple[OtherScore, ...] = Field(
-        ("seen_well",), description="Further scores that scores.parquet gets, beside egvs and the one that ranks"
+        (RECOMMENDED,),
+        description="Further scores that scores.parquet gets, beside egvs and the one that ranks",
     )
+    weights: WeightsModel = WeightsModel()
     keep_visibility: tuple[str, ...] | Literal["all"] = Field(
         (), description="Sites whose hits in every voxel are written to visibility.parquet"
     )

@@ -155,6 +155,8 @@ def run(
     period_scores.write(work.path(ARTEFACTS[2]), names, worths, ranking, apart, periods, limits, about)
     best = [name for name, rank in zip(names, ranking.rank, strict=True) if rank == 1]
     summary: Summary = {"sites": len(done), "best": best, "rank_by": wanted.rank_by, "egvs_limit": scorer.limit}
+    if wanted.weights.are_given:
+        summary["weights"] = wanted.weights.in_words
     if wanted.gamma == "auto":
         summary["gamma_auto"] = work.scenario.gamma
     if wanted.blindspots and (found := next(blindspots.read(work.path(BLINDSPOTS), best[:1]), None)):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -17,16 +18,19 @@ from pipeline.artefacts.readers import read_scores, read_scores_by_period, read_
 from pipeline.artefacts.traffic_frames import read
 from pipeline.core.findings import warnings_of
 from pipeline.scenario import loading
-from pipeline.scenario.score import ScoreModel
+from pipeline.scenario.score import OtherScore, ScoreModel
 from pipeline.scoring.egvs import binary_entropy
+from pipeline.scoring.targets.detectability import expected_detections
 from pipeline.scoring.targets.named import WORTHS
+from pipeline.scoring.targets.record import TargetRecord
+from pipeline.scoring.targets.seen import see
 from pipeline.scoring.visibility import Beams
 from pipeline.sensing.scanner import Scanner
 from pipeline.stages import score
 from tests.scoring.targets import scenes
 from tests.stages import inputs_of, run_stage
 
-ALL = 'score.others=["seen_well", "points_on_target", "entropy_seen"]'
+ALL = 'score.others=["expected_detections", "seen_well", "points_on_target", "entropy_seen"]'
 SITES = "site,x_m,y_m,z_m\n" + "".join(f"s{n},{5 + 6 * n},{11 - 22 * (n % 2)},{2 + n}\n" for n in range(5))
 
 
@@ -61,7 +65,7 @@ def test_means_over_vehicles_are_those_of_the_slow_twin(
     assert 1.0 <= widened[0] < 2.0
 
 
-@pytest.mark.parametrize("name", ["egvs", "entropy_seen", "points_on_target", "seen_well"])
+@pytest.mark.parametrize("name", ["egvs", *get_args(OtherScore)])
 def test_sites_rank_by_the_score_that_is_named(mini: Path, tmp_path: Path, name: str) -> None:
     (mini / "sites.csv").write_text(SITES)
     rows = run(mini, tmp_path / "run", f"score.rank_by={name}", "score.others=[]")
@@ -79,7 +83,7 @@ def test_what_ranks_changes_no_score(mini: Path, tmp_path: Path) -> None:
     (mini / "sites.csv").write_text(SITES)
     plain, other = run(mini, tmp_path / "a"), run(mini, tmp_path / "b", "score.rank_by=points_on_target", ALL)
     shared = set(plain["s0"]) - {"rank", "beats_next"}
-    assert {"egvs", "egvs_se", "seen_well", "seen_well_se"} <= shared
+    assert {"egvs", "egvs_se", "expected_detections", "expected_detections_se"} <= shared
     assert all(other[site][key] == row[key] for site, row in plain.items() for key in shared)
 
 
@@ -140,7 +144,7 @@ def test_no_vehicle_in_the_region_is_refused_where_vehicles_rank(mini: Path, tmp
     assert [it.rule for it in warnings_of(stage.summary for stage in record.stages.values())] == [
         "traffic in the region"
     ]
-    assert math.isnan(read_scores(tmp_path / "b" / "scores.parquet")["seen_well"][0].as_py())
+    assert math.isnan(read_scores(tmp_path / "b" / "scores.parquet")["expected_detections"][0].as_py())
 
 
 def test_errors_that_are_not_known_are_told_as_such(mini: Path, tmp_path: Path) -> None:
@@ -152,7 +156,8 @@ def test_errors_that_are_not_known_are_told_as_such(mini: Path, tmp_path: Path) 
     rows = run(mini, tmp_path / "run", "score.rank_by=seen_well", "score.others=[]")
     assert by_rank(rows, "seen_well")
     assert all(math.isnan(row["seen_well_se"]) and math.isnan(row["beats_next"]) for row in rows.values())
-    record = pipeline.run(loading.load(mini, ["score.rank_by=seen_well"]), tmp_path / "run", jobs=1)
+    sets = ["score.rank_by=seen_well", "score.others=[]"]
+    record = pipeline.run(loading.load(mini, sets), tmp_path / "run", jobs=1)
     (doubt,) = (it for it in warnings_of([record.stages["score"].summary]) if it.rule == "no standard error")
     assert "all vehicles in the region are in one of the 4 groups of frames" in doubt.found
 
@@ -164,7 +169,7 @@ def test_only_scores_over_vehicles_read_trajectories(mini: Path, tmp_path: Path)
     assert "trajectories.parquet" in inputs_of(score, loading.load(mini), tmp_path).files
     (tmp_path / "trajectories.parquet").unlink()
     run_stage(score, loading.load(mini, plain), tmp_path)
-    assert "seen_well" not in read_scores(tmp_path / "scores.parquet").column_names
+    assert "expected_detections" not in read_scores(tmp_path / "scores.parquet").column_names
     assert not (tmp_path / "blindspots.parquet").exists()
     assert read_tpog(tmp_path / "tpog.parquet").frames == 40
 
@@ -179,7 +184,7 @@ def test_what_is_asked_for_comes_once() -> None:
     ("override", "message"),
     [
         ("score.rank_by=detections", "score.rank_by: 'detections'; input should be 'egvs'"),
-        ('score.others=["egvs"]', "score.others.0: 'egvs'; input should be 'entropy_seen'"),
+        ('score.others=["egvs"]', "score.others.0: 'egvs'; input should be 'expected_detections'"),
         ('score.others=["seen_well","seen_well"]', "seen_well stands there twice"),
     ],
 )
@@ -195,11 +200,10 @@ def test_traffic_without_a_vehicles_centre_is_told(mini: Path, tmp_path: Path) -
     edge = ["roi.center_m=[20, 12.9, 2.5]", "roi.size_m=[40, 20, 5]", "sites.file=near.csv"]
     record = pipeline.run(loading.load(mini, edge), tmp_path / "run", jobs=1)
     told = [it for it in warnings_of([record.stages["score"].summary]) if it.rule == "no vehicles"]
-    values = read_scores(tmp_path / "run" / "scores.parquet")["seen_well"].to_pylist()
+    values = read_scores(tmp_path / "run" / "scores.parquet")["expected_detections"].to_pylist()
     assert read_tpog(tmp_path / "run" / "tpog.parquet").counts.any()
-    assert [it.found for it in told] == [
-        "no vehicle has its centre in the region of interest in the 40 frames looked at: seen_well is no number"
-    ]
+    nobody = "no vehicle has its centre in the region of interest in the 40 frames looked at"
+    assert [it.found for it in told] == [f"{nobody}: expected_detections is no number"]
     assert math.isnan(values[0])
 
 
@@ -217,3 +221,12 @@ def test_terminal_and_report_show_the_score_that_ranks(mini: Path, tmp_path: Pat
     assert 'data-label="seen well"' in page
     assert 'data-label="EGVS bit"' in page
     assert egvs("verify", tmp_path)[0] == 0
+
+
+def test_the_expected_detections_are_those_of_the_calibration(mini: Path, tmp_path: Path) -> None:
+    rows, scenario = run(mini, tmp_path / "run"), loading.load(mini)
+    record = TargetRecord.read(tmp_path / "run" / "trajectories.parquet", scenario.roi.grid)
+    scanner = Scanner(pipeline.build_scene(scenario))
+    for site in scanner.scene.sites:
+        seen = see(record, Beams.of(scanner.scan_site(site)))
+        assert rows[site.name]["expected_detections"] == expected_detections(seen)

@@ -249,7 +249,12 @@ def test_without_errors_the_scores_are_the_same(mini: Path, tmp_path: Path, chan
     pipeline.run(pipeline.load(mini), tmp_path / "with")
     pipeline.run(pipeline.load(mini, [change]), tmp_path / "without")
     table, plain = (pipeline.read_scores(tmp_path / name / "scores.parquet") for name in ("with", "without"))
-    assert set(table.column_names) - set(plain.column_names) == {"egvs_se", "egvs_bias", "beats_next", "seen_well_se"}
+    assert set(table.column_names) - set(plain.column_names) == {
+        "egvs_se",
+        "egvs_bias",
+        "beats_next",
+        "expected_detections_se",
+    }
     assert table.select(plain.column_names) == plain
     assert ranking_table(ScoredSite.all_of(plain)).caption is None
 

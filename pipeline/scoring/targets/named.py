@@ -7,6 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+import numpy as np
+
+from pipeline.scoring.targets.detectability import chances
 from pipeline.scoring.targets.record import Floats
 from pipeline.scoring.targets.scores import log_points, well
 from pipeline.scoring.targets.seen import SeenTargets
@@ -14,7 +17,14 @@ from pipeline.scoring.targets.seen import SeenTargets
 Worth = Callable[[SeenTargets], Floats]
 """What a site's sight of each vehicle-frame is worth, (n,)."""
 
+
+def _found(seen: SeenTargets) -> Floats:
+    """The chance that detectors find each; of people, for whom none is calibrated, how well they are seen."""
+    return np.where(seen.record.are_people, well(seen.points), chances(seen)) if len(seen) else np.empty(0)
+
+
 WORTHS: Mapping[str, Worth] = {
+    "expected_detections": _found,
     "points_on_target": lambda seen: log_points(seen.points),
     "seen_well": lambda seen: well(seen.points),
 }

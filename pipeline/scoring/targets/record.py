@@ -4,13 +4,13 @@ Steps: read some frames of ``trajectories.parquet``, evenly spread over the reco
 them; work out once for all sites what depends on traffic alone.
 
 To be seen are the vehicles of :meth:`pipeline.artefacts.traffic_frames.TrafficFrame.wanted`: centre in the region of
-interest, a box each for the parts of an articulated one, nobody on foot or on a bicycle. Each such box in a frame is
-one *vehicle-frame*, a row here. All other boxes of a frame are in the way.
+interest, a box each for the parts of an articulated one, nobody on foot or on a bicycle unless that is asked for. Each
+such box in a frame is one *vehicle-frame*, a row here. All other boxes of a frame are in the way.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.artefacts import tables, traffic_frames
-from pipeline.artefacts.traffic_frames import TrafficFrame
+from pipeline.artefacts.traffic_frames import NO_VEHICLES, TrafficFrame
 from pipeline.core.grid import Grid
 from pipeline.kernels import occlusion
 from pipeline.kernels import targets as kernels
@@ -115,11 +115,16 @@ class TargetRecord:
         """How many vehicle-frames."""
         return len(self.row)
 
+    @property
+    def are_people(self) -> NDArray[np.bool_]:
+        """Which rows are on foot or on a bicycle, (n,)."""
+        return np.array([kind in NO_VEHICLES for kind in self.kinds], dtype=np.bool_)[self.kind]
+
     @classmethod
-    def of(cls, frames: Sequence[TrafficFrame], grid: Grid) -> TargetRecord:
-        """From frames, in the order of their record."""
+    def of(cls, frames: Sequence[TrafficFrame], grid: Grid, people: Collection[str] = ()) -> TargetRecord:
+        """From frames, in the order of their record; with ``people`` of these vClasses."""
         boxes = AllBoxes.of(frames, grid)
-        wanted = [frame.wanted(grid.roi) for frame in frames]
+        wanted = [frame.wanted(grid.roi, people) for frame in frames]
         frame = np.repeat(np.arange(len(frames), dtype=np.int64), [len(rows) for rows in wanted])
         row = boxes.starts[frame] + np.concatenate([np.empty(0, dtype=np.int64), *wanted])
         vehicles, vehicle = _distinct(
@@ -137,9 +142,9 @@ class TargetRecord:
         )  # fmt: skip
 
     @classmethod
-    def read(cls, path: Path, grid: Grid, frames: int = FRAMES) -> TargetRecord:
+    def read(cls, path: Path, grid: Grid, frames: int = FRAMES, people: Collection[str] = ()) -> TargetRecord:
         """From ``trajectories.parquet``: so many frames, evenly spread over all that were recorded; all when 0 or more
-        are asked for.
+        are asked for. With ``people`` of these vClasses.
 
         Raises
         ------
@@ -147,7 +152,7 @@ class TargetRecord:
             For a file that is corrupt or out of order.
         """
         recorded = int(tables.read_metadata(path, "trajectories")["frames"])
-        return cls.of(list(traffic_frames.read(path, traffic_frames.spread(recorded, frames))), grid)
+        return cls.of(list(traffic_frames.read(path, traffic_frames.spread(recorded, frames))), grid, people)
 
 
 def _distinct(names: Sequence[Sequence[str]]) -> tuple[tuple[str, ...], Ints]:

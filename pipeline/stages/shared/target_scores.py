@@ -25,6 +25,7 @@ from pipeline.scoring.targets.named import WORTHS
 from pipeline.scoring.targets.record import Floats, TargetRecord
 from pipeline.scoring.targets.scores import mean
 from pipeline.scoring.targets.seen import SeenTargets, noticed_in, see
+from pipeline.scoring.targets.weights import people_of, weights_of, without_effect
 from pipeline.stages.base import Workspace
 from pipeline.stages.shared.blindspots import spots_of
 from pipeline.stages.shared.scans import SiteBeams
@@ -72,13 +73,16 @@ class Targets:
 
     def __init__(self, work: Workspace, grid: Grid) -> None:
         wanted, trajectories, tpog = work.scenario.score, work.path(TRAJECTORIES), work.path(TPOG)
-        self.record = TargetRecord.read(trajectories, grid)
+        self.record = TargetRecord.read(trajectories, grid, people=people_of(wanted.weights))
         self._scene = scene_of(work)
         self._names: tuple[str, ...] = tuple(name for name in wanted.asked if name in WORTHS)
         periods, recorded = read_periods(tpog), recorded_frames(trajectories)
-        self._weight = weights_in_mix(periods, recorded, self.record)
+        in_mix = weights_in_mix(periods, recorded, self.record)
+        self._by_choice = weights_of(wanted.weights, self.record) if wanted.weights.are_given else None
+        self._weight = in_mix if self._by_choice is None else in_mix * self._by_choice
+        self._weights = wanted.weights
         self._groups = FrameGroups.read(tpog, trajectories, self.record) if wanted.standard_error else None
-        self.spots = spots_of(work, self.record, recorded, self._weight) if wanted.blindspots else None
+        self.spots = spots_of(work, self.record, recorded, in_mix) if wanted.blindspots else None
         self._periods = _rows_of_periods(periods, recorded, self.record)
         if self.is_empty and wanted.rank_by in WORTHS:
             place = f"{work.scenario.file}: score.rank_by = {wanted.rank_by!r}"
@@ -97,7 +101,7 @@ class Targets:
         """The scores that are asked for, of what a site sees, and where it misses vehicles."""
         worths = {name: WORTHS[name](seen) for name in self._names}
         whole = {name: self._means(worth) for name, worth in worths.items()}
-        apart = ({name: mean(worth[rows]) for name, worth in worths.items()} for _, rows in self._periods)
+        apart = ({name: self._mean_of(worth, rows) for name, worth in worths.items()} for _, rows in self._periods)
         return SiteTargets(whole, tuple(apart), self.spots.by(seen.points) if self.spots is not None else None)
 
     def doubts(self, tpog: Tpog, by_period: Sequence[Tpog]) -> list[Finding]:
@@ -106,23 +110,33 @@ class Targets:
         names = " and ".join(self._names)
         if not names or not tpog.counts.any():
             return []
-        cure = "the region of interest should hold the road"
+        cure, idle = "the region of interest should hold the road", list(without_effect(self._weights, self.record))
         if self.is_empty:
-            return [Finding("no vehicles", f"{FILE}: roi", f"{self._nobody}: {names} is no number", cure)]
-        return [
+            return [Finding("no vehicles", f"{FILE}: roi", f"{self._nobody}: {names} is no number", cure), *idle]
+        return idle + [
             Finding("no vehicles", f"{FILE}: traffic.periods ({name})", f"{self._nobody}: {names} is no number", cure)
             for (name, rows), its in zip(self._periods, by_period, strict=True)
-            if rows.start == rows.stop and its.counts.any()
+            if not self._counts(rows) and its.counts.any()
         ]
 
     @property
     def _nobody(self) -> str:
-        return f"no vehicle has its centre in the region of interest in the {len(self.record.numbers)} frames looked at"
+        counts = "" if self._by_choice is None or not len(self.record) else " that counts by [score.weights]"
+        frames = f"in the {len(self.record.numbers)} frames looked at"
+        return f"no vehicle{counts} has its centre in the region of interest {frames}"
 
     def _means(self, worth: Floats) -> Floats:
         if self._groups is None:
             return np.array([mean(worth, self._weight)])
-        return self._groups.means(worth)
+        return self._groups.means(worth, self._by_choice)
+
+    def _mean_of(self, worth: Floats, rows: slice) -> float:
+        """Of some vehicle-frames by themselves."""
+        return mean(worth[rows], None if self._by_choice is None else self._by_choice[rows])
+
+    def _counts(self, rows: slice) -> bool:
+        """Whether any of these vehicle-frames does."""
+        return bool(self._weight[rows].any())
 
 
 def _rows_of_periods(
