@@ -78,7 +78,7 @@ def note(its: SiteBlindspots) -> str:
     if its.whole is None:
         return "No vehicle in the region."
     if len(its.places) == 1:
-        return "Without a network of roads there are no lanes to name: the map alone tells."
+        return "Without one network of roads for all the traffic there are no lanes to name: the map alone tells."
     found = []
     if not its.worst:
         found.append(f"No lane, turn or crossing with {FEWEST_VEHICLES} vehicles or more is seen worse than the rest.")

@@ -59,7 +59,7 @@ def test_a_handful_is_listed() -> None:
     ("places", "said"),
     [
         ([], "No vehicle in the region."),
-        ([ALL], "Without a network of roads there are no lanes to name: the map alone tells."),
+        ([ALL], "Without one network of roads for all the traffic there are no lanes to name: the map alone tells."),
         ([ALL, GOOD], "No lane, turn or crossing with 10 vehicles or more is seen worse than the rest."),
         ([ALL, LEFT, place("no lane", "on no lane", 1, 1, 1.0)], "Of 1,000 vehicles looked at, 1 was on no lane."),
         ([ALL, LEFT, place("no lane", "on no lane", 7, 2, 1.0)], "Of 1,000 vehicles looked at, 7 were on no lane."),
@@ -90,7 +90,9 @@ def test_the_page_shows_each_site_and_the_data_of_all(tmp_path: Path) -> None:
     text = page(about, out)
     read = Reader(text)
     assert read.text.count("Where vehicles are missed:") == 2
-    assert read.text.count("Without a network of roads there are no lanes to name") == 2 + 4  # panels, and data
+    assert (
+        read.text.count("Without one network of roads for all the traffic there are no lanes to name") == 2 + 4
+    )  # panels, and data
     data = json.loads(re.search(r'id="site-data">(.*?)</script>', text, re.DOTALL)[1])  # type: ignore[index]
     for name, its in data["sites"].items():
         (found,) = blindspots.blindspots.read(out / "blindspots.parquet", {name})

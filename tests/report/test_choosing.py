@@ -21,11 +21,21 @@ pytestmark = [
 SITES = [("north", 6, 9, 2), ("south", 6, -1, 2), ("<b>east", 14, 4, 3)]
 
 
+WORST = [["<i>eastbound</i> left-turn lane: 41 % seen", "± 8 %, from 12 vehicles looked at 120 times"]] * 2
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a small run with its report."""
     about, out = finished(tmp_path_factory.mktemp("choosing"), sites=SITES)
-    page(about, out)
+    report, text = out / "report.html", page(about, out)
+    data = json.loads(re.search(r'id="site-data">(.*?)</script>', text, re.DOTALL).group(1))
+    told = data["sites"]["south"]["vehicles"]  # the run has no network: as if two of its lanes were told of
+    told |= {"worst": WORST, "numbers": [[100.5, 200.0], [50, 60], None, None, None], "note": "<b>all"}
+    changed = json.dumps(data).replace("<", "\\u003c")
+    report.write_text(
+        re.sub(r'(?s)(id="site-data">).*?(?=</script>)', lambda m: m[1] + changed, text), encoding="utf-8"
+    )
     return out
 
 
@@ -82,6 +92,20 @@ def test_every_site_can_be_chosen(browser_page: Any, run: Path) -> None:
         assert images[name] == {kind: expected(run, name, kind) for kind in images[name]}
         assert browser_page.locator('[data-panel="1"] figcaption').inner_text().startswith(f"{name}: rank ")
     assert len({str(image["seen"]) for image in images.values()}) == len(names)
+
+
+def test_the_worst_places_of_a_chosen_site_are_listed_and_numbered(browser_page: Any) -> None:
+    panel = browser_page.locator('[data-panel="1"]')
+    shown_marks = """all => all.filter(m => getComputedStyle(m).display !== "none")
+        .map(m => m.textContent + " " + m.getAttribute("transform"))"""
+    marks = panel.locator("g.worst")
+    panel.locator("select").select_option("south")
+    assert panel.locator(".worst-places li").all_inner_texts() == ["\n".join(place) for place in WORST]
+    assert panel.locator(".worst-note").inner_text() == "<b>all"
+    assert marks.evaluate_all(shown_marks) == ["1 translate(100.5 200)", "2 translate(50 60)"]
+    panel.locator("select").select_option("north")
+    assert panel.locator(".worst-places li").count() == 0 and marks.evaluate_all(shown_marks) == []
+    assert "the map alone tells" in panel.locator(".worst-note").inner_text()
 
 
 def test_a_click_in_the_ranking_or_on_the_map_chooses(browser_page: Any) -> None:

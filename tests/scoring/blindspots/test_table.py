@@ -11,16 +11,19 @@ import pytest
 
 import pipeline
 from pipeline.artefacts import blindspots, tables
+from pipeline.core import files
 from pipeline.core.errors import InputError
 from pipeline.scenario import loading
 from pipeline.scoring.targets.record import TargetRecord
 from pipeline.scoring.targets.seen import see
 from pipeline.stages import scan, score, statics
 from pipeline.stages.base import Workspace
+from pipeline.stages.shared.blindspots import network_digests, spots_of
 from pipeline.stages.shared.scans import scans
 from tests.conftest import SITES, write_mini
-from tests.scoring.blindspots.roads import NETWORK
+from tests.scoring.blindspots.roads import GRID, NETWORK
 from tests.scoring.blindspots.test_spots import car
+from tests.scoring.targets.scenes import frame
 from tests.stages import inputs_of, run_stage
 
 NET = "made.net.xml"
@@ -162,6 +165,27 @@ def test_a_mix_of_periods_weighs_its_vehicles(tmp_path: Path) -> None:
     assert whole["share_seen"] == pytest.approx(expected)
     rows = rows_of(tmp_path / "run", "pole_b")
     assert all(row["weight"] > 0 for row in rows)
+
+
+@pytest.mark.parametrize(("second", "named"), [("made.net.xml", True), ("other.net.xml", False)])
+def test_periods_on_networks_of_their_own_have_a_map_alone(tmp_path: Path, second: str, named: bool) -> None:
+    for net in (NET, "other.net.xml"):
+        (tmp_path / net).write_text(NETWORK)
+    for name, net in (("day", NET), ("night", second)):
+        config = f'<configuration><net-file value="{net}"/><route-files value="r.rou.xml"/></configuration>'
+        (tmp_path / f"{name}.sumocfg").write_text(config)
+    periods = [{"name": name, "sumocfg": f"{name}.sumocfg"} for name in ("day", "night")]
+    values = {
+        "name": "two",
+        "roi": {"center_m": [30, 0, 2.5], "size_m": [60, 40, 5]},
+        "traffic": {"frames": 40, "periods": periods},
+        "sites": {"grid": {"low_m": [0, 0], "high_m": [1, 1], "spacing_m": 1, "heights_m": [3]}, "sensor": "VLP-16"},
+    }
+    scenario = loading.from_values(values, tmp_path, str(tmp_path / "scenario.toml"))
+    assert network_digests(scenario) == ({"network": files.sha256_of(tmp_path / NET)} if named else {})
+    record = TargetRecord.of([frame([car(20, -4.8)])], GRID)
+    spots = spots_of(Workspace(scenario, tmp_path), record, [40, 40], np.ones(1))
+    assert {place.by for place in spots.places} == ({"all", "approach", "lane"} if named else {"all"})
 
 
 def test_without_vehicles_there_is_nothing_to_miss(tmp_path: Path) -> None:
