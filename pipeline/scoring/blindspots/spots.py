@@ -93,10 +93,12 @@ class Spots:
         period
             The part of the day of each vehicle-frame, (n,) int64: two vehicles of one name may be in different ones.
         """
-        places, rows, at = _on_roads(record, roads)
-        cell_row, cells = cells_of(record.boxes, record.grid.roi)
+        vehicles = np.flatnonzero(~record.are_people)  # for scores, people may count too
+        boxes = record.boxes[vehicles]
+        places, rows, at = _on_roads(boxes, roads)
+        cell_row, cells = cells_of(boxes, record.grid.roi)
         cell, at_cell = np.unique(cells, axis=0, return_inverse=True)
-        row, spot = np.append(rows, cell_row), np.append(at, len(places) + at_cell.reshape(-1))
+        row, spot = vehicles[np.append(rows, cell_row)], np.append(at, len(places) + at_cell.reshape(-1))
         who = record.vehicle + len(record.vehicles) * period
         names = int(who.max(initial=0)) + 1
         visits, visit = np.unique(spot * names + who[row], return_inverse=True)
@@ -183,16 +185,16 @@ def cells_of(boxes: Floats, roi: Roi) -> tuple[Ints, Ints]:
     return row[covered], cell[covered]
 
 
-def _on_roads(record: TargetRecord, roads: RoadPlaces | None) -> tuple[tuple[Place, ...], Ints, Ints]:
+def _on_roads(boxes: Floats, roads: RoadPlaces | None) -> tuple[tuple[Place, ...], Ints, Ints]:
     """The places that vehicles are at, in order, and pairs of a vehicle-frame and one of them."""
-    found = [(Place(ALL, "", "all vehicles", (0.0, 0.0)), np.arange(len(record)))] if len(record) else []
+    found = [(Place(ALL, "", "all vehicles", (0.0, 0.0)), np.arange(len(boxes)))] if len(boxes) else []
     if roads is not None:
-        lane = lanes_of(fronts_m(record.boxes), record.boxes[:, 6], roads.lanes)
+        lane = lanes_of(fronts_m(boxes), boxes[:, 6], roads.lanes)
         rows: list[list[Ints]] = [[] for _ in roads.places]
         for number in np.unique(lane[lane >= 0]).tolist():
             for place in roads.places_of_lane[number]:
                 rows[place].append(np.flatnonzero(lane == number))
-        for place, its in _on_crossings(record.boxes, roads):
+        for place, its in _on_crossings(boxes, roads):
             rows[place].append(its)
         at = [(place, np.concatenate(its)) for place, its in zip(roads.places, rows, strict=True) if its]
         lost = np.flatnonzero(lane < 0)

@@ -205,6 +205,17 @@ def test_a_rear_part_is_where_its_own_front_is(tmp_path: Path) -> None:
     assert by_place(spots, spots.vehicles)["all", ""] == 1
 
 
+def test_people_whom_a_score_counts_are_no_vehicles(tmp_path: Path) -> None:
+    walk = (38.0, -4.8, 0.9, 0.5, 0.5, 1.8, 1.6)
+    mixed = frame([walk, car(41, -4.8), walk], ("pedestrian", "passenger", "bicycle"), vehicles=("a", "b", "c"))
+    roads = RoadPlaces.of(read(tmp_path), GRID.roi)
+    both = spots_of(TargetRecord.of([mixed], GRID, people=("pedestrian", "bicycle")), roads)
+    alone = spots_of(TargetRecord.of([mixed], GRID), roads)
+    assert by_place(both, both.vehicle_frames) == by_place(alone, alone.vehicle_frames)
+    assert both.cells.tolist() == alone.cells.tolist()
+    assert both.by(np.array([50.0, 0.0, 50.0])).seen.sum() == 0 < both.by(np.array([0.0, 20.0, 0.0])).seen.sum()
+
+
 def test_crossings_against_shapely(tmp_path: Path) -> None:
     """Also a bus whose rear alone reaches onto it, and a car that ends at its very edge, which does not."""
     rng = np.random.default_rng(3)
