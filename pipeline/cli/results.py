@@ -150,12 +150,13 @@ def _weights(weights: Iterable[tuple[str, float]]) -> list[str]:
     return [f"{name} {share:.1%}" for name, share in weights]
 
 
-def _in_sentences(folder: Path, sites: Sequence[ScoredSite]) -> list[str]:
+def _in_sentences(folder: Path, record: RunRecord, sites: Sequence[ScoredSite]) -> list[str]:
     """What the best site does, where its score says that in words; and where another score has others first."""
     about = tables.read_metadata(folder / "scores.parquet", "scores")
     best = next((site for site in sites if site.rank == 1), None)
     first = [] if best is None or best.rank_by == "egvs" else [f"{best.site} {best.by.sentence(best.score)}"]
-    other = disagreement(sites, setting_of(about["gamma"], about["grid"]["voxel_m"]))
+    hidden = "moving_occlusion" in record.scenario.get("effects", {})
+    other = disagreement(sites, setting_of(about["gamma"], about["grid"]["voxel_m"], moving_occlusion=hidden))
     return [*first, *([other] if other else [])]
 
 
@@ -163,7 +164,7 @@ def _print_scores(out: Console, folder: Path, record: RunRecord, top: int | None
     """The ranking of the ``top`` sites, the best of each pole, and the audit's worst case where there was one."""
     sites = ScoredSite.read(folder / "scores.parquet")
     out.print(ranking_table(sites, out.width, top))
-    for line in _in_sentences(folder, sites):
+    for line in _in_sentences(folder, record, sites):
         out.print(line)
     if top is not None and len(sites) > top:
         out.print(f"... and {len(sites) - top} more: without --top, in {folder / 'scores.parquet'} or in the report")

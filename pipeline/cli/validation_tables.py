@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.cli.terminal import console, table
+from pipeline.report.score_words import SCORES
+from pipeline.scenario.score import RECOMMENDED
 from pipeline.validation.agreement import main_measure
 from pipeline.validation.detection import ALL
 from pipeline.validation.looking import LookListener
@@ -41,7 +43,12 @@ def print_scores(entries: Iterable[Entry]) -> None:
             continue
         source = score.source + (f" (package {entry.package})" if entry.package else "")
         rows.add_row(score.name, score.formula, "more" if score.sign > 0 else "less", _tried(score.sweep), source)
-    console(_FILE_WIDTH, soft_wrap=False).print(rows, markup=False)
+    out = console(_FILE_WIDTH, soft_wrap=False)
+    out.print(rows, markup=False)
+    others = ", ".join(name for name in SCORES if name != RECOMMENDED)
+    out.print(
+        f"sites can be ranked by {RECOMMENDED}, which is recommended, or by {others}: [score] rank_by", markup=False
+    )
 
 
 def print_validation(scenario: Scenario, out: Path, done: Validation) -> None:

@@ -194,7 +194,9 @@ def page(
         headline=wording.headline(ranking, has_traffic),
         lead=wording.lead(ranking),
         which_to_trust=wording.which_to_trust(ranking),
-        disagreement=disagreement(sites, setting_of(gamma, tpog.grid.voxel_m)),
+        disagreement=disagreement(
+            sites, setting_of(gamma, tpog.grid.voxel_m, moving_occlusion="moving_occlusion" in effects)
+        ),
         limit_share=wording.share_of_limit(sites[0]) if ranking.by.name == "egvs" else None,
         separable=SEPARABLE,
         has_traffic=has_traffic,

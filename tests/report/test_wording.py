@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import get_args
 
+import pytest
+
 from pipeline.report import wording
-from pipeline.report.evidence import disagreement, setting_of
+from pipeline.report.evidence import RHO, disagreement, setting_of
 from pipeline.report.ranking import Ranking, ScoredSite
 from pipeline.report.score_words import SCORES
 from pipeline.scenario.score import OtherScore
@@ -65,8 +69,8 @@ def test_where_two_scores_have_other_sites_first() -> None:
     rows = (("a", 50.0, 0.9), ("b", 90.0, 0.8), ("c", 20.0, 0.7), ("d", 80.0, 0.6))
     told = disagreement(by_vehicles(*rows).sites, EGVS, {})
     assert told == (
-        "The EGVS has b, d and a first, the share of vehicles found has a, b and c: which of them goes better with"
-        " detection was not measured for this gamma and voxel size."
+        "The EGVS has b, d and a first, the share of vehicles found has a, b and c: how well this setting of the EGVS"
+        " goes with detection was not measured."
     )
     assert disagreement(by_vehicles(*rows, rank_by="egvs").sites, EGVS, {}) == told  # whichever ranks
     rho = {"expected_detections": {"cluster": 0.9, "pointpillars": 0.8}, EGVS: {"cluster": 0.7, "pointpillars": 0.6}}
@@ -78,7 +82,23 @@ def test_where_two_scores_have_other_sites_first() -> None:
         rho["expected_detections"] = {"cluster": worse, "pointpillars": worse if worse < 0.6 else 0.55}
         rho["expected_detections"]["pointpillars"] = 0.5 if worse == 0.5 else 0.7
         assert f"detection agrees with {who}, rho" in disagreement(by_vehicles(*rows).sites, EGVS, rho)
-    assert "was not measured" in disagreement(by_vehicles(*rows).sites, setting_of(10.0, 0.25), rho)
+    for other in (setting_of(10.0, 0.25), setting_of(2.0, 0.25, moving_occlusion=True)):
+        assert disagreement(by_vehicles(*rows).sites, other, rho).endswith(
+            "was not measured; the share of vehicles found goes with it at rho 0.65 (cluster) and 0.70 (pointpillars),"
+            " see docs/validity.md."
+        )
+
+
+def test_the_evidence_is_that_of_the_studys_tables() -> None:
+    tables = {its["name"]: its for its in json.loads(Path("docs/data/validity.json").read_text())["tables"]}
+    if not any(name.startswith("F ") for name in tables):
+        pytest.skip("the tables are older than the score")
+    columns = {"expected_detections": 3, setting_of(10.0, 0.25): 4, setting_of(2.0, 0.25): 5}
+    for name, its in RHO.items():
+        for detector, rho in its.items():
+            rows = tables[f"F {detector} ap_combined_r40_iou70"]["rows"]
+            (together,) = (row for row in rows if row[:2] == ["together", "all"])
+            assert rho == round(together[columns[name]][0], 2)
 
 
 def test_scores_that_agree_are_not_told() -> None:
