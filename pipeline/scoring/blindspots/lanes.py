@@ -2,8 +2,8 @@
 
 SUMO says that a vehicle is on the lane that its front is on, and so it is here. Of the lanes that hold the front and
 lead the same way, those inside junctions included, it is the one whose middle line is nearest. Against SUMO's own lanes
-of 12,000 vehicle-frames of ingolstadt, 99.9 % were right on roads and 99.0 % in junctions, where ways that part or meet
-still lie in one another.
+of 15,235 vehicle-frames of nishishinjuku and 3,930 of ingolstadt, 99.98 and 99.90 % were right on roads, 99.2 and 99.0
+% in junctions, where ways that part or meet still lie in one another.
 
 World frame, in plan, metres and radians.
 """
