@@ -41,7 +41,8 @@ numerics: $(VENV)/.installed-dev
 # OSM_TRAINING, OSM_HELD_OUT: OpenStreetMap extracts; OSM_TRAINING_AT: lat,lon of a junction; VALIDITY: further options
 validity: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.validity $(if $(OSM_TRAINING),--osm-training $(OSM_TRAINING)) \
-		$(if $(OSM_TRAINING_AT),--osm-training-at $(OSM_TRAINING_AT)) $(if $(OSM_HELD_OUT),--osm-held-out $(OSM_HELD_OUT)) $(VALIDITY)
+		$(if $(OSM_TRAINING_AT),--osm-training-at $(OSM_TRAINING_AT)) $(if $(OSM_HELD_OUT),--osm-held-out $(OSM_HELD_OUT)) \
+		$(if $(OSM_UNSEEN),--osm-unseen $(OSM_UNSEEN)) $(if $(OSM_UNSEEN_AT),--osm-unseen-at $(OSM_UNSEEN_AT)) $(VALIDITY)
 
 pictures: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.pictures

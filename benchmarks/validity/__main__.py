@@ -53,6 +53,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--osm-training", type=Path, metavar="FILE", help="an OpenStreetMap extract")
     parser.add_argument("--osm-training-at", metavar="LAT,LON", help="its junction; default: the largest")
     parser.add_argument("--osm-held-out", type=Path, metavar="FILE", help="an extract of elsewhere")
+    parser.add_argument("--osm-unseen", type=Path, metavar="FILE", help="an extract, for a junction that chose nothing")
+    parser.add_argument("--osm-unseen-at", metavar="LAT,LON", help="its junction; default: the largest")
     parser.add_argument("--jobs", type=int, help="processes; default: one a core")
     parser.add_argument("--data", type=Path, default=ROOT / "runs" / "validity", help="what was measured")
     parser.add_argument("--docs", type=Path, default=ROOT / "docs", help="tables and figures")
@@ -118,16 +120,18 @@ def _homes(chosen: argparse.Namespace) -> tuple[list[tuple[str, Role, Path]], li
     homes = junctions.shipped(names)
     there = {name for name, _, _ in homes}
     without = [f"{name} (not in this run)" for name in junctions.SHIPPED if name not in there]
-    at = arguments.latitude_and_longitude(chosen.osm_training_at) if chosen.osm_training_at else None
-    named: dict[Role, tuple[Path | None, tuple[float, float] | None]] = {
-        "training": (chosen.osm_training, at),
+    named: dict[Role, tuple[Path | None, str | None]] = {
+        "training": (chosen.osm_training, chosen.osm_training_at),
         "held out": (chosen.osm_held_out, None),
+        "unseen": (chosen.osm_unseen, chosen.osm_unseen_at),
     }
     for role, (extract, place) in named.items():
         if extract is not None:
-            homes.append(junctions.from_osm(role, extract, place, chosen.data / "junctions"))
+            at = arguments.latitude_and_longitude(place) if place else None
+            homes.append(junctions.from_osm(role, extract, at, chosen.data / "junctions"))
         else:
-            without.append(f"a {role} junction from OpenStreetMap (no extract was named)")
+            article = "an" if role == "unseen" else "a"
+            without.append(f"{article} {role} junction from OpenStreetMap (no extract was named)")
     return sorted(homes, key=lambda home: junctions.ROLES.index(home[1])), without
 
 

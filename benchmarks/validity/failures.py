@@ -23,7 +23,7 @@ WORST = 3
 
 _PER_CENT = 100.0
 
-_COLUMNS = [
+COLUMNS = [
     Column("junction"), Column("score"), Column("site"), Column("height, m", "one"), Column("detection", "one"),
     Column("rank by score", "whole"), Column("rank by detection", "whole"), Column("of", "whole"),
     Column("never seen, %", "one"), Column("1 to 19 points, %", "one"), Column("hidden by statics, %", "one"),
@@ -45,7 +45,7 @@ def tables(each: Sequence[Pools]) -> Iterator[Table]:
             " most; 1 is best. Detection in per cent. Hidden by statics: share of the traffic's entropy in voxels that"
             " no beam crosses; by traffic: what moving occlusion takes of the rest."
         )
-        yield Table(f"E {pools.detector}", "E. Where scores fail", caption, _COLUMNS, rows)
+        yield Table(f"E {pools.detector}", "E. Where scores fail", caption, COLUMNS, rows)
 
 
 def worst(record: Record, detector: str, measure: str, score: str) -> list[list[Cell]]:

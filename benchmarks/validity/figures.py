@@ -31,10 +31,12 @@ def draw(folder: Path, tables: Sequence[Table]) -> list[Path]:
     settings = [name for name in of if name.startswith("A ") and not name.startswith("A sites")]
     by_setting = [of[name] for name in settings if name.split()[-1] in first]
     ranked = [of[name] for name in of if name.startswith("D ") and name.split()[-1] in first]
+    recommended = [of[name] for name in of if name.startswith("F ") and name.split()[-1] == measures_of("")[0]]
     made = {
         "validity-gamma.png": gamma(by_setting) if by_setting else None,
         "validity-heights.png": heights(of["C heights"]) if of["C heights"].rows else None,
         "validity-scores.png": scores(ranked) if ranked else None,
+        "validity-recommended.png": recommendation(recommended) if recommended else None,
     }
     written = []
     for name, figure in made.items():
@@ -139,6 +141,33 @@ def scores(tables: Sequence[Table]) -> Figure:
         axes.set(ylim=(len(table.rows) - 0.5, -0.5), xlim=(-1.05, 1.05), xlabel="rho: open training, filled held out")
         axes.axvline(0.0, color="0.5", linewidth=0.8)
         axes.set_title(_what(table), fontsize=9)
+    return figure
+
+
+def recommendation(tables: Sequence[Table]) -> Figure:
+    """Rho at junctions that nothing was learnt from: the recommended score with its interval, and the EGVS."""
+    marks = [
+        ("EGVS, gamma 10", "EGVS, gamma 10", "o", "white", _LIGHT),
+        ("its rho", "EGVS at its best there, known afterwards", "^", "white", _MID),
+        ("recommended", "recommended: expected_detections", "o", _DARK, _DARK),
+    ]
+    figure, panels = _panels(1, len(tables), 5.2, 1.2 + 0.27 * max(len(table.rows) for table in tables))
+    for axes, table in zip(panels[0], tables, strict=True):
+        for heading, label, marker, face, edge in marks:
+            cells = [(line, cell) for line, cell in enumerate(table.column(heading)) if cell is not None]
+            axes.scatter(
+                [cell[0] for _, cell in cells], [line for line, _ in cells], s=26, marker=marker, facecolors=face,
+                edgecolors=edge, zorder=3, label=label,
+            )  # fmt: skip
+            for line, cell in cells:
+                if heading == "recommended" and cell[1] is not None:
+                    axes.plot(cell[1:], [line, line], color=edge, linewidth=1.3, zorder=2)
+        names = zip(table.column("junction"), table.column("sites"), table.column("number"), strict=True)
+        axes.set_yticks(range(len(table.rows)), [f"{name}, {its}: {n}" for name, its, n in names], fontsize=7)
+        axes.set(ylim=(len(table.rows) - 0.5, -0.5), xlim=(0.0, 1.02), xlabel="rho")
+        axes.set_title(_what(table), fontsize=9)
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(marks), fontsize=7)
     return figure
 
 

@@ -1,6 +1,7 @@
 """The junctions of the study, what each is there for, and its sites.
 
-*Training* junctions may choose (gamma, the best score, a detector's weights); *held-out* ones are what is quoted.
+*Training* junctions may choose (gamma, the best score, a detector's weights); *held-out* ones are what is quoted; the
+*unseen* one was not looked at before all was chosen and answered, and is quoted for the score that came of it.
 Junctions from OpenStreetMap are made from extracts that the user names, since none is shipped; without them the study
 runs on the others, and its tables say so.
 """
@@ -8,6 +9,7 @@ runs on the others, and its tables say so.
 from __future__ import annotations
 
 import csv
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,8 +29,8 @@ from pipeline.stages.shared.scene import scene_of
 from pipeline.traffic import network, sumo_folder
 from pipeline.world.carriageway import Carriageway
 
-Role = Literal["training", "held out"]
-ROLES: tuple[Role, ...] = ("training", "held out")
+Role = Literal["training", "held out", "unseen"]
+ROLES: tuple[Role, ...] = ("training", "held out", "unseen")
 
 SHIPPED: dict[str, Role] = {
     "ingolstadt": "training",
@@ -36,7 +38,7 @@ SHIPPED: dict[str, Role] = {
     "roundabout": "training",
     "nishishinjuku": "held out",
 }
-OSM: dict[Role, str] = {"training": "osm_training", "held out": "osm_held_out"}
+OSM: dict[Role, str] = {"training": "osm_training", "held out": "osm_held_out", "unseen": "osm_unseen"}
 """What junctions from OpenStreetMap are called."""
 
 APART_M = 700.0
@@ -74,7 +76,7 @@ def from_osm(role: Role, extract: Path, at: tuple[float, float] | None, folder: 
     name = OSM[role]
     home, note = folder / name, folder / f"{name}.json"
     if not extract.is_file():
-        raise InputError(f"--osm-{role.replace(' ', '-')}", f"no such file ({extract})", "an OpenStreetMap extract")
+        raise InputError(_option(role), f"no such file ({extract})", "an OpenStreetMap extract")
     key = files.canonical_json({"extract": files.sha256_of(extract), "at": at})
     if not (home.is_dir() and note.is_file() and note.read_bytes() == key):
         if home.is_dir():
@@ -99,22 +101,23 @@ def check_unseen(scenario: Scenario) -> None:
 
 
 def check_apart(homes: Sequence[tuple[str, Role, Path]]) -> None:
-    """Refuse a training and a held-out junction from OpenStreetMap whose surroundings may meet.
+    """Refuse two junctions from OpenStreetMap whose surroundings may meet.
 
     Raises
     ------
     InputError
         For regions of interest nearer than :data:`APART_M`.
     """
-    there = {name: home for name, _, home in homes}
-    if set(OSM.values()) <= set(there):
-        first, second = (_on_map(there[name]) for name in OSM.values())
-        away_m = math.hypot(first[1] - second[1], first[2] - second[2])
-        if first[0] == second[0] and away_m < APART_M:
-            found = f"{away_m:.0f} m from the junction of --osm-training"
-            raise InputError(
-                "--osm-held-out", found, f"one at least {APART_M:g} m from it, which nothing was chosen on"
-            )
+    places = [(role, _on_map(home)) for name, role, home in homes if name in OSM.values()]
+    for (first, one), (second, other) in itertools.combinations(places, 2):
+        away_m = math.hypot(one[1] - other[1], one[2] - other[2])
+        if one[0] == other[0] and away_m < APART_M:
+            found = f"{away_m:.0f} m from the junction of {_option(first)}"
+            raise InputError(_option(second), found, f"one at least {APART_M:g} m from it, which nothing was chosen on")
+
+
+def _option(role: Role) -> str:
+    return f"--osm-{role.replace(' ', '-')}"
 
 
 def _on_map(home: Path) -> tuple[str, float, float]:

@@ -15,7 +15,7 @@ FAST = (POINTS, "cluster")
 """Detectors that look from every site, and with every sensor; others look from some."""
 
 FEW_PLACES = 5
-FEW_GIVEN: dict[Role, int] = {"training": 6, "held out": 13}
+FEW_GIVEN: dict[Role, int] = {"training": 6, "held out": 13, "unseen": 13}
 """Where other detectors look from: the first places of the grid at all heights, and so many of the given sites."""
 
 

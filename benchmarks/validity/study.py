@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.validity import agreement, failures, gaps, heights, junctions, low_models, poses
+from benchmarks.validity import agreement, failures, foretold, gaps, heights, junctions, low_models, poses
 from benchmarks.validity.agreement import WORDS
 from benchmarks.validity.junctions import StudyJunction
 from benchmarks.validity.looking_from import FAST, first_places, sites_of
@@ -89,10 +89,11 @@ def reckoned_s(part: Part) -> float:
 
 def tables_of(records: Sequence[Record], with_sensors: Sequence[Record], detectors: Sequence[str]) -> Iterator[Table]:
     """Every table of the page. Detectors that are there for mounting heights alone have no coefficients."""
-    every = [Pools(records, name) for name in detectors if name not in low_models.NAMES]
+    known = foretold.before(records)
+    every = [Pools(known, name) for name in detectors if name not in low_models.NAMES]
     each = [pools for pools in every if pools.records]
     yield measured_table(records, detectors)
-    yield gaps.table(each, records)
+    yield gaps.table(each, known)
     for pools in each:
         yield from agreement.by_setting(pools)
     for pools in each:
@@ -100,10 +101,11 @@ def tables_of(records: Sequence[Record], with_sensors: Sequence[Record], detecto
     yield agreement.chosen_gamma(each)
     if with_sensors:
         yield from agreement.by_sensor(with_sensors, [name for name in detectors if name in FAST])
-    yield heights.table(records, detectors)
+    yield heights.table(known, detectors)
     for pools in each:
         yield from agreement.ranked(pools)
     yield from failures.tables(each)
+    yield from foretold.tables(records, detectors)
 
 
 def measured_table(records: Sequence[Record], detectors: Sequence[str]) -> Table:

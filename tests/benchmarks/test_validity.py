@@ -17,6 +17,7 @@ from benchmarks.validity import (
     agreement,
     failures,
     figures,
+    foretold,
     gaps,
     heights,
     junctions,
@@ -152,10 +153,13 @@ def test_traffic_that_scores_have_seen_is_refused(mini: Path) -> None:
     junctions.check_unseen(pipeline.load(ROOT / "scenarios" / "hill"))
 
 
+@pytest.mark.parametrize("other", ["held out", "unseen"])
 @pytest.mark.parametrize(("east_m", "far"), [(699.0, False), (701.0, True), (-701.0, True)])
-def test_junctions_of_different_roles_lie_apart(tmp_path: Path, east_m: float, far: bool) -> None:
+def test_junctions_of_different_roles_lie_apart(
+    tmp_path: Path, east_m: float, far: bool, other: junctions.Role
+) -> None:
     homes = []
-    for role, offset_m in (("training", 0.0), ("held out", east_m)):
+    for role, offset_m in (("training", 0.0), (other, east_m)):
         home = tmp_path / junctions.OSM[role]
         write_mini(home)
         location = f'<location netOffset="{1000.0 - offset_m},5.0" projParameter="+proj=utm +zone=32"/>'
@@ -165,7 +169,9 @@ def test_junctions_of_different_roles_lie_apart(tmp_path: Path, east_m: float, f
     if far:
         junctions.check_apart(homes)
     else:
-        with pytest.raises(InputError, match=r"held-out: 699 m from the junction of --osm-training; one at least"):
+        with pytest.raises(
+            InputError, match=rf"{other.replace(' ', '-')}: 699 m from the junction of --osm-training; one"
+        ):
             junctions.check_apart(homes)
 
 
@@ -439,3 +445,33 @@ def test_the_protocol_says_the_numbers_of_the_program() -> None:
     for name, role in junctions.SHIPPED.items():
         assert re.search(rf"\| {name} \|[^|]*\| {role} \|", page), name
     assert json.loads((DOCS / "data" / "validity.json").read_text(encoding="utf-8"))["preface"]
+
+
+# the score that is recommended
+
+
+def recommended(name: str, role: str) -> Record:
+    """As above, with the recommended score as good as can be, and a junction that is unseen beside one held out."""
+    record = made_up(name, role)
+    values = record.detections["cluster"][BOXED[0]].values
+    return replace(record, scores=record.scores | {foretold.RECOMMENDED: values, "seen_well": values})
+
+
+def test_the_recommended_score_is_quoted_where_nothing_was_learnt_and_has_no_part_in_what_came_before() -> None:
+    its = [recommended("left", "training"), recommended("right", "held out"), recommended("north", "unseen")]
+    made = list(foretold.tables(its, ["cluster", low_models.SENSOR]))
+    found = table(made, f"F cluster {BOXED[0]}")
+    assert found.column("junction")[:3] == ["right", "north", "together"]
+    assert found.column("number")[:9] == [30, 30, 60, 6, 6, 12, 24, 24, 48]
+    assert all(cell[0] == 1.0 for cell in found.column("recommended"))
+    assert all(cell[0] == -1.0 for cell in found.column("EGVS, gamma 10"))
+    assert found.column("EGVS at its best here")[0] == "(gamma 2, voxel 0.25)"  # as good as can be too
+    assert found.column("recommended less that")[0][0] == 0.0
+    worst = table(made, "F worst cluster")
+    assert len(worst.rows) == 6 and worst.column("rank by score") == worst.column("rank by detection")
+    assert len(made) == 3  # none of detectors that are there for heights alone
+    assert foretold.before(its) == [made_up("left", "training"), made_up("right", "held out")]
+
+
+def test_records_without_the_recommended_score_have_no_such_table(all_tables: list[tables.Table]) -> None:
+    assert not [its for its in all_tables if its.name.startswith("F")]

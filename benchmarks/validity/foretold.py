@@ -1,0 +1,91 @@
+"""Does the score that is recommended foretell detection where nothing was learnt or chosen? The tables of F.
+
+It came after A to E: learnt on the training junctions (``benchmarks/detectability``), so nothing is quoted for them. It
+is compared with the EGVS at every setting that was tried, also with the one that is best at the very same sites, which
+nobody can know beforehand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+
+from benchmarks.validity import low_models
+from benchmarks.validity.agreement import HELD_OUT, TRAINING, WORDS, told
+from benchmarks.validity.failures import COLUMNS, worst
+from benchmarks.validity.pools import DEFAULT, Pools, Setting
+from benchmarks.validity.record import Record, StudySite, measures_of
+from benchmarks.validity.tables import Cell, Column, Table
+from pipeline.scoring.targets.detectability import DETECTORS
+from pipeline.validation.agreement import ScoreName
+
+RECOMMENDED = str(ScoreName("expected_detections", f'{{"detectors": "{"+".join(DETECTORS)}"}}'))
+"""What is recommended: the mean chance over the detectors that have a model."""
+
+LATER = ("seen_well", "expected_detections")
+"""Scores that came after A to E were answered; they have no part in these."""
+
+BETTER = Setting(2.0, DEFAULT.voxel_m, False)
+"""What ``gamma = "auto"`` has at the default's voxels, chosen on training junctions."""
+
+_KINDS: dict[str, Callable[[StudySite], bool]] = {
+    "all": lambda site: True,
+    "given": lambda site: site.is_given,
+    "grid": lambda site: not site.is_given,
+}
+
+
+def before(records: Sequence[Record]) -> list[Record]:
+    """What A to E rest on: the junctions and scores that were there then."""
+    kept = [record for record in records if record.role in (TRAINING, HELD_OUT)]
+    return [
+        replace(its, scores={name: v for name, v in its.scores.items() if not name.startswith(LATER)}) for its in kept
+    ]
+
+
+def tables(records: Sequence[Record], detectors: Sequence[str]) -> Iterator[Table]:
+    """F: a table of coefficients a detector, and the sites that the score ranks worst; nothing without that score."""
+    held = [its for its in records if its.role != TRAINING and RECOMMENDED in its.scores]
+    named = [name for name in detectors if name not in low_models.NAMES]
+    pairs = [(name, [its for its in held if name in its.detections]) for name in named]
+    for name, mine in ((name, its) for name, its in pairs if its):
+        yield from (_coefficients(mine, name, measure) for measure in measures_of(name))
+    for name, mine in ((name, its) for name, its in pairs if its):
+        measure = measures_of(name)[0]
+        rows = [row for record in mine for row in worst(record, name, measure, RECOMMENDED)]
+        caption = f"The sites that {RECOMMENDED} ranks farthest from their rank by {WORDS[measure]} ({name}), as in E."
+        yield Table(f"F worst {name}", "F. Where it fails", caption, COLUMNS, rows)
+
+
+def _coefficients(records: Sequence[Record], detector: str, measure: str) -> Table:
+    rows: list[list[Cell]] = []
+    for kind, wanted in _KINDS.items():
+        some = [replace(record.only(wanted), role=HELD_OUT) for record in records]
+        pools = Pools([its for its in some if its.detections[detector][measure].sites], detector)
+        names = [name for name in pools.studies if name != HELD_OUT or len(pools.records) > 1]
+        rows += [_row(pools, name, kind, measure) for name in names]
+    head = [Column("junction"), Column("sites"), Column("number", "whole")]
+    head += [Column(its, "two") for its in ("recommended", "EGVS, gamma 10", "EGVS, gamma 2")]
+    head += [Column("EGVS at its best here"), Column("its rho", "two"), Column("recommended less that", "two")]
+    caption = (
+        f"Rho of the recommended score, {RECOMMENDED}, with the {WORDS[measure]} ({detector}) at junctions that it was"
+        " not learnt from, beside the EGVS with voxels of 0.25 m, and with the gamma, voxels and moving occlusion that"
+        " are best at the very sites of the row."
+    )
+    return Table(f"F {detector} {measure}", "F. The score that is recommended", caption, head, rows)
+
+
+def _row(pools: Pools, name: str, kind: str, measure: str) -> list[Cell]:
+    sites = sum(
+        len(its.detections[pools.detector][measure].sites) for its in pools.records if name in (HELD_OUT, its.junction)
+    )
+    best = pools.best(name, [str(setting) for setting in pools.settings()], measure)
+    cells = [
+        told(pools.rho(name, score, measure)) if score in pools.scores else None
+        for score in (RECOMMENDED, str(DEFAULT), str(BETTER))
+    ]
+    beside: list[Cell] = [None, None, None]
+    if best is not None:
+        gap = pools.difference(name, RECOMMENDED, best, measure)
+        beside = [best.removeprefix("egvs "), told(pools.rho(name, best, measure)), told(gap)]
+    return ["together" if name == HELD_OUT else name, kind, sites, *cells, *beside]
