@@ -7,6 +7,7 @@ nobody can know beforehand.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
@@ -18,6 +19,7 @@ from benchmarks.validity.record import Record, StudySite, measures_of
 from benchmarks.validity.tables import Cell, Column, Table
 from pipeline.scoring.targets.detectability import DETECTORS
 from pipeline.validation.agreement import ScoreName
+from pipeline.validation.site_findings import POINTS
 
 RECOMMENDED = str(ScoreName("expected_detections", f'{{"detectors": "{"+".join(DETECTORS)}"}}'))
 """What is recommended: the mean chance over the detectors that have a model."""
@@ -50,6 +52,8 @@ def tables(records: Sequence[Record], detectors: Sequence[str]) -> Iterator[Tabl
     pairs = [(name, [its for its in held if name in its.detections]) for name in named]
     for name, mine in ((name, its) for name, its in pairs if its):
         yield from (_coefficients(mine, name, measure) for measure in measures_of(name))
+    if boxed := [(name, its) for name, its in pairs if its and name != POINTS]:
+        yield _every_score(boxed)
     for name, mine in ((name, its) for name, its in pairs if its):
         measure = measures_of(name)[0]
         rows = [row for record in mine for row in worst(record, name, measure, RECOMMENDED)]
@@ -73,6 +77,26 @@ def _coefficients(records: Sequence[Record], detector: str, measure: str) -> Tab
         " are best at the very sites of the row."
     )
     return Table(f"F {detector} {measure}", "F. The score that is recommended", caption, head, rows)
+
+
+def _every_score(boxed: Sequence[tuple[str, Sequence[Record]]]) -> Table:
+    """What the program quotes where scores disagree: every score, over all these junctions together."""
+    together = [Pools([replace(its, role=HELD_OUT) for its in records], name) for name, records in boxed]
+    measures = [measures_of(pools.detector)[0] for pools in together]
+    rho = [
+        {score: pools.rho(HELD_OUT, score, measure) for score in pools.scores}
+        for pools, measure in zip(together, measures, strict=True)
+    ]
+    names = [name for name in rho[0] if all(name in its for its in rho)]
+    total = {name: sum(its[name].value for its in rho) for name in names}
+    order = sorted(names, key=lambda name: math.inf if math.isnan(total[name]) else -total[name])
+    rows: list[list[Cell]] = [[name, *(told(its[name]) for its in rho)] for name in order]
+    head = [Column("score"), *(Column(pools.detector, "two") for pools in together)]
+    caption = (
+        f"Rho of every score with the {WORDS[measures[0]]}, over all junctions that nothing was learnt from together,"
+        " given sites and grid."
+    )
+    return Table("F all", "F. All scores", caption, head, rows)
 
 
 def _row(pools: Pools, name: str, kind: str, measure: str) -> list[Cell]:

@@ -469,7 +469,11 @@ def test_the_recommended_score_is_quoted_where_nothing_was_learnt_and_has_no_par
     assert found.column("recommended less that")[0][0] == 0.0
     worst = table(made, "F worst cluster")
     assert len(worst.rows) == 6 and worst.column("rank by score") == worst.column("rank by detection")
-    assert len(made) == 3  # none of detectors that are there for heights alone
+    every = table(made, "F all")
+    rho = dict(zip(every.column("score"), every.column("cluster"), strict=True))
+    assert rho[foretold.RECOMMENDED][0] == 1.0 and rho[str(DEFAULT)][0] == -1.0
+    assert every.column("score")[-1] == "constant" and rho["constant"] is None  # the same everywhere
+    assert len(made) == 4  # none of detectors that are there for heights alone
     assert foretold.before(its) == [made_up("left", "training"), made_up("right", "held out")]
 
 
