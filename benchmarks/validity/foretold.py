@@ -69,8 +69,8 @@ def _coefficients(records: Sequence[Record], detector: str, measure: str) -> Tab
         names = [name for name in pools.studies if name != HELD_OUT or len(pools.records) > 1]
         rows += [_row(pools, name, kind, measure) for name in names]
     head = [Column("junction"), Column("sites"), Column("number", "whole")]
-    head += [Column(its, "two") for its in ("recommended", "EGVS, gamma 10", "EGVS, gamma 2")]
-    head += [Column("EGVS at its best here"), Column("its rho", "two"), Column("recommended less that", "two")]
+    head += [Column(its, "two") for its in ("recommended", "EGVS, gamma 10", "recommended less that", "EGVS, gamma 2")]
+    head += [Column("EGVS at its best here"), Column("its rho", "two"), Column("recommended less its", "two")]
     caption = (
         f"Rho of the recommended score, {RECOMMENDED}, with the {WORDS[measure]} ({detector}) at junctions that it was"
         " not learnt from, beside the EGVS with voxels of 0.25 m, and with the gamma, voxels and moving occlusion that"
@@ -108,6 +108,7 @@ def _row(pools: Pools, name: str, kind: str, measure: str) -> list[Cell]:
         told(pools.rho(name, score, measure)) if score in pools.scores else None
         for score in (RECOMMENDED, str(DEFAULT), str(BETTER))
     ]
+    cells.insert(2, told(pools.difference(name, RECOMMENDED, str(DEFAULT), measure)))
     beside: list[Cell] = [None, None, None]
     if best is not None:
         gap = pools.difference(name, RECOMMENDED, best, measure)

@@ -466,7 +466,8 @@ def test_the_recommended_score_is_quoted_where_nothing_was_learnt_and_has_no_par
     assert all(cell[0] == 1.0 for cell in found.column("recommended"))
     assert all(cell[0] == -1.0 for cell in found.column("EGVS, gamma 10"))
     assert found.column("EGVS at its best here")[0] == "(gamma 2, voxel 0.25)"  # as good as can be too
-    assert found.column("recommended less that")[0][0] == 0.0
+    assert found.column("recommended less its")[0][0] == 0.0
+    assert found.column("recommended less that")[0][0] == 2.0
     worst = table(made, "F worst cluster")
     assert len(worst.rows) == 6 and worst.column("rank by score") == worst.column("rank by detection")
     every = table(made, "F all")
