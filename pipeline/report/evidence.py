@@ -6,7 +6,9 @@ the sites of the junctions that chose nothing. What is not measured is not there
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 from pipeline.report.ranking import ScoredSite
 from pipeline.report.score_words import SCORES
@@ -15,18 +17,16 @@ from pipeline.scenario.score import RECOMMENDED
 FIRST = 3
 """So many of the best sites are held against each other."""
 
-RHO: Mapping[str, Mapping[str, float]] = {
-    "expected_detections": {"cluster": 0.95, "pointpillars": 0.95},
-    "egvs, gamma 10, voxels of 0.25 m": {"cluster": 0.82, "pointpillars": 0.77},
-    "egvs, gamma 2, voxels of 0.25 m": {"cluster": 0.90, "pointpillars": 0.85},
-}
-"""Score -> detector -> rho with AP (BEV + 3D, IoU 0.7), given sites and grid of these junctions together: table F of
-docs/validity-tables.md. The EGVS goes by its setting, as :func:`setting_of` names it."""
+RHO: Mapping[str, Mapping[str, float]] = json.loads(
+    Path(__file__).with_name("evidence.json").read_text(encoding="utf-8")
+)
+"""Score -> detector -> rho with AP (BEV + 3D, IoU 0.7), given sites and grid of these junctions together: the table of
+all scores under F in docs/validity-tables.md. The EGVS goes by its setting, as :func:`setting_of` names it."""
 
 
 def setting_of(gamma: float, voxel_m: float, *, moving_occlusion: bool = False) -> str:
     """The EGVS of a run, as :data:`RHO` names it."""
-    return f"egvs, gamma {gamma:g}, voxels of {voxel_m:g} m" + (", moving occlusion" if moving_occlusion else "")
+    return f"egvs (gamma {gamma:g}, {'moving occlusion, ' if moving_occlusion else ''}voxel {voxel_m:g})"
 
 
 def disagreement(sites: Sequence[ScoredSite], egvs: str, rho: Mapping[str, Mapping[str, float]] | None = None) -> str:
