@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import numba
+import numpy as np
 
 _kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+_ROWS = 1024
+"""Rows that go down a tree together: what is known of them stays near the processor."""
 
 
 @_kernel
 def add_trees(features, starts, feature, threshold, left, right, value, total):  # type: ignore[no-untyped-def]
     """Add what every tree says of each row to ``total``.
 
+    Every node is asked of all rows at once, whether they come by it or not: a few nodes without a branch take less time
+    than one path after another.
+
     Parameters
     ----------
     features
-        (n, f) float64, without any that is not a number.
+        Each feature of all rows in one piece, (f, n) float64, without any that is not a number.
     starts
-        Nodes starts[t] to starts[t + 1] are those of tree t, its root first, (trees + 1,) int64.
+        Nodes starts[t] to starts[t + 1] are those of tree t, its root first, a node before those that it leads to;
+        (trees + 1,) int64.
     feature
         Which feature each node asks for, (nodes,) int64; below 0 at a leaf.
     threshold
@@ -28,11 +36,23 @@ def add_trees(features, starts, feature, threshold, left, right, value, total): 
     total
         Added to, (n,) float64, tree after tree.
     """
-    for t in range(starts.shape[0] - 1):
-        root = starts[t]
-        for row in range(features.shape[0]):
-            node = root
-            while feature[node] >= 0:
-                goes_left = features[row, feature[node]] <= threshold[node]
-                node = root + (left[node] if goes_left else right[node])
-            total[row] += value[node]
+    at = np.empty(_ROWS, np.int64)
+    for begin in range(0, features.shape[1], _ROWS):
+        end = min(begin + _ROWS, features.shape[1])
+        for t in range(starts.shape[0] - 1):
+            root = starts[t]
+            at[: end - begin] = 0
+            for node in range(starts[t + 1] - root):
+                if feature[root + node] >= 0:
+                    _pass_on(node, features[feature[root + node], begin:end], threshold[root + node],
+                             left[root + node], right[root + node], at)  # fmt: skip
+            for row in range(begin, end):
+                total[row] += value[root + at[row - begin]]
+
+
+@_kernel
+def _pass_on(node, its, threshold, left, right, at):  # type: ignore[no-untyped-def]
+    """Let the rows that are at a node go on, by one feature (n,) of theirs."""
+    for row in range(its.shape[0]):
+        on = left if its[row] <= threshold else right
+        at[row] = on if at[row] == node else at[row]

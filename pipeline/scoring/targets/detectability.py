@@ -88,9 +88,9 @@ class Model:
 
     def chances(self, features: Floats) -> Floats:
         """Of rows of :data:`FEATURES` (n, f), the chance of each, (n,), 0 to 1."""
-        logit = np.full(len(features), self.base)
+        logit, columns = np.full(len(features), self.base), np.ascontiguousarray(features.T)
         add_trees(
-            features, self.starts, self.feature, self.threshold, self.left, self.right, self.value, logit
+            columns, self.starts, self.feature, self.threshold, self.left, self.right, self.value, logit
         )  # fmt: skip
         chance: Floats = expit(logit)
         return chance

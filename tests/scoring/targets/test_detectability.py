@@ -55,6 +55,21 @@ def test_rises_with_what_helps_and_falls_with_what_hinders(detector, feature):
     assert (change >= 0.0).all() and change.max() > 0.01
 
 
+def test_rows_of_several_blocks_are_as_each_alone_whatever_their_order_in_memory():
+    x, model = rows(2500), detectability.model_of("cluster")
+    found = model.chances(x)
+    assert np.array_equal(found, model.chances(np.asfortranarray(x)))
+    some = [0, 1, 1023, 1024, 1025, 2047, 2048, 2499]
+    assert np.array_equal(found[some], [model.chances(x[row : row + 1])[0] for row in some])
+    assert len(model.chances(x[:0])) == 0
+
+
+@pytest.mark.parametrize("detector", DETECTORS)
+def test_a_node_comes_before_those_that_it_leads_to(detector):
+    for tree in DATA["detectors"][detector]["trees"]:
+        assert all(min(node[2:]) > number for number, node in enumerate(tree) if len(node) > 1)
+
+
 def test_a_tree_by_hand():
     model = Model.of({"base": 0.5, "trees": [[[0, 2.0, 1, 2], [-1.5], [1.0]], [[0.25]]]})
     x = np.zeros((3, len(FEATURES)))
