@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: run test test-train unit lint bench scaling numerics validity pictures schema docs clean
+.PHONY: run test test-train unit lint bench scaling numerics validity detectability pictures schema docs clean
 
 run: $(VENV)/.installed
 	$(BIN)/egvs run scenarios/nishishinjuku
@@ -43,6 +43,11 @@ validity: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.validity $(if $(OSM_TRAINING),--osm-training $(OSM_TRAINING)) \
 		$(if $(OSM_TRAINING_AT),--osm-training-at $(OSM_TRAINING_AT)) $(if $(OSM_HELD_OUT),--osm-held-out $(OSM_HELD_OUT)) \
 		$(if $(OSM_UNSEEN),--osm-unseen $(OSM_UNSEEN)) $(if $(OSM_UNSEEN_AT),--osm-unseen-at $(OSM_UNSEEN_AT)) $(VALIDITY)
+
+# OSM_TRAINING, OSM_TRAINING_AT as above; DETECTABILITY: further options
+detectability: $(VENV)/.installed-dev
+	$(BIN)/python -m benchmarks.detectability $(if $(OSM_TRAINING),--osm-training $(OSM_TRAINING)) \
+		$(if $(OSM_TRAINING_AT),--osm-training-at $(OSM_TRAINING_AT)) $(DETECTABILITY)
 
 pictures: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.pictures

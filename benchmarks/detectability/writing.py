@@ -1,0 +1,83 @@
+"""The file of models, ``pipeline/scoring/targets/detectability.json``: what was learnt, from what, how well it holds.
+
+A line a tree and a line a part of the calibration curve, so that a change shows where it is.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from pipeline.scoring.targets.detectability import FEATURES
+
+MADE_BY = "python -m benchmarks.detectability"
+FINDS = "a box that overlaps the vehicle by more than 0.7, in the mean of seen from above and in space"
+
+
+@dataclass(frozen=True)
+class LearntOn:
+    """A junction that was learnt from.
+
+    Attributes
+    ----------
+    sites
+        From how many each detector looked.
+    sensors
+        Of the sites.
+    vehicle_frames
+        Of the traffic, the same for all sites.
+    """
+
+    sites: Mapping[str, int]
+    sensors: tuple[str, ...]
+    vehicle_frames: int
+
+
+@dataclass(frozen=True)
+class About:
+    """What the models were learnt from.
+
+    Attributes
+    ----------
+    learnt_on
+        By the junction's name.
+    frames
+        Of each junction's traffic.
+    settings
+        Hash of each detector's settings, or of its model.
+    scikit_learn
+        The version that fitted.
+    """
+
+    learnt_on: Mapping[str, LearntOn]
+    frames: int
+    settings: Mapping[str, str]
+    scikit_learn: str
+
+    def to_json(self) -> dict[str, Any]:
+        """As in the file."""
+        return {"made_by": MADE_BY, "finds": FINDS, "features": list(FEATURES), **asdict(self)}
+
+
+def text(about: About, models: Mapping[str, Mapping[str, Any]]) -> str:
+    """The whole file.
+
+    Parameters
+    ----------
+    models
+        By detector: ``base`` and ``trees`` of :func:`benchmarks.detectability.fitting.fitted`, and ``elsewhere`` of
+        :func:`benchmarks.detectability.fitting.elsewhere`.
+    """
+    head = json.dumps(about.to_json(), indent=1).replace("\n", "\n ")
+    each = ",\n".join(f'  "{name}": {_model(its)}' for name, its in models.items())
+    return f'{{\n "about": {head},\n "detectors": {{\n{each}\n }}\n}}\n'
+
+
+def _model(its: Mapping[str, Any]) -> str:
+    rho, curve = its["elsewhere"]["rho_with_ap"], its["elsewhere"]["calibration"]
+    parts = ",\n     ".join(json.dumps(part) for part in curve)
+    trees = ",\n    ".join(json.dumps(tree, separators=(",", ":")) for tree in its["trees"])
+    elsewhere = f'{{\n    "rho_with_ap": {json.dumps(rho)},\n    "calibration": [\n     {parts}\n    ]\n   }}'
+    return f'{{\n   "elsewhere": {elsewhere},\n   "base": {its["base"]},\n   "trees": [\n    {trees}\n   ]\n  }}'
