@@ -89,6 +89,14 @@ SCORES = {
             "Sites are ranked by the share of the traffic’s uncertainty in voxels that at least one beam crosses.",
         ),
         ScoreWords(
+            "coverage", "the coverage", "coverage", "crosses {} of the voxels where traffic ever is",
+            "Sites are ranked by the share of the voxels that traffic ever occupies that at least one beam crosses.",
+        ),
+        ScoreWords(
+            "expected_visibility", "the occupancy seen", "visibility", "sees {} of what traffic occupies",
+            "Sites are ranked by the share of occupancy, the sum of its chances, in voxels that a beam crosses.",
+        ),
+        ScoreWords(
             "points_on_target", "the points on vehicles", "log points", "has a mean log(1 + points) of {} on vehicles",
             f"Sites are ranked by the points that they get from vehicles: the mean of log(1 + points). {_VEHICLES}",
             is_share=False, digits=2,

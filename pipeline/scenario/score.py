@@ -18,7 +18,9 @@ VehicleClass = Literal[
 ]  # fmt: skip
 """SUMO's vClasses."""
 
-OtherScore = Literal["expected_detections", "seen_well", "points_on_target", "entropy_seen"]
+OtherScore = Literal[
+    "expected_detections", "seen_well", "points_on_target", "entropy_seen", "coverage", "expected_visibility"
+]  # fmt: skip
 """Scores beside the EGVS."""
 
 RECOMMENDED: OtherScore = "expected_detections"

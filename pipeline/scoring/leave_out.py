@@ -65,6 +65,8 @@ class LeaveOut:
         Flat index of each voxel that is ever occupied, and its class, (n,) int64.
     entropies_bit
         Entropy of each class, (classes, 1 + k) float64: of all frames, then with group 0, 1, ... left out.
+    p
+        Share of the frames in which voxels of each class are occupied, likewise.
     groups
         Of each record that the TPOG was counted in, in the order of the columns.
     """
@@ -72,6 +74,7 @@ class LeaveOut:
     cells: NDArray[np.int64]
     classes: NDArray[np.int64]
     entropies_bit: NDArray[np.float64]
+    p: NDArray[np.float64]
     groups: tuple[Groups, ...]
 
     @classmethod
@@ -92,8 +95,11 @@ class LeaveOut:
     def from_counts(cls, counts: NDArray[np.uint32], cells: NDArray[np.int64], groups: Groups, grid: Grid) -> LeaveOut:
         """From the counts of two or more groups, (k, n), in the voxels ``cells``, (n,)."""
         first, classes = _classes(counts)
-        entropies = _entropies(counts[:, first].astype(np.int64), groups.frames, grid)
-        return cls(cells, classes, entropies, (groups,))
+        by_group = counts[:, first].astype(np.int64)
+        without = np.vstack([by_group.sum(axis=0), by_group.sum(axis=0) - by_group])
+        p = without / np.append(groups.total, groups.total - groups.frames)[:, None]
+        entropies = _entropies(by_group, groups.frames, grid)
+        return cls(cells, classes, entropies, np.ascontiguousarray(p.T), (groups,))
 
     @classmethod
     def from_mix(
@@ -116,13 +122,15 @@ class LeaveOut:
         shares = [number * its.total / total for number, its in zip(times, groups, strict=True)]
         p = [share * sums / its.total for share, sums, its in zip(shares, whole, groups, strict=True)]
         mixed = np.array(times, dtype=np.int64) @ whole
-        columns = [_exact(mixed, total, grid)]
+        shares_left, columns = [mixed / total], [_exact(mixed, total, grid)]
         for number, (part, its) in enumerate(zip(parts, groups, strict=True)):
             others = sum((p[other] for other in range(len(p)) if other != number), np.zeros(len(first)))
             for group, frames in zip(part, its.frames.tolist(), strict=True):
                 left = shares[number] * (whole[number] - group) / (its.total - frames)
+                shares_left.append(others + left)
                 columns.append(_binary_entropies(others + left))
-        return cls(cells, classes, np.ascontiguousarray(np.array(columns).T), groups)
+        entropies, left_out = (np.ascontiguousarray(np.array(its).T) for its in (columns, shares_left))
+        return cls(cells, classes, entropies, left_out, groups)
 
     def scores(self, hits: NDArray[np.uint32] | NDArray[np.int64], gamma: float, unit: int = 1) -> NDArray[np.float64]:
         """One site's score of all frames, and with each group left out, (1 + k,) float64; ``hits`` as in
@@ -131,14 +139,18 @@ class LeaveOut:
         march.tally(hits, self.cells, self.classes, gamma * unit, capped, below, seen)
         return self._sum((0.0 if math.isinf(gamma) else gamma) * capped + below / unit)
 
-    def shares_seen(self, hits: NDArray[np.uint32] | NDArray[np.int64]) -> NDArray[np.float64]:
-        """The share of the entropy in voxels that one site's ``hits`` see, of all frames, and with each group left
-        out, (1 + k,) float64; 0 where there is no entropy."""
+    def shares_seen(self, hits: NDArray[np.uint32] | NDArray[np.int64], name: str) -> NDArray[np.float64]:
+        """One of :data:`pipeline.scoring.voxel_shares.NAMES` of one site's ``hits``, of all frames, and with each group
+        left out, (1 + k,) float64; 0 of nothing."""
+        each = self.entropies_bit if name == "entropy_seen" else self.p
+        if name == "coverage":
+            each = (self.p > 0.0).astype(np.float64)
         capped, below, seen = (np.zeros(len(self.entropies_bit), dtype=np.int64) for _ in range(3))
         march.tally(hits, self.cells, self.classes, 1.0, capped, below, seen)
-        total = self.limits(1.0)
-        shares, seen_bit = np.zeros(len(total)), self._sum(seen.astype(np.float64))
-        np.divide(seen_bit, total, out=shares, where=total > 0)
+        of_all = np.bincount(self.classes, minlength=len(each)).astype(np.float64)
+        total, crossed = ((count[:, None] * each).sum(axis=0) for count in (of_all, seen.astype(np.float64)))
+        shares = np.zeros(len(total))
+        np.divide(crossed, total, out=shares, where=total > 0)
         return shares
 
     def limits(self, gamma: float) -> NDArray[np.float64]:

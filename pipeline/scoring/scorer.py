@@ -8,17 +8,20 @@ is that of :mod:`pipeline.scoring.egvs`, hits are those of :mod:`pipeline.scorin
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.artefacts.readers import Tpog
+from pipeline.scoring import voxel_shares
 from pipeline.scoring.egvs import EntropyField
 from pipeline.scoring.leave_out import LeaveOut
 from pipeline.scoring.thinning import Hits
 from pipeline.scoring.visibility import Beams, Visibility
+from pipeline.scoring.voxel_shares import OccupiedVoxels
 from pipeline.sensing.scanner import Scan
 from pipeline.sensing.scene import Scene
 
@@ -41,8 +44,9 @@ class SiteScore:
     egvs: float
     entropy_seen: float
     left_out: NDArray[np.float64] | None = None
-    seen_left_out: NDArray[np.float64] | None = None
-    """The same of ``entropy_seen``, where the scenario asks for that score."""
+    shares: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    """The same of those of :data:`pipeline.scoring.voxel_shares.NAMES` that the scenario asks for, by name; the score
+    of all frames alone, (1,), where nothing is left out."""
     by_period: tuple[SiteScore, ...] = ()
     """The same for each period alone, where the TPOG is a mix of some and that was asked for."""
 
@@ -82,11 +86,10 @@ class Scorer:
         periods: tuple[PeriodTpog, ...] = (),
     ) -> None:
         self._built_from = (scene, tpog, trajectories, leave_out, periods)
-        fields = (EntropyField.of(its.tpog.counts, its.tpog.frames, its.tpog.grid) for its in periods)
-        self._periods = tuple(zip(fields, (its.leave_out for its in periods), strict=True))
-        self._leave_out, self._gamma = leave_out, scene.scenario.gamma
-        self._asks_entropy_seen = "entropy_seen" in scene.scenario.score.asked
-        self.field = EntropyField.of(tpog.counts, tpog.frames, tpog.grid)
+        self._asked: tuple[str, ...] = tuple(name for name in voxel_shares.NAMES if name in scene.scenario.score.asked)
+        self._periods = tuple(_Field.of(its.tpog, its.leave_out) for its in periods)
+        self._whole = _Field.of(tpog, leave_out)
+        self._gamma, self.field = scene.scenario.gamma, self._whole.entropy
         self._visibility = Visibility(scene, tpog, trajectories)
 
     def __reduce__(
@@ -102,7 +105,7 @@ class Scorer:
     @property
     def limits_by_period(self) -> list[float]:
         """The same of each period."""
-        return [field.limit(self._gamma) for field, _ in self._periods]
+        return [its.entropy.limit(self._gamma) for its in self._periods]
 
     def score(self, scan: Scan | Beams) -> SiteScore:
         """The score of one scan."""
@@ -119,16 +122,37 @@ class Scorer:
         return (hits / self._visibility.unit).reshape(self.field.grid.shape)
 
     def _worth(self, hits: Hits) -> SiteScore:
-        apart = tuple(self._against(hits, field, leave_out) for field, leave_out in self._periods)
-        whole, leave_out = self._against(hits, self.field, self._leave_out), self._leave_out
-        seen = leave_out.shares_seen(hits) if self._asks_entropy_seen and leave_out is not None else None
-        return replace(whole, seen_left_out=seen, by_period=apart)
+        return replace(self._against(hits, self._whole), by_period=tuple(self._against(hits, p) for p in self._periods))
 
-    def _against(self, hits: Hits, field: EntropyField, leave_out: LeaveOut | None) -> SiteScore:
+    def _against(self, hits: Hits, its: _Field) -> SiteScore:
         unit = self._visibility.unit
-        found = field.score(hits, self._gamma, unit)
-        left_out = leave_out.scores(hits, self._gamma, unit) if leave_out is not None else None
-        return SiteScore(found.egvs, found.entropy_seen, left_out)
+        found = its.entropy.score(hits, self._gamma, unit)
+        left_out = its.leave_out.scores(hits, self._gamma, unit) if its.leave_out is not None else None
+        shares = {name: its.share(name, hits, found.entropy_seen) for name in self._asked}
+        return SiteScore(found.egvs, found.entropy_seen, left_out, shares)
+
+
+@dataclass(frozen=True)
+class _Field:
+    """A TPOG as scores take it."""
+
+    entropy: EntropyField
+    occupied: OccupiedVoxels
+    leave_out: LeaveOut | None
+
+    @classmethod
+    def of(cls, tpog: Tpog, leave_out: LeaveOut | None) -> _Field:
+        entropy = EntropyField.of(tpog.counts, tpog.frames, tpog.grid)
+        return cls(entropy, OccupiedVoxels.of(tpog.counts), leave_out)
+
+    def share(self, name: str, hits: Hits, entropy_seen: float) -> NDArray[np.float64]:
+        """One of :data:`voxel_shares.NAMES`, with groups left out where that is asked for."""
+        if name == "entropy_seen":
+            value = entropy_seen
+        else:
+            value = (self.occupied.coverage if name == "coverage" else self.occupied.expected_visibility)(hits)
+        rest = np.empty(0) if self.leave_out is None else self.leave_out.shares_seen(hits, name)[1:]
+        return np.append(value, rest)
 
 
 def ranks(scores: NDArray[np.float64]) -> NDArray[np.uint32]:

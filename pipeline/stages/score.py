@@ -150,7 +150,7 @@ def run(
     _write_blindspots(work, done, targets, about)
     _write_scores(work, done, judged, scorer.limit, about)
     names, worths = [d.site.name for d in done], [d.score for d in done]
-    apart = [other for other in others if other.name in WORTHS]
+    apart = [other for other in others if other.name != "entropy_seen"]
     limits = scorer.limits_by_period
     period_scores.write(work.path(ARTEFACTS[2]), names, worths, ranking, apart, periods, limits, about)
     best = [name for name, rank in zip(names, ranking.rank, strict=True) if rank == 1]

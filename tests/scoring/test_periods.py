@@ -154,16 +154,22 @@ def test_of_a_mix_each_group_is_left_out_of_its_own_record() -> None:
     found = leave_out.scores(hits, 5.0)
     weight = [m * its.total for m, its in zip(times, records, strict=True)]
     columns = [(None, None), *((q, g) for q in (0, 1) for g in range(len(counts[q])))]
+    p_left: list[list[float]] = []
     for column, (record, group) in enumerate(columns):
         total = 0.0
+        p_left.append([])
         for cell in range(20):
             p = 0.0
             for q in (0, 1):
                 kept = [g for g in range(len(counts[q])) if (q, g) != (record, group)]
                 there, frames = sum(int(counts[q][g, cell]) for g in kept), sum(int(records[q].frames[g]) for g in kept)
                 p += weight[q] / sum(weight) * there / frames
+            p_left[-1].append(p)
             total += min(5, int(hits[cell])) * (-(p * np.log2(p) + (1 - p) * np.log2(1 - p)) if 0 < p < 1 else 0.0)
         assert found[column] == pytest.approx(total, rel=1e-12)
+    assert pytest.approx(np.array(p_left)) == leave_out.p[leave_out.classes].T
+    crossed = (np.array(p_left) * (hits > 0)).sum(axis=1) / np.array(p_left).sum(axis=1)
+    assert leave_out.shares_seen(hits, "expected_visibility") == pytest.approx(crossed)
     mixed = (4 * counts[0].sum(axis=0) + 3 * counts[1].sum(axis=0)).astype(np.int64)
     assert found[0] == pytest.approx(EntropyField.of(mixed, sum(weight), grid).score(hits, 5.0).egvs, rel=1e-13)
     assert len(Estimate.of(found[None], leave_out.groups).strata) == 2

@@ -87,10 +87,16 @@ def test_what_ranks_changes_no_score(mini: Path, tmp_path: Path) -> None:
     assert all(other[site][key] == row[key] for site, row in plain.items() for key in shared)
 
 
-def test_the_error_of_the_entropy_seen_is_that_of_its_groups(mini: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["entropy_seen", "coverage", "expected_visibility"])
+def test_the_error_of_a_share_of_voxels_is_that_of_its_groups(mini: Path, tmp_path: Path, name: str) -> None:
     """With two blocks a group left out is the other block: its share by hand, voxel by voxel."""
     more = ("tpog.blocks=2", "score.keep_visibility=all")
-    rows = run(mini, tmp_path / "run", 'score.others=["entropy_seen"]', *more)
+    rows = run(mini, tmp_path / "run", f'score.others=["{name}"]', *more)
+    worth = {
+        "entropy_seen": binary_entropy,
+        "coverage": lambda count, _: float(count > 0),
+        "expected_visibility": lambda count, frames: count / frames,
+    }[name]
     path = tmp_path / "run" / "tpog.parquet"
     counts = {}
     for row in tables.read(path, "tpog")[0].to_pylist():
@@ -99,13 +105,13 @@ def test_the_error_of_the_entropy_seen_is_that_of_its_groups(mini: Path, tmp_pat
         hits = read_visibility(tmp_path / "run" / "visibility.parquet", site)
         shares = []
         for kept in ((0,), (1,), (0, 1)):
-            bits = {cell: binary_entropy(sum(its[b] for b in kept), 20 * len(kept)) for cell, its in counts.items()}
-            shares.append(sum(h for cell, h in bits.items() if hits[cell]) / sum(bits.values()))
-        assert row["entropy_seen"] == pytest.approx(shares[2])
+            each = {cell: worth(sum(its[b] for b in kept), 20 * len(kept)) for cell, its in counts.items()}
+            shares.append(sum(w for cell, w in each.items() if hits[cell]) / sum(each.values()))
+        assert row[name] == pytest.approx(shares[2])
         # two equal groups: the pseudo-values are 2 S - S_(g), so their halved squared distances from their mean
         scatter = abs(shares[0] - shares[1]) / 2
-        assert row["entropy_seen_se"] >= scatter * (1 - 1e-9)
-        assert row["entropy_seen_se"] < 3 * scatter
+        assert row[f"{name}_se"] >= scatter * (1 - 1e-9)
+        assert row[f"{name}_se"] < 3 * scatter
 
 
 def test_without_standard_errors_there_are_none(mini: Path, tmp_path: Path) -> None:

@@ -90,18 +90,18 @@ class Judged:
 
 
 def _value(name: str, score: SiteScore, targets: SiteTargets | None) -> float:
-    if targets is not None and name in targets.scores:
-        return float(targets.scores[name][0])
-    return score.egvs if name == "egvs" else score.entropy_seen
+    if name == "egvs":
+        return score.egvs
+    return float((targets.scores if targets is not None and name in targets.scores else score.shares)[name][0])
 
 
 def _left_out(name: str, score: SiteScore, targets: SiteTargets | None) -> Floats | None:
-    if targets is not None and name in targets.scores:
-        return targets.scores[name]
-    return score.left_out if name == "egvs" else score.seen_left_out
+    if name == "egvs":
+        return score.left_out
+    return (targets.scores if targets is not None and name in targets.scores else score.shares)[name]
 
 
 def _by_period(name: str, score: SiteScore, targets: SiteTargets | None) -> list[float]:
     if targets is not None and name in targets.scores:
         return [period[name] for period in targets.by_period]
-    return [period.egvs if name == "egvs" else period.entropy_seen for period in score.by_period]
+    return [_value(name, period, None) for period in score.by_period]

@@ -11,6 +11,7 @@ import math
 import numpy as np
 from scipy.special import rel_entr
 
+from pipeline.scoring.voxel_shares import OccupiedVoxels
 from pipeline.validation.surrogates.base import GAMMA, OCCLUSION, VOXEL, Score
 from pipeline.validation.surrogates.evidence import SiteEvidence
 
@@ -36,14 +37,12 @@ def entropy_seen(evidence: SiteEvidence) -> float:
 
 def coverage(evidence: SiteEvidence) -> float:
     r""":math:`|\{v : p(v) > 0, hits(v) > 0\}| \,/\, |\{v : p(v) > 0\}|`: the rest are blind spots."""
-    hits = evidence.hits
-    return int(np.count_nonzero(hits)) / len(hits) if len(hits) else 0.0
+    return OccupiedVoxels(evidence.occupancy.cells, evidence.occupancy.counts).coverage(evidence.counted[0])
 
 
 def expected_visibility(evidence: SiteEvidence) -> float:
     r""":math:`\sum_v p(v) [hits(v) > 0] \,/ \sum_v p(v)`."""
-    counts = evidence.occupancy.counts
-    return int(counts[evidence.hits > 0].sum()) / int(counts.sum()) if len(counts) else 0.0
+    return OccupiedVoxels(evidence.occupancy.cells, evidence.occupancy.counts).expected_visibility(evidence.counted[0])
 
 
 def s_mig(evidence: SiteEvidence) -> float:
