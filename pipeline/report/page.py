@@ -193,7 +193,7 @@ def page(
         hidden=len(sites) - len(first) - len(last),
         headline=wording.headline(ranking, has_traffic),
         lead=wording.lead(ranking),
-        which_to_trust=wording.which_to_trust(ranking),
+        beside_entropy_seen=wording.beside_entropy_seen(ranking),
         disagreement=disagreement(
             sites, setting_of(gamma, tpog.grid.voxel_m, moving_occlusion="moving_occlusion" in effects)
         ),

@@ -107,7 +107,7 @@ SCORES = {
             + _VEHICLES,
         ),
         ScoreWords(
-            "expected_detections", "the share of vehicles found", "found", "finds {} of vehicles",
+            "expected_detections", "the share of vehicles found", "found", "should find {} of vehicles",
             "Sites are ranked by the share of vehicles that detectors are expected to find, by the points on each, how "
             f"far they spread over it, how far away it is and how near the next one. {_VEHICLES}",
         ),

@@ -49,9 +49,8 @@ def lead(ranking: Ranking) -> str:
     return text
 
 
-def which_to_trust(ranking: Ranking) -> str:
-    """What entropy seen says beside the EGVS, and which of the two to trust where they disagree; nothing where another
-    score ranks."""
+def beside_entropy_seen(ranking: Ranking) -> str:
+    """What entropy seen says beside the EGVS; nothing where another score ranks."""
     top, most = (max(sites, key=lambda site: site.entropy_seen) for sites in (ranking.best, ranking.sites))
     if ranking.is_tie or top.rank_by != "egvs" or not top.egvs > 0:
         return ""
@@ -60,8 +59,8 @@ def which_to_trust(ranking: Ranking) -> str:
         return f"{it} also sees most of the traffic’s uncertainty, {share(top.entropy_seen)}."
     return (
         f"{most.site}, rank {most.rank}, sees more of the traffic’s uncertainty ({share(most.entropy_seen)} against "
-        f"{share(top.entropy_seen)}), but with fewer beams on it: trust the score, which the ranking follows. A voxel "
-        f"counts as seen from one beam on, and one beam detects no vehicle."
+        f"{share(top.entropy_seen)}), but with fewer beams on it. A voxel counts as "
+        f"seen from one beam on, and one beam detects no vehicle."
     )
 
 

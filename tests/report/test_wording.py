@@ -39,13 +39,13 @@ def by_vehicles(*rows: tuple[str, float, float], rank_by: str = "expected_detect
 
 def test_a_score_over_vehicles_is_told_in_a_planners_words() -> None:
     found = by_vehicles(("a", 50.0, 0.871), ("b", 90.0, 0.8), ("c", 20.0, 0.4))
-    assert wording.headline(found, has_traffic=True) == "a is the best of 3 sites: it finds 87% of vehicles"
+    assert wording.headline(found, has_traffic=True) == "a is the best of 3 sites: it should find 87% of vehicles"
     assert wording.lead(found) == "It leads b, the next, by 8.2% of its score."
-    assert wording.which_to_trust(found) == ""
+    assert wording.beside_entropy_seen(found) == ""
     assert wording.site_caption(found.sites[0], 1, 2).startswith("a: rank 1, the share of vehicles found 87.1%, at x")
     assert found.sites[0].score_se == 0.01 and found.beside is SCORES["egvs"]
     assert (
-        wording.headline(by_vehicles(("a", 50.0, 0.871)), has_traffic=True) == "a, the only site, finds 87% of vehicles"
+        wording.headline(by_vehicles(("a", 50.0, 0.871)), has_traffic=True) == "a, the only site, should find 87% of vehicles"
     )
     assert by_vehicles(("a", 50.0, 0.9), rank_by="egvs").beside is SCORES["expected_detections"]
     assert ranking(("a", 50.0, 1, 0.5, 1.0)).beside is None
@@ -118,13 +118,13 @@ def test_the_one_beside_the_next_says_whether_the_first_can_be_told_from_it() ->
     assert wording.lead(alone).endswith("With this much traffic they cannot be told apart.")
 
 
-def test_the_score_is_to_be_trusted_only_where_it_says_something_else() -> None:
+def test_what_entropy_seen_says_beside_the_score() -> None:
     """Of two with the same score, one that sees more contradicts nothing."""
     tied = ranking(("a", 100.0, 1, 0.5, 0.5), ("b", 100.0, 1, 0.6, 0.99), ("c", 80.0, 3, 0.4, 1.0))
-    assert wording.which_to_trust(tied) == "b also sees most of the traffic’s uncertainty, 60.0%."
+    assert wording.beside_entropy_seen(tied) == "b also sees most of the traffic’s uncertainty, 60.0%."
     other = ranking(("a", 100.0, 1, 0.5, 0.99), ("c", 80.0, 2, 0.7, 1.0))
-    assert wording.which_to_trust(other).startswith(
-        "c, rank 2, sees more of the traffic’s uncertainty (70.0% against 50.0%), but with fewer beams on it: trust"
+    assert wording.beside_entropy_seen(other).startswith(
+        "c, rank 2, sees more of the traffic’s uncertainty (70.0% against 50.0%), but with fewer beams on it. A voxel"
     )
     agree = ranking(("a", 100.0, 1, 0.7, 0.99), ("c", 80.0, 2, 0.5, 1.0))
-    assert wording.which_to_trust(agree) == "It also sees most of the traffic’s uncertainty, 70.0%."
+    assert wording.beside_entropy_seen(agree) == "It also sees most of the traffic’s uncertainty, 70.0%."
