@@ -155,6 +155,8 @@ def _in_sentences(folder: Path, record: RunRecord, sites: Sequence[ScoredSite]) 
     about = tables.read_metadata(folder / "scores.parquet", "scores")
     best = next((site for site in sites if site.rank == 1), None)
     first = [] if best is None or best.rank_by == "egvs" else [f"{best.site} {best.by.sentence(best.score)}"]
+    if first and best is not None and best.by.counts_vehicles and "weights" in about:
+        first[0] += ", which are weighted"
     hidden = "moving_occlusion" in record.scenario.get("effects", {})
     other = disagreement(sites, setting_of(about["gamma"], about["grid"]["voxel_m"], moving_occlusion=hidden))
     return [*first, *([other] if other else [])]

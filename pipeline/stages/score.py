@@ -146,6 +146,8 @@ def run(
         frames=tpog.frames,
         sites=sites,
     )
+    if wanted.weights.are_given:
+        about["weights"] = wanted.weights.model_dump(mode="json")
     _write_visibility(work, done, about)
     _write_blindspots(work, done, targets, about)
     _write_scores(work, done, judged, scorer.limit, about)

@@ -45,7 +45,8 @@ def test_a_score_over_vehicles_is_told_in_a_planners_words() -> None:
     assert wording.site_caption(found.sites[0], 1, 2).startswith("a: rank 1, the share of vehicles found 87.1%, at x")
     assert found.sites[0].score_se == 0.01 and found.beside is SCORES["egvs"]
     assert (
-        wording.headline(by_vehicles(("a", 50.0, 0.871)), has_traffic=True) == "a, the only site, should find 87% of vehicles"
+        wording.headline(by_vehicles(("a", 50.0, 0.871)), has_traffic=True)
+        == "a, the only site, should find 87% of vehicles"
     )
     assert by_vehicles(("a", 50.0, 0.9), rank_by="egvs").beside is SCORES["expected_detections"]
     assert ranking(("a", 50.0, 1, 0.5, 1.0)).beside is None

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import pipeline
+from pipeline.artefacts import tables
 from pipeline.artefacts.readers import read_scores, read_scores_by_period
 from pipeline.core.findings import warnings_of
 from pipeline.scenario import loading
@@ -93,6 +94,18 @@ def test_scores_of_a_run_are_weighted_means_and_so_are_their_errors(mini: Path, 
 def test_a_weight_of_one_for_all_changes_nothing(mini: Path, tmp_path: Path) -> None:
     plain, one = run(mini, tmp_path / "a"), run(mini, tmp_path / "b", "score.weights.kinds.passenger=1")
     assert {site: set(row.items()) for site, row in one.items()} == {s: set(row.items()) for s, row in plain.items()}
+
+
+def test_weights_are_told(mini: Path, tmp_path: Path, egvs) -> None:  # type: ignore[no-untyped-def]
+    weights = ("--set", WEST, "--set", "score.weights.kinds.passenger=2")
+    code, printed, told = egvs("run", mini, "--out", tmp_path, "--set", "score.rank_by=seen_well", *weights)
+    assert code == 0
+    assert "weights passenger 2, zone west 4" in told
+    assert "of vehicles well, which are weighted" in printed
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "They are weighted: passenger 2, zone west 4; what is not named counts 1." in page
+    about = tables.read_metadata(tmp_path / "scores.parquet", "scores")
+    assert about["weights"]["kinds"] == {"passenger": 2.0}
 
 
 def test_periods_are_weighted_each_by_itself(mini: Path, tmp_path: Path) -> None:
