@@ -116,31 +116,45 @@ def _meet(k, box, beams, runs, owner, range_m, t_m):  # type: ignore[no-untyped-
 
 
 @_inlined
-def _note(b, worth, along, across, half_length, half_width, found):  # type: ignore[no-untyped-def]
-    """Add a hit on box b to what is found, as in :func:`first_met`."""
-    total, sides, slices, low, high = found
-    total[b] += worth
-    if worth > 0.0:
-        if abs(along) > half_length - _ON_SIDE_M or abs(across) > half_width - _ON_SIDE_M:
-            sides[b] += worth
-        part = int(SLICES * (0.5 * along / half_length + 0.5))
-        slices[b] |= np.uint64(1) << np.uint64(min(max(part, 0), SLICES - 1))
-        low[b, 0], high[b, 0] = min(low[b, 0], along), max(high[b, 0], along)
-        low[b, 1], high[b, 1] = min(low[b, 1], across), max(high[b, 1], across)
+def _is_on_side(along, across, half_length, half_width):  # type: ignore[no-untyped-def]
+    """Whether a hit lies on a side of its box, not on its roof (or, from below, its underside)."""
+    return abs(along) > half_length - _ON_SIDE_M or abs(across) > half_width - _ON_SIDE_M
+
+
+@_inlined
+def _slice_of(along, half_length):  # type: ignore[no-untyped-def]
+    """The bit of the slice of its box's length that a hit lies in."""
+    part = int(SLICES * (0.5 * along / half_length + 0.5))
+    return np.uint64(1) << np.uint64(min(max(part, 0), SLICES - 1))
 
 
 @_kernel
-def _add(k, b, box, beams, runs, owner, range_m, found):  # type: ignore[no-untyped-def]
-    """Add up the beams that end on box k, which is box b of all frames."""
+def _add(k, b, box, beams, runs, owner, range_m, mine, found):  # type: ignore[no-untyped-def]
+    """Add up the beams that end on box k, which is box b of all frames, as in :func:`first_met`; listed in ``mine``
+    (n,) first, so that there is no branch at each of the others."""
     ax, ay, az, ao, ah = box[0], box[1], box[2], box[3], box[4]
     bx, by, bz, bo, bh = box[5], box[6], box[7], box[8], box[9]
     x, y, z, weight = beams[3][0], beams[3][1], beams[3][2], beams[5]
+    total, sides, slices, low, high = found
+    count = 0
     for run in range(runs.shape[0]):
         for n in range(runs[run, 0], runs[run, 1]):
-            if owner[n] == k:
-                along = ao + range_m[n] * (ax * x[n] + ay * y[n] + az * z[n])
-                across = bo + range_m[n] * (bx * x[n] + by * y[n] + bz * z[n])
-                _note(b, weight[n], along, across, ah, bh, found)
+            mine[count] = n
+            count += owner[n] == k
+    worth, on_sides, parts = 0.0, 0.0, np.uint64(0)
+    a_low, a_high, b_low, b_high = np.inf, -np.inf, np.inf, -np.inf
+    for i in range(count):
+        n = mine[i]
+        worth += weight[n]
+        if weight[n] > 0.0:
+            along = ao + range_m[n] * (ax * x[n] + ay * y[n] + az * z[n])
+            across = bo + range_m[n] * (bx * x[n] + by * y[n] + bz * z[n])
+            on_sides += weight[n] if _is_on_side(along, across, ah, bh) else 0.0
+            parts |= _slice_of(along, ah)
+            a_low, a_high = min(a_low, along), max(a_high, along)
+            b_low, b_high = min(b_low, across), max(b_high, across)
+    total[b], sides[b], slices[b] = worth, on_sides, parts
+    low[b, 0], high[b, 0], low[b, 1], high[b, 1] = a_low, a_high, b_low, b_high
 
 
 @_kernel
@@ -213,6 +227,7 @@ def first_met(begin, o, size_m, boxes, beams, owner, range_m, found, hits):  # t
     facing, block, span = np.empty((most, 15)), np.empty((most, 9)), np.empty((most, 2))
     box, away, t_m = np.empty(most, np.int64), np.empty(most), np.empty(azimuth.shape[0])
     runs, filled = np.empty((most, 3 * bands.shape[0], 2), np.int64), np.zeros(most, np.int64)
+    mine = np.empty(azimuth.shape[0], np.int64)
     for f in range(begin, starts.shape[0] - 1):
         if room > 0 and count + azimuth.shape[0] > room:
             return f, count
@@ -235,7 +250,7 @@ def first_met(begin, o, size_m, boxes, beams, owner, range_m, found, hits):  # t
             if listed[b] and room > 0:
                 count = _list(k, b, facing[k], beams, its, owner, range_m, hits, count)
             elif listed[b]:
-                _add(k, b, facing[k], beams, its, owner, range_m, counted)
+                _add(k, b, facing[k], beams, its, owner, range_m, mine, counted)
         for k in range(kept):
             _restore(runs[k, : filled[k]], beams[4], owner, range_m)
     return starts.shape[0] - 1, count
@@ -254,9 +269,15 @@ def add_up(box, worth, along, across, boxes, found):  # type: ignore[no-untyped-
     found
         Added to: ``total``, ``sides``, ``slices``, ``low`` and ``high``, as :func:`first_met` fills them.
     """
+    total, sides, slices, low, high = found
     for i in range(box.shape[0]):
-        half_length, half_width = 0.5 * boxes[box[i], 5] - SHRINK_M, 0.5 * boxes[box[i], 6] - SHRINK_M
-        _note(box[i], worth[i], along[i], across[i], half_length, half_width, found)
+        b, half_length, half_width = box[i], 0.5 * boxes[box[i], 5] - SHRINK_M, 0.5 * boxes[box[i], 6] - SHRINK_M
+        total[b] += worth[i]
+        if worth[i] > 0.0:
+            sides[b] += worth[i] if _is_on_side(along[i], across[i], half_length, half_width) else 0.0
+            slices[b] |= _slice_of(along[i], half_length)
+            low[b, 0], high[b, 0] = min(low[b, 0], along[i]), max(high[b, 0], along[i])
+            low[b, 1], high[b, 1] = min(low[b, 1], across[i]), max(high[b, 1], across[i])
 
 
 @_kernel
