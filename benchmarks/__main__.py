@@ -24,7 +24,7 @@ from rich.console import Console
 from rich.table import Table
 
 import pipeline
-from benchmarks import casting, clouds, detection, effects, others, savings, stability
+from benchmarks import casting, clouds, detection, effects, judging, others, savings, stability
 from benchmarks.scenes import run_stage
 from pipeline.artefacts.readers import read_tpog
 from pipeline.core.parallel import in_order
@@ -178,6 +178,7 @@ def main() -> None:
     console = Console(width=140, highlight=False)
     console.print(table)
     for title, measure in (
+        ("what it costs to judge a site, processor time a site", judging.rows),
         ("what stability costs", stability.rows),
         ("what exact hits cost", casting.rows),
         ("what leaving out the unseen saves", savings.rows),
