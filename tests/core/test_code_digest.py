@@ -97,6 +97,8 @@ CHANGED = {
     "kernels/rays.py": {"check", "scan", "score", "page"},  # without kept scans, these two cast
     "traffic/sumo_folder.py": {"check", "statics", "traffic", "scan", "score", "page"},  # beside what reads the network
     "core/grid.py": {"check", "statics", "scan", "traffic", "tpog", "score", "page"},
+    "scoring/targets/detectability.json": {"score"},  # numbers beside the module of the same name
+    "report/evidence.json": {"page"},
     "studies/accuracy.py": set(),
     "cli/app.py": set(),
     "__init__.py": set(),

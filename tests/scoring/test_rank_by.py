@@ -14,6 +14,7 @@ import pytest
 
 import pipeline
 from pipeline.artefacts import tables
+from pipeline.artefacts.period_ranking import PeriodRanking
 from pipeline.artefacts.readers import read_scores, read_scores_by_period, read_tpog, read_visibility
 from pipeline.artefacts.traffic_frames import read
 from pipeline.core.findings import warnings_of
@@ -136,6 +137,13 @@ def test_a_mix_of_periods_weighs_vehicles_with_and_without_errors(mini: Path, tm
         assert row["seen_well"] == pytest.approx(wanted, rel=1e-12)
     for name in "ab":
         assert by_rank({its["site"]: its for its in apart if its["period"] == name}, "seen_well")
+    shown = PeriodRanking.read(tmp_path / "a")
+    assert shown is not None
+    best = {name: max(its["seen_well"] for its in apart if its["period"] == name) for name in "ab"}
+    for site, _, periods in shown.sites:
+        own = [next(its for its in apart if (its["site"], its["period"]) == (site, name)) for name in "ab"]
+        assert [its.of_best for its in periods] == [its["seen_well"] / best[its["period"]] for its in own]
+        assert [its.rank for its in periods] == [its["rank"] for its in own]
 
 
 def test_no_vehicle_in_the_region_is_refused_where_vehicles_rank(mini: Path, tmp_path: Path, egvs) -> None:  # type: ignore[no-untyped-def]
