@@ -96,6 +96,15 @@ class RunRecord:
         known = {name: stage for name in STAGES if (stage := stages.get(name)) is not None}
         return cls(value["egvs"], value["seed"], value["scenario"], value["scenario_folder"], known)
 
+    @property
+    def digests(self) -> dict[str, str]:
+        """Name -> sha256 of what stages wrote; of what they read, where the stage that wrote it is not known any more:
+        settings were others then.
+        """
+        read = [stage.files for stage in self.stages.values()]
+        written = [stage.artefacts for stage in self.stages.values()]
+        return {name: digest for part in (*read, *written) for name, digest in part.items()}
+
     def having(self, name: str, stage: StageRecord | None) -> RunRecord:
         """With a stage as it is now; without it for None."""
         stages = {**self.stages, name: stage}

@@ -7,7 +7,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from pipeline.artefacts.run_record import STAGES
+from pipeline.artefacts.run_record import STAGES, RunRecord
 from pipeline.core import files
 from pipeline.core.cost import Cost, measured
 from pipeline.core.findings import seen_from
@@ -68,6 +68,12 @@ def module_of(stage: str) -> ModuleType:
 def artefacts_of(stage: str) -> tuple[str, ...]:
     """The files that a stage may write."""
     return tuple(module_of(stage).ARTEFACTS)
+
+
+def recorded(record: RunRecord) -> dict[str, str]:
+    """The sha256 of every artefact as a run's record has it, "" where nothing is known of it."""
+    known = record.digests
+    return {name: known.get(name, "") for stage in STAGES for name in artefacts_of(stage)}
 
 
 def make(stage: str, work: Workspace, inputs: StageInputs, **options: Any) -> Made:

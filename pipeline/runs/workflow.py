@@ -92,9 +92,9 @@ def run_one(
 ) -> RunRecord:
     """Run a single stage, whether its inputs changed or not, and note it in ``run.json``."""
     with alone(out):
-        work = Workspace(scenario, out, jobs=jobs, progress=progress)
-        run = _Run(work, listener)
-        record = run.bring(name, _record_so_far(scenario, out), again=True, **options)
+        record = _record_so_far(scenario, out)
+        work = Workspace(scenario, out, jobs=jobs, progress=progress, recorded=stages.recorded(record))
+        record = _Run(work, listener).bring(name, record, again=True, **options)
         for other in [stage for stage in record.stages if stage != name and not _is_of(stage, work, record)]:
             record = record.having(other, None)  # of other settings: the record would contradict itself
         record.write(out)
@@ -115,7 +115,8 @@ def refresh_report(out: Path) -> Path | None:
         return None
     scenario = from_values(record.scenario, source, str(out / RECORD))
     work = Workspace(scenario, out)
-    if not all(_is_of(name, work, record) for name in STAGES if name != "report"):
+    before = {name: stage for name, stage in record.stages.items() if name != "report"}
+    if not all(_is_of(name, work, record) and _intact(work, stage.artefacts) for name, stage in before.items()):
         return None
     _Run(work, unheard).bring("report", record)
     return out / "report.html"

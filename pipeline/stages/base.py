@@ -20,6 +20,7 @@ from typing import Any, Protocol, TypeVar
 
 from pipeline.artefacts import schemas
 from pipeline.core import files, parallel
+from pipeline.core.errors import InputError
 from pipeline.core.progress import Progress, silent
 from pipeline.scenario.models import Scenario
 
@@ -79,12 +80,22 @@ class Workspace:
         What is run, and where its artefacts are.
     jobs
         Threads; one a core when None. Results do not depend on it.
+    recorded
+        The sha256 of artefacts as ``run.json`` has it, "" where it has none: an artefact with other bytes is refused.
+        None where nothing is recorded, as in a notebook.
     """
 
     def __init__(
-        self, scenario: Scenario, folder: Path, *, jobs: int | None = None, progress: Progress = silent
+        self,
+        scenario: Scenario,
+        folder: Path,
+        *,
+        jobs: int | None = None,
+        progress: Progress = silent,
+        recorded: Mapping[str, str] | None = None,
     ) -> None:
         self.scenario, self.folder, self.progress = scenario, folder, progress
+        self._recorded = dict(recorded or {})
         self.threads = parallel.threads(jobs)
         self._digests: dict[str, str] = {}
         self._remembered: dict[str, tuple[tuple[str, ...], Any]] = {}
@@ -94,9 +105,19 @@ class Workspace:
         return self.folder / artefact
 
     def digest(self, artefact: str) -> str:
-        """The sha256 of an artefact, hashed once until :meth:`forget`; InputError when it is not there."""
+        """The sha256 of an artefact, hashed once until :meth:`forget`.
+
+        InputError when it is not there, or is not the one that ``run.json`` names.
+        """
         if artefact not in self._digests:
-            self._digests[artefact] = files.sha256_of(self.path(artefact))
+            digest, right = files.sha256_of(self.path(artefact)), "egvs run makes it again"
+            match self._recorded.get(artefact, digest):
+                case "":
+                    raise InputError(self.path(artefact), "no stage that run.json knows of made it here", right)
+                case known if known != digest:
+                    found = f"was altered or replaced (sha256 {digest[:12]}, in run.json {known[:12]})"
+                    raise InputError(self.path(artefact), found, right)
+            self._digests[artefact] = digest
         return self._digests[artefact]
 
     def digests(self, *artefacts: str) -> dict[str, str]:
@@ -107,6 +128,7 @@ class Workspace:
         """Some artefacts are about to be written anew."""
         for name in artefacts:
             self._digests.pop(name, None)
+            self._recorded.pop(name, None)
 
     def remember(self, what: str, artefacts: tuple[str, ...], make: Callable[[], T]) -> T:
         """What ``make`` gives, made once for as long as the artefacts that it is made from stay what they are."""

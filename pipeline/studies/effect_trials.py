@@ -19,7 +19,7 @@ from pipeline.artefacts.run_record import RECORD, RunRecord
 from pipeline.core.errors import InputError
 from pipeline.effects import scene_resolving
 from pipeline.effects.base import Effect, Traffic
-from pipeline.runs import stage_keys
+from pipeline.runs import stage_keys, stages
 from pipeline.scenario.effects import EffectParameters
 from pipeline.scoring.scorer import Scorer
 from pipeline.sensing.scanner import Scanner
@@ -68,15 +68,17 @@ class Trials:
         """None where the folder holds no traffic of this scenario as it is now."""
         if not (folder / RECORD).is_file():
             return None
-        record, work = RunRecord.read(folder), Workspace(scene.scenario, folder)
+        record = RunRecord.read(folder)
+        work = Workspace(scene.scenario, folder, recorded=stages.recorded(record))
         try:
             current = all(
                 name in record.stages and record.stages[name].inputs == stage_keys.inputs(name, work).key
                 for name in ("traffic", "statics", "tpog")
             )
-        except InputError:  # an artefact is gone
+            work.digests(_TRAJECTORIES, _TPOG)
+        except InputError:  # an artefact is gone, or another one
             return None
-        return cls(scene, folder) if current and (folder / _TPOG).is_file() else None
+        return cls(scene, folder) if current else None
 
     def trial(self, effect: Effect[EffectParameters]) -> Trial | None:
         """What the effect changes; None where that takes other traffic, or every score is 0."""

@@ -113,19 +113,43 @@ def read_ply(path: Path) -> tuple[World, dict[str, Any]]:
     """Read what :func:`write_ply` wrote: the world and the metadata. InputError when the file is not such a one."""
     if not path.is_file():
         raise InputError(path, "no such file", f"run the stage that makes {path.name} first")
-    data = path.read_bytes()
-    head, end, body = data.partition(b"end_header\n")
-    lines = head.decode("ascii", errors="replace").splitlines()
+    head, end, body = path.read_bytes().partition(b"end_header\n")
+    try:
+        vertex_count, face_count, metadata, solids = _header(head.decode("ascii"))
+        size = vertex_count * _VERTEX.itemsize
+        if not end or vertex_count < 0 or len(body) != size + face_count * _FACE.itemsize:
+            raise ValueError
+    except (ValueError, LookupError, TypeError, RecursionError):
+        raise InputError(path, "is not a whole statics.ply", "run the statics stage again") from None
+    vertices = np.frombuffer(body, dtype=_VERTEX, count=vertex_count)
+    faces = np.frombuffer(body, dtype=_FACE, offset=size)
+    _check_indices(path, faces, vertex_count, len(solids))
+    if not np.isfinite(vertices["xyz"]).all():
+        raise InputError(path, "a vertex is no number", "finite coordinates; run the statics stage again")
+    return World(vertices["xyz"].copy(), faces["corners"].copy(), faces["solid"].copy(), solids), metadata
+
+
+def _header(text: str) -> tuple[int, int, dict[str, Any], tuple[tuple[str, str], ...]]:
+    """Vertices, faces, metadata and solids that a header names; an exception of Python's where it is none of ours."""
+    lines = text.splitlines()
     comments = [line.removeprefix("comment ").split(" ", 1) for line in lines if line.startswith("comment ")]
     counts = {line.split()[1]: int(line.split()[2]) for line in lines if line.startswith("element ")}
-    size = counts.get("vertex", -1) * _VERTEX.itemsize
-    if not end or len(body) != size + counts.get("face", -1) * _FACE.itemsize or comments[0][0] != "egvs":
-        raise InputError(path, "is not a whole statics.ply", "run the statics stage again")
-    vertices = np.frombuffer(body, dtype=_VERTEX, count=counts["vertex"])
-    faces = np.frombuffer(body, dtype=_FACE, offset=size)
+    word, metadata = comments[0][0], json.loads(comments[0][1])
+    if word != "egvs" or not isinstance(metadata, dict):
+        raise ValueError
     solids = tuple((str(n), str(k)) for n, k in (json.loads(text) for word, text in comments if word == "solid"))
-    world = World(vertices["xyz"].copy(), faces["corners"].copy(), faces["solid"].copy(), solids)
-    return world, json.loads(comments[0][1])
+    return counts["vertex"], counts["face"], metadata, solids
+
+
+def _check_indices(path: Path, faces: NDArray[np.void], vertices: int, solids: int) -> None:
+    """InputError unless every triangle is one, of vertices and a solid that are there."""
+    right = "run the statics stage again"
+    if bad := np.flatnonzero(faces["n"] != 3).tolist():
+        raise InputError(path, f"face {bad[0]} has {faces['n'][bad[0]]} corners", f"triangles; {right}")
+    for what, index, count in (("vertex", faces["corners"], vertices), ("solid", faces["solid"], solids)):
+        if len(index) and not (index.min() >= 0 and index.max() < count):
+            worst = index.min() if index.min() < 0 else index.max()
+            raise InputError(path, f"a triangle names {what} {worst} of {count}", f"0 to {count - 1}; {right}")
 
 
 def _line(value: Any) -> str:

@@ -1,8 +1,11 @@
 """Is every footprint and mesh built as it is meant, or mended with a count, or refused with the reason - and never
 dropped?"""
 
+import contextlib
+import dataclasses
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -284,6 +287,39 @@ def test_ply_comes_back_bit_for_bit(tmp_path):
         (tmp_path / "w.ply").write_bytes(broken)
         with pytest.raises(InputError, match=r"whole statics\.ply"):
             read_ply(tmp_path / "w.ply")
+
+
+INDICES = {
+    "a vertex beyond the last": ("faces", 8, "a triangle names vertex 8 of 8; 0 to 7; run the statics stage again"),
+    "a vertex before the first": ("faces", -1, "a triangle names vertex -1 of 8; 0 to 7; run the statics stage again"),
+    "a solid beyond the last": ("solid_of_face", 1, "a triangle names solid 1 of 1; 0 to 0; run the statics stage"),
+    "a solid before the first": ("solid_of_face", -2, "a triangle names solid -2 of 1; 0 to 0; run the statics stage"),
+    "a vertex that is no number": ("vertices_m", np.nan, "a vertex is no number; finite coordinates; run the statics"),
+}
+
+
+@pytest.mark.parametrize(("column", "value", "message"), INDICES.values(), ids=INDICES.keys())
+def test_ply_whose_indices_lead_nowhere_is_refused(tmp_path, column, value, message):
+    world, _ = built(tmp_path, polygon(SQUARE))
+    values = getattr(world, column).copy()
+    values.flat[5] = value
+    write_ply(tmp_path / "w.ply", dataclasses.replace(world, **{column: values}), {})
+    with pytest.raises(InputError, match=re.escape(f"w.ply: {message}")):
+        read_ply(tmp_path / "w.ply")
+
+
+def test_ply_with_a_flipped_bit_is_read_or_refused(tmp_path):
+    world, _ = built(tmp_path, polygon(SQUARE))
+    write_ply(tmp_path / "w.ply", world, {"any": 1})
+    whole = (tmp_path / "w.ply").read_bytes()
+    for bit in range(0, 8 * len(whole), 17):
+        data = bytearray(whole)
+        data[bit // 8] ^= 1 << bit % 8
+        (tmp_path / "w.ply").write_bytes(data)
+        with contextlib.suppress(InputError):
+            again, _ = read_ply(tmp_path / "w.ply")
+            assert np.isfinite(again.triangles_m).all()
+            assert len(again.closed) == len(again.solids)
 
 
 def checked_at(folder, *sites, features, ground=True):

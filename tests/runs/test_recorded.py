@@ -1,0 +1,136 @@
+"""A single verb reads an artefact only as run.json names it: flipped bits and files of other runs are refused."""
+
+from __future__ import annotations
+
+import json
+import random
+import shutil
+from pathlib import Path
+
+import pytest
+
+import pipeline
+from pipeline.core import files
+from pipeline.core.errors import InputError
+from pipeline.effects import scene_resolving
+from pipeline.runs import workflow
+from pipeline.stages.base import Workspace
+from pipeline.stages.shared.world import world_of
+from pipeline.studies.effect_trials import Trials
+
+READ_BY = {
+    "trajectories.parquet": ("tpog", "score", "report"),
+    "statics.ply": ("scan", "tpog", "report"),
+    "tpog.parquet": ("score", "report"),
+    "scans.parquet": ("score", "report"),
+    "scores.parquet": ("report",),
+    "blindspots.parquet": ("report",),
+}
+PAIRS = [(name, verb) for name, verbs in READ_BY.items() for verb in verbs]
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[pipeline.Scenario, Path, Path]:
+    """A scenario, its finished run, and one of other settings."""
+    from tests.conftest import write_mini
+
+    folder = tmp_path_factory.mktemp("recorded")
+    scenario = pipeline.load(write_mini(folder / "mini"))
+    pipeline.run(scenario, folder / "out")
+    others = ["traffic.frames=20", "score.gamma=2", "statics.ground=false", "sensors.small.channels=4"]
+    pipeline.run(pipeline.load(scenario.folder, others), folder / "other")
+    return scenario, folder / "out", folder / "other"
+
+
+@pytest.fixture
+def out(runs: tuple[pipeline.Scenario, Path, Path], tmp_path: Path) -> Path:
+    """A copy of the finished run, in a folder of its own."""
+    copy = Path(shutil.copytree(runs[1], tmp_path / "out"))
+    record = json.loads((copy / "run.json").read_text())
+    record["scenario_folder"] = str(runs[0].folder)
+    (copy / "run.json").write_text(json.dumps(record))
+    return copy
+
+
+def contents(folder: Path) -> dict[str, str]:
+    return {path.name: files.sha256_of(path) for path in folder.iterdir() if path.is_file()}
+
+
+def answer(verb: str, scenario: pipeline.Scenario, out: Path) -> str:
+    with pytest.raises(InputError) as caught:
+        workflow.run_one(verb, scenario, out)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(("name", "verb"), PAIRS)
+def test_any_flipped_bit_is_refused(runs, out: Path, name: str, verb: str) -> None:
+    whole, draw = (out / name).read_bytes(), random.Random(f"{name} {verb}")
+    for _ in range(5):
+        data = bytearray(whole)
+        data[draw.randrange(len(data))] ^= 1 << draw.randrange(8)
+        (out / name).write_bytes(data)
+        before = contents(out)
+        said = answer(verb, runs[0], out)
+        now, known = (files.sha256_of(path / name)[:12] for path in (out, runs[1]))
+        altered = f"{out / name}: was altered or replaced (sha256 {now}, in run.json {known}); egvs run makes it again"
+        assert said == altered
+        assert contents(out) == before, "a refused verb wrote something"
+
+
+@pytest.mark.parametrize(("name", "verb"), PAIRS)
+def test_a_file_of_another_run_is_refused(runs, out: Path, name: str, verb: str) -> None:
+    scenario, _, other = runs
+    shutil.copyfile(other / name, out / name)
+    assert f"{out / name}: was altered or replaced" in answer(verb, scenario, out)
+
+
+def test_a_file_that_no_stage_made_here_is_refused(runs, tmp_path: Path, egvs) -> None:
+    scenario, made, _ = runs
+    fresh = tmp_path / "fresh"
+    fresh.mkdir()
+    for name in ("trajectories.parquet", "statics.ply"):
+        shutil.copyfile(made / name, fresh / name)
+    code, _, error = egvs("tpog", scenario.folder, "--out", fresh)
+    what = "no stage that run.json knows of made it here; egvs run makes it again"
+    assert (code, error) == (2, f"egvs: {fresh / 'trajectories.parquet'}: {what}\n")
+    assert not (fresh / "tpog.parquet").exists()
+
+
+def test_the_run_that_the_message_asks_for_mends_it(runs, out: Path) -> None:
+    for name in READ_BY:
+        shutil.copyfile(runs[2] / name, out / name)
+    workflow.run(runs[0], out)
+    assert {name: contents(out)[name] for name in READ_BY} == {name: contents(runs[1])[name] for name in READ_BY}
+
+
+def test_stages_one_by_one_still_go_on_from_what_lies_there(runs, tmp_path: Path, egvs) -> None:
+    scenario, made, _ = runs
+    for verb in ("statics", "scan", "traffic", "tpog", "score", "report"):
+        code, _, error = egvs(verb, scenario.folder, "--out", tmp_path / "out")
+        assert code == 0, error
+    for name in READ_BY:
+        assert files.sha256_of(tmp_path / "out" / name) == files.sha256_of(made / name)
+
+
+def test_what_a_stage_read_is_known_though_its_maker_is_of_other_settings_now(runs, out: Path, egvs) -> None:
+    """Traffic of other settings is no longer what the scenario says, and its record goes; the file is still known."""
+    for _ in range(2):
+        code, _, error = egvs("score", runs[0].folder, "--out", out, "--set", "traffic.frames=20")
+        assert code == 0, error
+        assert "traffic" not in json.loads((out / "run.json").read_text())["stages"]
+
+
+def test_the_report_of_a_run_is_not_drawn_anew_of_altered_artefacts(runs, out: Path) -> None:
+    assert workflow.refresh_report(out) is not None
+    before = contents(out)["report.html"]
+    shutil.copyfile(runs[2] / "scores.parquet", out / "scores.parquet")
+    assert workflow.refresh_report(out) is None
+    assert contents(out)["report.html"] == before
+
+
+@pytest.mark.parametrize("name", ["trajectories.parquet", "tpog.parquet", "statics.ply"])
+def test_effects_are_tried_on_no_altered_traffic(runs, out: Path, name: str) -> None:
+    scene = scene_resolving.resolve(runs[0], world_of(Workspace(runs[0], out)))
+    assert Trials.of(scene, out) is not None
+    shutil.copyfile(runs[2] / name, out / name)
+    assert Trials.of(scene, out) is None
