@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from pipeline.core.strict_model import StrictModel
 from pipeline.scenario.types import Name, Positive
+
+_ATTRIBUTE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9]*")
+"""What an attribute of a vType may be called: it is written into XML as it stands."""
 
 
 class VehicleKind(StrictModel):
@@ -23,6 +27,14 @@ class VehicleKind(StrictModel):
     attributes: dict[str, str | float] = Field(
         default_factory=dict, description="Further attributes of the SUMO vType, under SUMO's own names"
     )
+
+    @field_validator("attributes")
+    @classmethod
+    def _named_as_in_sumo(cls, attributes: dict[str, str | float]) -> dict[str, str | float]:
+        for name in attributes:
+            if _ATTRIBUTE_NAME.fullmatch(name) is None:
+                raise ValueError(f"{name[:80]!r} is no attribute's name: letters and digits, as in SUMO's sigma")
+        return attributes
 
 
 EdgeId = Annotated[str, Field(min_length=1)]

@@ -10,11 +10,9 @@ compared exactly.
 
 from __future__ import annotations
 
-import os
-import shutil
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
@@ -23,7 +21,7 @@ import numpy as np
 
 from pipeline.core import files
 from pipeline.core.errors import InputError
-from pipeline.formats import osm, safe_xml
+from pipeline.formats import osm
 from pipeline.scenario.models import Scenario
 from pipeline.scenario.traffic import TrafficModel
 from pipeline.traffic import network, sumo
@@ -31,6 +29,8 @@ from pipeline.traffic.demand import counts
 from pipeline.traffic.demand import trips as demand
 from pipeline.traffic.extensions import TrafficExtension
 from pipeline.traffic.frames import Window
+from pipeline.traffic.guarded import configuration, copies
+from pipeline.traffic.guarded.configuration import Sources
 
 CONFIG, NETWORK, TRIPS, VTYPES = "run.sumocfg", "network.net.xml", "trips.rou.xml", "vtypes.add.xml"
 FCD, COLLISIONS, STOPS, LOG = "fcd.csv", "collisions.xml", "stops.xml", "sumo.log"
@@ -39,16 +39,6 @@ STATISTICS, DRIVEN = "statistics.xml", "driven.rou.xml"
 OTHERS, PERSONS, MAP = "others.rou.xml", "persons.csv", "map.osm.xml"
 """Route file of an extension (those of further ones count up), and what SUMO records of persons."""
 
-_SYNONYMS = {
-    "n": "net-file", "net": "net-file", "r": "route-files", "route": "route-files", "routes": "route-files",
-    "a": "additional-files", "additional": "additional-files", "b": "begin", "e": "end", "F": "weight-files",
-}  # fmt: skip
-_LEFT_OUT = {
-    "end", "random", "start", "quit-on-end", "human-readable-time", "verbose", "remote-port", "num-clients", "log",
-    "message-log", "error-log", "device.rerouting.threads", "precision", "configuration-file", "game", "demo",
-}  # fmt: skip
-_LEFT_OUT_STARTS = ("save-", "gui-", "osg-", "device.fcd.", "summary", "game.")
-_TRUE = {"true", "1", "yes", "on", "t", "x"}
 OSM_SIGNALS = (
     "--tls.guess-signals", "--tls.join", "--tls.default-type", "actuated", "--default.connection.cont-pos", "0",
 )  # fmt: skip
@@ -86,19 +76,6 @@ class Timing:
     def window(self) -> Window:
         """Every step of this time is recorded."""
         return Window(self.frames, self.period_ms, self.first_ms, complete=True)
-
-
-@dataclass(frozen=True)
-class Sources:
-    """The files that the traffic comes from: SUMO option -> files, and the other options of a user's configuration."""
-
-    files: dict[str, tuple[Path, ...]]
-    options: dict[str, str] = field(default_factory=dict)
-    begin_s: float = 0.0
-
-    def all(self) -> list[Path]:
-        """Every file, once."""
-        return list(dict.fromkeys(path for paths in self.files.values() for path in paths))
 
 
 def place_of(scenario: Scenario) -> str:
@@ -139,7 +116,7 @@ def sources(scenario: Scenario) -> Sources:
     """The files that a simulation reads; InputError when the scenario, or its configuration, names a missing one."""
     traffic = scenario.traffic
     if traffic.sumocfg is not None:
-        return _configured(scenario.find(traffic.sumocfg, "traffic.sumocfg"))
+        return configuration.read(scenario.find(traffic.sumocfg, "traffic.sumocfg"))
     assert traffic.network is not None
     files: dict[str, tuple[Path, ...]] = {"net-file": (scenario.find(traffic.network, "traffic.network"),)}
     if traffic.routes:
@@ -154,8 +131,7 @@ def network_path(scenario: Scenario) -> Path | None:
         return scenario.find(traffic.network, "traffic.network")
     if traffic.sumocfg is None:
         return None
-    config = scenario.find(traffic.sumocfg, "traffic.sumocfg")
-    return next((config.parent / value for key, value in _options(config) if key == "net-file" and value), None)
+    return configuration.network_path(scenario.find(traffic.sumocfg, "traffic.sumocfg"))
 
 
 def roads(scenario: Scenario) -> network.Network | None:
@@ -175,48 +151,6 @@ def may_have_heights(scenario: Scenario) -> bool:
     """Whether the network may go up and down: a quick look, so that for a flat one nothing more is read or imported."""
     path = network_path(scenario)
     return path is not None and network.may_have_heights(path)
-
-
-def _configured(path: Path) -> Sources:
-    """What a user's configuration names. Outputs and what the scenario decides itself are not taken over."""
-    files: dict[str, tuple[Path, ...]] = {}
-    options, begin_s = {}, 0.0
-    for key, value in _options(path):
-        pieces = tuple(path.parent / piece.strip() for piece in value.split(",") if piece.strip())
-        if key == "begin":
-            begin_s = _seconds(value, path)
-        elif key == "no-internal-links" and value.lower() in _TRUE:
-            what = "lets vehicles jump over junctions (up to 42 m)"
-            raise InputError(f"{path}: {key} = {value!r}", what, "remove it")
-        elif key in _LEFT_OUT or key.startswith(_LEFT_OUT_STARTS) or "output" in key:
-            continue
-        elif key.endswith(("-file", "-files")):
-            for missing in (piece for piece in pieces if not piece.is_file()):
-                what = f"no such file ({missing})"
-                raise InputError(f"{path}: {key} = {value!r}", what, "a path relative to the configuration")
-            files[key] = pieces
-        else:
-            options[key] = value
-    if "net-file" not in files:
-        raise InputError(path, "names no net-file", "<net-file value=.../> in its <input>")
-    return Sources(files, options, begin_s)
-
-
-def _options(path: Path) -> Iterator[tuple[str, str]]:
-    """Every option with its value; sections are only for readers."""
-    for child in safe_xml.children(path, ""):
-        for element in child.iter():
-            value = element.get("value", element.get("v"))
-            if value is not None:
-                yield _SYNONYMS.get(element.tag, element.tag), os.path.expandvars(value)
-
-
-def _seconds(value: str, path: Path) -> float:
-    try:
-        return float(value)
-    except ValueError:
-        right = "for example 25200 for seven o'clock"
-        raise InputError(f"{path}: begin = {value!r}", "is no number of seconds", right) from None
 
 
 @dataclass(frozen=True)
@@ -267,7 +201,7 @@ def prepare(scenario: Scenario, folder: Path, extensions: Iterable[TrafficExtens
     adding = [extension for extension in extensions if extension.ADDS_TRAFFIC]
     others = [OTHERS.replace("others", f"others{number or ''}") for number in range(len(adding))]
     folder.mkdir(parents=True, exist_ok=True)
-    named = _copies(given, folder, others)
+    named, left_out = _copies(given, folder, others)
     roads = network.read(folder / named["net-file"], given.files["net-file"][0])
     demand_seed, sumo_seed, *other_seeds = np.random.SeedSequence(scenario.seed).spawn(2 + len(adding))
     drawn, notes = traffic.sumocfg is None and not traffic.routes, []
@@ -294,7 +228,7 @@ def prepare(scenario: Scenario, folder: Path, extensions: Iterable[TrafficExtens
     if delay_s := traffic.max_depart_delay_s or (_DRAWN_DEPART_DELAY_S if drawn and not traffic.counts else None):
         options["max-depart-delay"] = f"{delay_s:g}"
     files.write_text(folder / CONFIG, _config_xml(options))
-    return Prepared(folder, options, when, roads, vehicles, drawn, bool(traffic.counts), bool(adding), notes)
+    return Prepared(folder, options, when, roads, vehicles, drawn, bool(traffic.counts), bool(adding), left_out + notes)
 
 
 def _settings(traffic: TrafficModel, when: Timing, seed: int) -> dict[str, str]:
@@ -340,28 +274,27 @@ def _draw(
     ]
 
 
-def _copies(given: Sources, folder: Path, others: Iterable[str]) -> dict[str, str]:
-    """Copy every file into the folder, so that it can be moved and opened elsewhere; ``others`` are taken names."""
-    taken, values = (
-        {CONFIG, TRIPS, VTYPES, FCD, COLLISIONS, STOPS, LOG, OTHERS, PERSONS, MAP, STATISTICS, DRIVEN, *others},
-        {},
-    )
+def _copies(given: Sources, folder: Path, others: Iterable[str]) -> tuple[dict[str, str], list[str]]:
+    """Copy every file into the folder, so that it can be moved and opened elsewhere; ``others`` are taken names.
+
+    The copies' names by option, and what was left out of them.
+    """
+    taken = {CONFIG, TRIPS, VTYPES, FCD, COLLISIONS, STOPS, LOG, OTHERS, PERSONS, MAP, STATISTICS, DRIVEN, *others}
+    values, notes = {}, []
     for option, paths in given.files.items():
         names = []
         for path in paths:
-            name = path.name.replace(",", "_")
-            if option == "net-file":
-                name = NETWORK + (".gz" if safe_xml.is_gzip(path) and not network.is_osm(path) else "")
+            name = NETWORK if option == "net-file" else copies.safe_name(path.name)
             while name in taken:
                 name = f"_{name}"
             taken.add(name)
             if option == "net-file" and network.is_osm(path):
                 convert_osm(path, folder / name)
             else:
-                shutil.copyfile(path, folder / name)
+                notes += copies.copy(path, folder / name)
             names.append(name)
         values[option] = ",".join(names)
-    return values
+    return values, notes
 
 
 def convert_osm(path: Path, network_path: Path) -> None:
@@ -374,12 +307,12 @@ def _converted(path: Path, _content: str) -> bytes:
     """The network of a map, converted once for the check and the traffic."""
     with tempfile.TemporaryDirectory(prefix="egvs-map-") as temporary:
         folder = Path(temporary)
-        source = os.path.relpath(path, folder)
         if osm.is_pbf(path):  # netconvert reads XML only
             osm.write_xml(path, folder / MAP)
-            source = MAP
+        else:
+            copies.copy(path, folder / MAP)
         try:
-            sumo.run("netconvert", ["--osm-files", source, *_OSM_FLAGS, "-o", NETWORK], folder)
+            sumo.run("netconvert", ["--osm-files", MAP, *_OSM_FLAGS, "-o", NETWORK], folder)
         except sumo.RefusedError as error:
             raise InputError(
                 path, f"is no map that streets can be made of: {error}", "a whole map; fetch it again"

@@ -1,0 +1,198 @@
+"""Reads of a user's SUMO configuration what may be taken over.
+
+SUMO writes wherever an option tells it to, so an option is taken over only where it is known to change nothing but the
+traffic: :data:`FILES` are files that it reads, :data:`TAKEN` are numbers, names and switches. What only writes, shows
+or tells, and what the scenario decides itself, is left out. Any other option is an error: unheard, it might change the
+traffic.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pipeline.core.errors import InputError
+from pipeline.formats import safe_xml
+
+_SYNONYMS = {
+    "n": "net-file", "net": "net-file", "r": "route-files", "route": "route-files", "routes": "route-files",
+    "a": "additional-files", "additional": "additional-files", "b": "begin", "e": "end", "w": "weight-files",
+    "weights": "weight-files", "x": "weight-attribute", "measure": "weight-attribute", "s": "route-steps",
+}  # fmt: skip
+
+FILES = ("net-file", "route-files", "additional-files", "weight-files")
+"""Options that name files which SUMO reads; each is read here first."""
+
+_TAKEN = """
+    weight-attribute junction-taz
+
+    step-method.ballistic extrapolate-departpos route-steps ignore-junction-blocker ignore-route-errors
+    ignore-accidents intermodal-collision.action collision.stoptime intermodal-collision.stoptime
+    collision.check-junctions.mingap collision.mingap-factor keep-after-arrival max-num-vehicles max-num-persons
+    max-num-teleports scale scale-suffix time-to-teleport.highways time-to-teleport.highways.min-speed
+    time-to-teleport.disconnected time-to-teleport.remove time-to-teleport.remove-constraint time-to-teleport.ride
+    time-to-teleport.bidi time-to-teleport.railsignal-deadlock waiting-time-memory startup-wait-threshold
+    max-depart-delay sloppy-insert eager-insert emergency-insert insertion-checks random-depart-offset
+    lanechange.duration lanechange.overtake-right tls.all-off tls.actuated.show-detectors tls.actuated.jam-threshold
+    tls.actuated.detector-length tls.delay_based.detector-range tls.yellow.min-decel railsignal-moving-block
+    railsignal.moving-block.default-classes railsignal.moving-block.max-dist railsignal.max-block-length
+    railsignal.default-classes slope-centered time-to-impatience default.departspeed default.departlane
+    default.action-step-length default.carfollowmodel default.speeddev default.emergencydecel overhead-wire.solver
+    overhead-wire.recuperation overhead-wire.substation-current-limits emergencydecel.warning-threshold
+    parking.maneuver use-stop-ended use-stop-started pedestrian.model pedestrian.timegap-crossing
+    pedestrian.striping.stripe-width pedestrian.striping.dawdling pedestrian.striping.mingap-to-vehicle
+    pedestrian.striping.jamtime pedestrian.striping.jamtime.crossing pedestrian.striping.jamtime.narrow
+    pedestrian.striping.jamfactor pedestrian.striping.reserve-oncoming pedestrian.striping.reserve-oncoming.junctions
+    pedestrian.striping.reserve-oncoming.max pedestrian.striping.legacy-departposlat
+    pedestrian.striping.walkingarea-detail ride.stop-tolerance mapmatch.distance mapmatch.junctions mapmatch.taz
+    weights.turnaround-penalty weights.reversal-penalty persontrip.walk-opposite-factor
+
+    routing-algorithm weights.random-factor weights.random-factor.dynamic weights.minor-penalty weights.tls-penalty
+    weights.priority-factor weights.separate-turns persontrip.walkfactor persontrip.transfer.car-walk
+    persontrip.transfer.taxi-walk persontrip.transfer.walk-taxi persontrip.default.group persontrip.taxi.waiting-time
+    persontrip.ride-public-line railway.max-train-length replay-rerouting device.rerouting.probability
+    device.rerouting.explicit device.rerouting.deterministic device.rerouting.period device.rerouting.pre-period
+    device.rerouting.adaptation-weight device.rerouting.adaptation-steps device.rerouting.adaptation-interval
+    device.rerouting.cch-update-threshold.factor device.rerouting.cch-update-threshold.constant
+    device.rerouting.cch-ensemble device.rerouting.threshold.factor device.rerouting.threshold.constant
+    device.rerouting.invalidation device.rerouting.with-taz device.rerouting.mode
+    device.rerouting.init-with-loaded-weights device.rerouting.synchronize device.rerouting.railsignal
+    device.rerouting.bike-speeds person-device.rerouting.probability person-device.rerouting.explicit
+    person-device.rerouting.deterministic person-device.rerouting.period person-device.rerouting.mode
+    person-device.rerouting.scope
+
+    device.battery.probability device.battery.explicit device.battery.deterministic device.battery.track-fuel
+    device.stationfinder.probability device.stationfinder.explicit device.stationfinder.deterministic
+    device.stationfinder.rescueTime device.stationfinder.rescueAction device.stationfinder.reserveFactor
+    device.stationfinder.emptyThreshold device.stationfinder.radius device.stationfinder.maxEuclideanDistance
+    device.stationfinder.repeat device.stationfinder.chargeType device.stationfinder.waitForCharge
+    device.stationfinder.minOpportunityDuration device.stationfinder.saturatedChargeLevel
+    device.stationfinder.needToChargeLevel device.stationfinder.opportunisticChargeLevel
+    device.stationfinder.replacePlannedStop device.stationfinder.maxDistanceToReplacedStop
+    device.stationfinder.chargingStrategy device.stationfinder.checkEnergyForRoute device.elechybrid.probability
+    device.elechybrid.explicit device.elechybrid.deterministic
+
+    device.toc.probability device.toc.explicit device.toc.deterministic device.toc.manualType device.toc.automatedType
+    device.toc.responseTime device.toc.recoveryRate device.toc.lcAbstinence device.toc.initialAwareness
+    device.toc.mrmDecel device.toc.dynamicToCThreshold device.toc.dynamicMRMProbability device.toc.mrmKeepRight
+    device.toc.mrmSafeSpot device.toc.mrmSafeSpotDuration device.toc.maxPreparationAccel
+    device.toc.ogNewTimeHeadway device.toc.ogNewSpaceHeadway device.toc.ogMaxDecel device.toc.ogChangeRate
+    device.toc.useColorScheme device.driverstate.probability device.driverstate.explicit
+    device.driverstate.deterministic device.driverstate.initialAwareness
+    device.driverstate.errorTimeScaleCoefficient device.driverstate.errorNoiseIntensityCoefficient
+    device.driverstate.speedDifferenceErrorCoefficient device.driverstate.headwayErrorCoefficient
+    device.driverstate.freeSpeedErrorCoefficient device.driverstate.speedDifferenceChangePerceptionThreshold
+    device.driverstate.headwayChangePerceptionThreshold device.driverstate.minAwareness
+    device.driverstate.maximalReactionTime device.bluelight.probability device.bluelight.explicit
+    device.bluelight.deterministic device.bluelight.reactiondist device.bluelight.mingapfactor
+    device.taxi.probability device.taxi.explicit device.taxi.deterministic device.taxi.dispatch-algorithm
+    device.taxi.dispatch-algorithm.params device.taxi.dispatch-period device.taxi.dispatch-keep-unreachable
+    device.taxi.idle-algorithm device.taxi.vclasses device.glosa.probability device.glosa.explicit
+    device.glosa.deterministic device.glosa.range device.glosa.max-speedfactor device.glosa.min-speed
+    device.glosa.add-switchtime device.glosa.use-queue device.glosa.override-safety device.glosa.ignore-cfmodel
+    device.friction.probability device.friction.explicit device.friction.deterministic device.friction.stdDev
+    device.friction.offset
+
+    mesosim meso-ltm meso-edgelength meso-tauff meso-taufj meso-taujf meso-taujj meso-jam-threshold meso-multi-queue
+    meso-lane-queue meso-ignore-lanes-by-vclass meso-junction-control meso-junction-control.limited meso-tls-penalty
+    meso-tls-flow-penalty meso-minor-penalty meso-overtaking meso-recheck meso-interpolate-pos thread-rngs
+"""
+TAKEN = frozenset(_TAKEN.split())
+"""Options that change the traffic and neither read nor write a file."""
+
+_SILENT = """
+    end random seed step-length threads lateral-resolution time-to-teleport collision.action collision.check-junctions
+    precision precision.geo human-readable-time verbose v print-options no-step-log step-log.period
+    duration-log.disable duration-log.statistics t no-warnings W suppress-warnings aggregate-warnings log l log-file
+    device.toc.file message-log error-log log.timestamps log.processid language write-license write-metadata
+    netstate-dump netstate ndump netstate-dump.empty-edges netstate-dump.precision
+    tripinfo vehroutes vehroute summary emissions configuration-file c C remote-port num-clients
+    device.rerouting.threads routing-threads phemlight-path phemlight-year phemlight-temperature
+    pedestrian.jupedsim.wkt pedestrian.jupedsim.wkt.geo pedestrian.jupedsim.py
+    quit-on-end Q start S delay d breakpoints B game G game.mode demo D edgedata-files m alternative-net-file N
+    selection-file disable-textures T registry-viewport window-size window-pos tracker-interval osg-view
+    begin no-internal-links
+"""
+_LEFT_OUT = frozenset(_SILENT.split())
+_LEFT_OUT_STARTS = (
+    "save-", "gui-", "osg-", "summary", "xml-validation", "emissions.", "device.fcd.", "person-device.fcd.",
+    "device.ssm.", "device.emissions.", "device.tripinfo.", "device.vehroute.", "device.btreceiver.",
+    "device.btsender.", "person-device.btsender.", "person-device.btreceiver.", "device.example.",
+)  # fmt: skip
+"""What only writes, shows or tells, or is the scenario's to decide: nothing is lost without it."""
+
+_TRUE = {"true", "1", "yes", "on", "t", "x"}
+
+
+@dataclass(frozen=True)
+class Sources:
+    """The files that the traffic comes from: SUMO option -> files, and the other options of a user's configuration."""
+
+    files: dict[str, tuple[Path, ...]]
+    options: dict[str, str] = field(default_factory=dict)
+    begin_s: float = 0.0
+
+    def all(self) -> list[Path]:
+        """Every file, once."""
+        return list(dict.fromkeys(path for paths in self.files.values() for path in paths))
+
+
+def network_path(path: Path) -> Path | None:
+    """The network that the configuration ``path`` names; None where it names none."""
+    return next((path.parent / value for key, value in _options(path) if key == "net-file" and value), None)
+
+
+def read(path: Path) -> Sources:
+    """What is taken over of the configuration ``path``.
+
+    InputError when it names no network, a file that is missing, or an option that is not known to be harmless.
+    """
+    files: dict[str, tuple[Path, ...]] = {}
+    options, begin_s = {}, 0.0
+    for key, value in _options(path):
+        if key == "begin":
+            begin_s = _seconds(value, path)
+        elif key == "no-internal-links" and value.lower() in _TRUE:
+            what = "lets vehicles jump over junctions (up to 42 m)"
+            raise InputError(f"{path}: {key} = {value!r}", what, "remove it")
+        elif key in FILES:
+            files[key] = _files(path, key, value)
+        elif key in TAKEN:
+            options[key] = value
+        elif value and not _is_left_out(key):
+            what = "is no option of SUMO that is taken over"
+            raise InputError(f"{path}: {key} = {value!r}", what, "remove it; docs/security.md says which are")
+    if "net-file" not in files:
+        raise InputError(path, "names no net-file", "<net-file value=.../> in its <input>")
+    return Sources(files, options, begin_s)
+
+
+def _is_left_out(key: str) -> bool:
+    return key in _LEFT_OUT or key.startswith(_LEFT_OUT_STARTS) or "output" in key
+
+
+def _files(path: Path, key: str, value: str) -> tuple[Path, ...]:
+    pieces = tuple(path.parent / piece.strip() for piece in value.split(",") if piece.strip())
+    for missing in (piece for piece in pieces if not piece.is_file()):
+        what = f"no such file ({missing})"
+        raise InputError(f"{path}: {key} = {value!r}", what, "a path relative to the configuration")
+    return pieces
+
+
+def _options(path: Path) -> Iterator[tuple[str, str]]:
+    """Every option with its value; sections are only for readers."""
+    for child in safe_xml.children(path, ""):
+        for element in child.iter():
+            value = element.get("value", element.get("v"))
+            if value is not None:
+                yield _SYNONYMS.get(element.tag, element.tag), os.path.expandvars(value)
+
+
+def _seconds(value: str, path: Path) -> float:
+    try:
+        return float(value)
+    except ValueError:
+        right = "for example 25200 for seven o'clock"
+        raise InputError(f"{path}: begin = {value!r}", "is no number of seconds", right) from None

@@ -1,0 +1,53 @@
+"""Does SUMO read what was read here, and nothing else?"""
+
+import gzip
+from xml.etree.ElementTree import parse
+
+import pytest
+
+from pipeline.formats import safe_xml
+from pipeline.traffic.guarded import copies
+
+TEXT = '<?xml version="1.0" encoding="{}"?>\n<!-- note --><routes a="1"><route id="通り" edges="a  b"/></routes>\n'
+
+
+def told(path):
+    return [(e.tag, e.attrib, [c.attrib for c in e]) for e in safe_xml.children(path, "")]
+
+
+def test_a_harmless_file_is_copied_byte_for_byte_and_unzipped(tmp_path):
+    data = TEXT.format("UTF-8").encode()
+    (tmp_path / "a.xml").write_bytes(data)
+    (tmp_path / "b.xml.gz").write_bytes(gzip.compress(data))
+    for name in ("a.xml", "b.xml.gz"):
+        assert copies.copy(tmp_path / name, tmp_path / "copy.xml") == []
+        assert (tmp_path / "copy.xml").read_bytes() == data
+
+
+@pytest.mark.parametrize("encoding", ["UTF-16", "iso-8859-1", "windows-1252"])
+def test_another_encoding_becomes_utf8(tmp_path, encoding):
+    data = TEXT.format(encoding).replace("通り", "é").encode(encoding)
+    (tmp_path / "a.xml").write_bytes(data)
+    copies.copy(tmp_path / "a.xml", tmp_path / "copy.xml")
+    assert (tmp_path / "copy.xml").read_bytes().decode() == '<routes a="1">\n<route id="é" edges="a  b" /></routes>\n'
+
+
+def test_a_rewritten_file_says_the_same_but_for_its_outputs(tmp_path):
+    text = (
+        '<additional v="&lt;&quot;"><a x="1&amp;&#10;2"><b file="f"/><b/></a><c>t</c>'
+        '<param key="x.file" value="f"/></additional>'
+    )
+    (tmp_path / "a.xml").write_text(text)
+    assert copies.copy(tmp_path / "a.xml", tmp_path / "copy.xml") == [
+        "a.xml: SUMO's outputs that it asks for are not written: 1 of <b>, 1 of <param>"
+    ]
+    assert told(tmp_path / "copy.xml") == [
+        ("a", {"x": "1&\n2"}, [{"file": "NUL"}, {}]),
+        ("c", {}, []),
+        ("param", {"key": "x.file", "value": "NUL"}, []),
+    ]
+    assert parse(tmp_path / "copy.xml").getroot().attrib == {"v": '<"'}
+
+
+def test_names_that_sumo_would_read_as_more_are_changed():
+    assert copies.safe_name("a,b;${HOME}.rou.xml") == "a_b__{HOME}.rou.xml"
