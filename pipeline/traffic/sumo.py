@@ -25,6 +25,7 @@ from typing import IO, Any
 
 from pipeline.core.errors import InputError, MissingBackendError, RunError
 from pipeline.core.sumo_home import sumo_home
+from pipeline.traffic.guarded import confined
 
 APT_LINE = "apt-get install libatomic1 libx11-6 libxext6 libxrender1 libgl1"
 """What SUMO's binaries need on a minimal Debian."""
@@ -119,13 +120,8 @@ def run(
     log = log or Path(os.devnull)
     with log.open("wb") as errors:
         capture = subprocess.PIPE if str(log) == os.devnull else errors
-        process = _start(name, arguments, folder, subprocess.PIPE, capture)
-        with process:
-            try:
-                printed, complaint = _wait(process, watch)
-            except BaseException:
-                process.kill()
-                raise
+        with _started(name, arguments, folder, subprocess.PIPE, capture) as process:
+            printed, complaint = _wait(process, watch)
     if process.returncode:
         text = complaint if capture == subprocess.PIPE else log.read_bytes()
         raise failure(name, process.returncode, (text or b"").decode("utf-8", "replace"))
@@ -147,12 +143,30 @@ def run_tool(name: str, arguments: Sequence[str], folder: Path) -> str:
     return done.stdout.decode("utf-8", "replace")
 
 
-def _start(name: str, arguments: Sequence[str], folder: Path, printed: Any, complaints: Any) -> subprocess.Popen[bytes]:
-    program, streams = binary(name), {"stdin": subprocess.DEVNULL, "stdout": printed, "stderr": complaints}
+@contextmanager
+def _started(
+    name: str, arguments: Sequence[str], folder: Path, printed: Any, complaints: Any
+) -> Iterator[subprocess.Popen[bytes]]:
+    """A program that ends with the block, and with this process. It may write in its folder only."""
+    launcher = [sys.executable, "-I", "-S", confined.__file__, os.curdir, str(os.getpid())]
+    reading, holding = os.pipe()
     try:
-        return subprocess.Popen([str(program), *arguments], cwd=folder, env=environment(), **streams)
-    except OSError as error:
-        raise MissingBackendError(f"{program} cannot be started: {error.strerror}") from None
+        process = subprocess.Popen(
+            [*launcher, str(binary(name)), *arguments], cwd=folder, env=environment(), stdin=reading, stdout=printed,
+            stderr=complaints,
+        )  # fmt: skip
+    except BaseException:
+        os.close(holding)
+        raise
+    finally:
+        os.close(reading)
+    with process:
+        try:
+            yield process
+        finally:
+            os.close(holding)
+            if confined.BECOMES_THE_PROGRAM:  # else the launcher kills it now
+                process.kill()
 
 
 def _wait(process: subprocess.Popen[bytes], watch: Callable[[], None] | None) -> tuple[bytes, bytes]:
@@ -173,6 +187,8 @@ def failure(name: str, code: int, text: str) -> RunError:
             f"{name} cannot start, the system library {library} is missing; on Debian: {APT_LINE}"
         )
     lines = [line.strip() for line in text.splitlines() if line.strip()]
+    if code == confined.CANNOT_START:
+        return MissingBackendError(f"{name} cannot be started: {(lines or ['this process has ended'])[-1]}")
     errors = [line for line in lines if not line.startswith(("Warning", "Quitting", "pj_obj_create"))] or lines[-1:]
     how = f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
     kind = RunError if code < 0 else RefusedError
@@ -218,8 +234,8 @@ def served(arguments: Sequence[str], folder: Path) -> Iterator[Any]:
     port = getFreeSocketPort()
     # a file, because SUMO would wait for ever on a full pipe that nobody reads
     with tempfile.TemporaryFile() as complaints:
-        process = _start("sumo", [*arguments, "--remote-port", str(port)], folder, subprocess.DEVNULL, complaints)
-        with process:
+        flags = [*arguments, "--remote-port", str(port)]
+        with _started("sumo", flags, folder, subprocess.DEVNULL, complaints) as process:
             try:
                 connection = _attach(process, port)
                 try:
@@ -228,8 +244,6 @@ def served(arguments: Sequence[str], folder: Path) -> Iterator[Any]:
                     _close(connection)
             except traci.exceptions.FatalTraCIError:
                 raise _hung_up(process, complaints) from None
-            finally:
-                process.kill()
 
 
 def _hung_up(process: subprocess.Popen[bytes], complaints: IO[bytes]) -> RunError:

@@ -10,6 +10,7 @@ compared exactly.
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -200,7 +201,7 @@ def prepare(scenario: Scenario, folder: Path, extensions: Iterable[TrafficExtens
     when = timing(traffic, given.begin_s, place)
     adding = [extension for extension in extensions if extension.ADDS_TRAFFIC]
     others = [OTHERS.replace("others", f"others{number or ''}") for number in range(len(adding))]
-    folder.mkdir(parents=True, exist_ok=True)
+    _make_fresh(folder, given)
     named, left_out = _copies(given, folder, others)
     roads = network.read(folder / named["net-file"], given.files["net-file"][0])
     demand_seed, sumo_seed, *other_seeds = np.random.SeedSequence(scenario.seed).spawn(2 + len(adding))
@@ -229,6 +230,19 @@ def prepare(scenario: Scenario, folder: Path, extensions: Iterable[TrafficExtens
         options["max-depart-delay"] = f"{delay_s:g}"
     files.write_text(folder / CONFIG, _config_xml(options))
     return Prepared(folder, options, when, roads, vehicles, drawn, bool(traffic.counts), bool(adding), left_out + notes)
+
+
+def _make_fresh(folder: Path, given: Sources) -> None:
+    """An empty folder, so that nothing of an earlier run, nor a SUMO that still writes, gets into this one."""
+    for path in given.all():
+        if path.resolve().is_relative_to(folder.resolve()):
+            what = "lies in the folder that is made anew for SUMO"
+            raise InputError(path, what, "another --out, or the file elsewhere")
+    if folder.is_symlink():
+        folder.unlink()
+    elif folder.exists():
+        shutil.rmtree(folder)
+    folder.mkdir(parents=True)
 
 
 def _settings(traffic: TrafficModel, when: Timing, seed: int) -> dict[str, str]:

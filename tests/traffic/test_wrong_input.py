@@ -139,3 +139,23 @@ def test_traci_beside_a_finished_file_is_refused(tmp_path):
     (tmp_path / "f.csv").write_text("x")
     with pytest.raises(InputError, match="--traci: the scenario names a finished FCD file"):
         run_stage(traffic, scenario(tmp_path, fcd="f.csv"), tmp_path, traci=("localhost", 1))
+
+
+def test_a_file_in_the_folder_that_is_made_anew_is_kept(town, tmp_path):
+    own = tmp_path / "sumo" / "net.xml"
+    own.parent.mkdir()
+    shutil.copy(town / "net.xml", own)
+    with pytest.raises(InputError, match=r"sumo/net\.xml: lies in the folder that is made anew for SUMO; another"):
+        run_stage(traffic, scenario(tmp_path, network="sumo/net.xml"), tmp_path)
+    assert own.is_file()
+
+
+def test_what_an_earlier_run_left_is_gone(town, tmp_path):
+    left = tmp_path / "sumo" / "fcd.csv"
+    left.parent.mkdir()
+    left.write_text("another run's")
+    keys = {"network": "net.xml", "frames": 2, "warmup_s": 0.0, "vehicles": 1, "hold": "at_most"}
+    with left.open("a") as still_written:
+        run_stage(traffic, scenario(town, **keys), tmp_path)
+        still_written.write("more")
+    assert not left.exists() and (tmp_path / "trajectories.parquet").is_file()

@@ -1,0 +1,87 @@
+"""Does SUMO write in its own folder alone, and end with the process that started it?"""
+
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pipeline.core.errors import RunError
+from pipeline.traffic import sumo
+from pipeline.traffic.guarded import confined
+
+LINUX = sys.platform.startswith("linux")
+
+
+def has_landlock():
+    return LINUX and ctypes.CDLL(None).syscall(444, None, ctypes.c_size_t(0), ctypes.c_uint32(1)) >= 1
+
+
+def fake_sumo(folder, monkeypatch, script):
+    path = folder / "sumo"
+    path.write_text(f"#!/bin/sh\n{script}\n")
+    path.chmod(0o755)
+    monkeypatch.setenv("SUMO_BINARY", str(path))
+
+
+@pytest.mark.skipif(not has_landlock(), reason="this kernel has no Landlock")
+def test_sumo_cannot_write_outside_its_folder(tmp_path, monkeypatch):
+    own, foreign = tmp_path / "own", tmp_path / "foreign"
+    own.mkdir()
+    foreign.write_text("kept")
+    monkeypatch.setattr(sumo, "environment", lambda: dict(os.environ))
+    for attempt in (f"echo x > {foreign}", "echo x > ../new", f"rm {foreign}", f"mv {foreign} here", "mkdir ../new"):
+        fake_sumo(tmp_path, monkeypatch, f"echo mine > mine && echo gone > /dev/null || exit 3\n{attempt} || exit 9")
+        with pytest.raises(RunError, match=r"sumo ended with exit code [29]"):
+            sumo.run("sumo", [], own)
+        assert ((own / "mine").read_text(), foreign.read_text()) == ("mine\n", "kept")
+        assert not (tmp_path / "new").exists()
+
+
+PARENT = """
+import sys
+from pathlib import Path
+from pipeline.traffic import sumo
+sumo.run("sumo", [], Path(sys.argv[1]))
+"""
+
+
+@pytest.mark.skipif(not LINUX, reason="elsewhere the launcher watches a pipe")
+def test_sumo_ends_with_a_killed_parent(tmp_path, monkeypatch):
+    os.mkfifo(tmp_path / "alive")
+    fake_sumo(tmp_path, monkeypatch, "exec 3> alive; echo $$ >&3; while :; do :; done")
+    parent = subprocess.Popen([sys.executable, "-c", PARENT, str(tmp_path)])
+    with (tmp_path / "alive").open() as alive, parent:
+        assert int(alive.readline()) > 0
+        parent.send_signal(signal.SIGKILL)
+        assert alive.read() == ""  # the end comes when nobody holds the other end any more: when the child is dead
+
+
+WATCHED = """
+import sys
+from pipeline.traffic.guarded import confined
+sys.exit(confined.watched(sys.argv[1:]))
+"""
+
+
+def test_a_watched_program_ends_with_the_pipe():
+    command = [sys.executable, "-c", WATCHED, "/bin/sh", "-c", "echo runs; while :; do :; done"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as launcher:
+        assert launcher.stdin is not None and launcher.stdout is not None
+        assert launcher.stdout.readline() == b"runs\n"
+        launcher.stdin.close()
+        assert launcher.stdout.read() == b""
+    assert launcher.returncode != 0
+
+
+def test_a_watched_programs_exit_code_is_told():
+    command = [sys.executable, "-c", WATCHED, "/bin/sh", "-c", "exit 5"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE) as launcher:
+        assert launcher.wait() == 5
+
+
+def test_the_launcher_needs_nothing_of_the_program():
+    assert "pipeline" not in Path(confined.__file__).read_text().split('"""', 2)[2]
