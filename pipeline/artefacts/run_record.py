@@ -113,4 +113,4 @@ class RunRecord:
     def write(self, folder: Path) -> None:
         """Write ``folder / "run.json"``."""
         value = {**self.__dict__, "stages": {name: stage.to_json() for name, stage in self.stages.items()}}
-        files.write_text(folder / RECORD, json.dumps(value, indent=2, ensure_ascii=False) + "\n")
+        files.write_text(folder / RECORD, files.json_text(value, indent=2) + "\n")

@@ -76,8 +76,13 @@ def digests(scenario: Scenario, candidates: Iterable[Site]) -> dict[str, str]:
     """
     found = {f"{key} = {name}": _digest(scenario, key, name) for key, name in named(scenario)}
     found |= {f"{key} = {name}": _presence(scenario, key, name) for key, name in measured(candidates)}
-    paths = [path for alone in scenario.by_period().values() for path in _configured(alone)]
+    paths = configured(scenario)
     return found | {f"{number}: {path.name}": files.sha256_of(path) for number, path in enumerate(paths)}
+
+
+def configured(scenario: Scenario) -> list[Path]:
+    """What the configurations of SUMO name, of all periods."""
+    return [path for alone in scenario.by_period().values() for path in _configured(alone)]
 
 
 def _configured(scenario: Scenario) -> list[Path]:

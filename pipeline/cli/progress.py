@@ -28,9 +28,13 @@ class Screen:
     def __init__(self, verb: str = "") -> None:
         self.any_stage_ran = False
         self._stage = verb
-        self._console = Console(stderr=True, highlight=False, soft_wrap=True)
+        self._console = Console(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=True)
         self._bar = Progress(
-            TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=self._console, transient=True
+            TextColumn("{task.description}", markup=False),  # names may have brackets
+            BarColumn(),
+            TimeElapsedColumn(),
+            console=self._console,
+            transient=True,
         )
         self._task = self._bar.add_task("", total=None, visible=False)
         self._has_bar = sys.stderr.isatty()
@@ -83,4 +87,4 @@ class Screen:
 
     def say(self, line: str) -> None:
         """Print a line, above the bar."""
-        self._console.print(line, markup=False)
+        self._console.print(line)

@@ -14,6 +14,7 @@ from pipeline.artefacts.period_ranking import PeriodRanking
 from pipeline.artefacts.readers import SEPARABLE
 from pipeline.artefacts.run_record import RunRecord
 from pipeline.cli.terminal import NARROW, WIDE, console, in_words, table, value_in_words
+from pipeline.core.findings import warnings_of
 from pipeline.report.evidence import disagreement, setting_of
 from pipeline.report.ranking import ScoredSite, beside, poles_of
 from pipeline.report.score_words import SCORES, ScoreWords
@@ -158,13 +159,17 @@ def _in_sentences(folder: Path, record: RunRecord, sites: Sequence[ScoredSite]) 
     if first and best is not None and best.by.counts_vehicles and "weights" in about:
         first[0] += ", which are weighted"
     hidden = "moving_occlusion" in record.scenario.get("effects", {})
-    other = disagreement(sites, setting_of(about["gamma"], about["grid"]["voxel_m"], moving_occlusion=hidden))
+    other = disagreement(sites, setting_of(float(about["gamma"]), about["grid"]["voxel_m"], moving_occlusion=hidden))
     return [*first, *([other] if other else [])]
 
 
 def _print_scores(out: Console, folder: Path, record: RunRecord, top: int | None) -> None:
     """The ranking of the ``top`` sites, the best of each pole, and the audit's worst case where there was one."""
     sites = ScoredSite.read(folder / "scores.parquet")
+    if not any(site.score > 0 for site in sites):
+        for warning in warnings_of([record.stages["score"].summary]):
+            out.print(str(warning))
+        return
     out.print(ranking_table(sites, out.width, top))
     for line in _in_sentences(folder, record, sites):
         out.print(line)

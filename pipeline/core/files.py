@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ def aside(path: Path) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.partial")
     _refuse_folder(path)
+    partial.unlink(missing_ok=True)  # what a killed run left, or a link: nothing is written through one
     try:
         yield partial
         partial.replace(path)
@@ -73,4 +75,22 @@ def hash_of(value: Any) -> str:
 
 def canonical_json(value: Any) -> bytes:
     """A JSON value as bytes that do not depend on the order of its keys."""
-    return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False).encode("utf-8")
+    return json_text(value, sort_keys=True, separators=(",", ":")).encode("utf-8")
+
+
+def json_text(value: Any, **how: Any) -> str:
+    """A JSON value as text, written as :func:`json.dumps` is told; "inf", "-inf" and "nan" stand for the numbers that
+    JSON does not know.
+    """
+    try:
+        return json.dumps(value, ensure_ascii=False, allow_nan=False, **how)
+    except ValueError:
+        return json.dumps(_with_words(value), ensure_ascii=False, allow_nan=False, **how)
+
+
+def _with_words(value: Any) -> Any:
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    if isinstance(value, Mapping):
+        return {key: _with_words(part) for key, part in value.items()}
+    return [_with_words(part) for part in value] if isinstance(value, list | tuple) else value

@@ -142,6 +142,8 @@ def run(work: Workspace, inputs: StageInputs) -> Summary:
     files.write_text(work.path(ARTEFACTS[0]), html)
     work.progress("page written", 3, 3)
     kilobytes = round(len(html.encode("utf-8")) / 1000)
+    if not ranking.sites[0].score > 0:  # which is no ranking
+        return {"kilobytes": kilobytes}
     return {"best": ranking.sites[0].site, "worst": ranking.last.site, "kilobytes": kilobytes}
 
 

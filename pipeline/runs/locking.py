@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 from collections.abc import Iterator
@@ -18,8 +19,11 @@ def alone(folder: Path) -> Iterator[None]:
     store_settings.keep_out(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        lock = (folder / ".lock").open("w")
+        lock = os.fdopen(os.open(folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666))
     except OSError as error:
+        if error.errno == errno.ELOOP:
+            found = "is a symbolic link, and nothing is written through one"
+            raise InputError(folder / ".lock", found, "remove it") from None
         raise InputError(folder, f"cannot be written ({error.strerror})", "a folder of yours") from None
     with lock:
         if not _take(lock.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB):

@@ -24,6 +24,7 @@ from pipeline.core.errors import InputError
 from pipeline.core.progress import Progress, silent
 from pipeline.core.version import __version__
 from pipeline.runs import stage_keys, stages
+from pipeline.runs.guarding import keep_inputs
 from pipeline.runs.locking import alone
 from pipeline.runs.stage_keys import Inputs
 from pipeline.runs.stages import Made
@@ -72,6 +73,7 @@ def run(
         What ``run.json`` holds.
     """
     folder = Path(out) if out is not None else default_folder(scenario)
+    keep_inputs(scenario, folder)
     with alone(folder):
         run = _Run(Workspace(scenario, folder, jobs=jobs, progress=progress), listener)
         record = _record_so_far(scenario, folder)
@@ -91,6 +93,7 @@ def run_one(
     **options: Any,
 ) -> RunRecord:
     """Run a single stage, whether its inputs changed or not, and note it in ``run.json``."""
+    keep_inputs(scenario, out)
     with alone(out):
         record = _record_so_far(scenario, out)
         work = Workspace(scenario, out, jobs=jobs, progress=progress, recorded=stages.recorded(record))

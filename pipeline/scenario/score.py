@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+import math
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator
 
@@ -96,6 +97,11 @@ class ScoreModel(StrictModel):
     )
     blindspots: bool = Field(True, description="Write blindspots.parquet: where each site misses vehicles")
     standard_error: bool = Field(True, description="Say how far each score may be off because the traffic was short")
+
+    @field_validator("gamma", mode="before")
+    @classmethod
+    def _from_json(cls, gamma: Any) -> Any:
+        return math.inf if gamma == "inf" else gamma
 
     @field_validator("others")
     @classmethod

@@ -155,7 +155,8 @@ def run(
     apart = [other for other in others if other.name != "entropy_seen"]
     limits = scorer.limits_by_period
     period_scores.write(work.path(ARTEFACTS[2]), names, worths, ranking, apart, periods, limits, about)
-    best = [name for name, rank in zip(names, ranking.rank, strict=True) if rank == 1]
+    nothing = ranking.nothing(work.scenario.gamma, scorer.limit)
+    best = [] if nothing else [name for name, rank in zip(names, ranking.rank, strict=True) if rank == 1]
     summary: Summary = {"sites": len(done), "best": best, "rank_by": wanted.rank_by, "egvs_limit": scorer.limit}
     if wanted.weights.are_given:
         summary["weights"] = wanted.weights.in_words
@@ -176,7 +177,7 @@ def run(
         summary["audit"] = _worst([d.audit for d in done if d.audit is not None])
     if work.scenario.is_recorded:  # without a network, the record alone knows the road
         doubts += recorded.on_the_road(scene_of(work).sites, tpog)
-    if doubts:
+    if doubts := nothing + doubts:
         summary[WARNINGS] = [doubt.to_json() for doubt in doubts]
     return summary
 

@@ -54,7 +54,8 @@ def test_score_is_its_definition(mini, tmp_path, gamma):
         assert row["egvs"] <= row["egvs_limit"]
         assert (row["egvs"] > 0) == (gamma > 0)
         assert 0 < row["entropy_seen"] <= 1
-    assert json.loads(pq.read_metadata(tmp_path / "scores.parquet").metadata[b"egvs"])["gamma"] == gamma
+    about = json.loads(pq.read_metadata(tmp_path / "scores.parquet").metadata[b"egvs"])
+    assert float(about["gamma"]) == gamma
 
 
 def test_threads_change_no_byte(mini, tmp_path):

@@ -66,6 +66,19 @@ class Judged:
         cure = "traffic that lasts longer"
         return [Finding("no standard error", f"{FILE}: traffic", f"{found}: {self.name} has no standard error", cure)]
 
+    def nothing(self, gamma: float, limit: float) -> list[Finding]:
+        """A warning where the score is 0 at every site, which is no ranking; why, by gamma and the EGVS's limit."""
+        if np.any(self.values > 0):
+            return []
+        if gamma == 0:
+            place, why, cure = f"{FILE}: score.gamma", "gamma is 0", "a gamma above 0"
+        elif limit == 0:
+            place, why, cure = f"{FILE}: roi", "no traffic comes and goes in the region", "a region with traffic in it"
+        else:
+            place, why = f"{FILE}: sites", "no beam crosses a place with traffic"
+            cure = "sites and sensors that look at the traffic in the region"
+        return [Finding("no ranking", place, f"{self.name} is 0 at every site, so none is best: {why}", cure)]
+
     @property
     def rank(self) -> np.ndarray[Any, np.dtype[np.uint32]]:
         """1 for the best, (n,)."""

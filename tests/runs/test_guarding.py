@@ -1,0 +1,174 @@
+"""What the user made is not written over, and nothing is written through a link."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from pathlib import Path
+
+import pytest
+
+import pipeline
+from pipeline.core import files
+from tests.conftest import collection, fcd
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def named(mini: Path, old: str, new: str) -> None:
+    path = mini / "scenario.toml"
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new))
+
+
+def a_mesh(mini: Path) -> None:
+    (mini / "statics.ply").write_text("ply")
+    named(mini, "[tpog]", '[[statics.meshes]]\nfile = "statics.ply"\nkind = "wall"\n[tpog]')
+
+
+def an_fcd_file(mini: Path) -> None:
+    (mini / "trajectories.parquet").write_text(fcd())
+    named(mini, "fcd.csv", "trajectories.parquet")
+
+
+def a_file_for_sumo(mini: Path) -> None:
+    (mini / "sumo").mkdir()
+    (mini / "sumo" / "f.geojson").write_text(collection())
+    named(mini, "statics.geojson", "sumo/f.geojson")
+
+
+def a_measured_scan(mini: Path) -> None:
+    (mini / "scan_pole_a.ply").write_text("ply")
+    (mini / "sites.csv").write_text("site,x_m,y_m,z_m,points\npole_a,10,12,3,scan_pole_a.ply\n")
+
+
+INPUTS = {
+    "a mesh": (a_mesh, "statics.ply, which the scenario names (statics.meshes)"),
+    "an FCD file": (an_fcd_file, "trajectories.parquet, which the scenario names (traffic.fcd)"),
+    "in the folder of SUMO": (a_file_for_sumo, "sumo/f.geojson, which the scenario names (statics.footprints)"),
+    "a measured scan": (a_measured_scan, "scan_pole_a.ply, which the scenario names (site pole_a: points)"),
+}
+
+
+@pytest.mark.parametrize("verb", ["run", "statics", "traffic", "scan", "report"])
+@pytest.mark.parametrize(("put", "message"), INPUTS.values(), ids=INPUTS.keys())
+def test_an_input_is_not_written_over(mini: Path, egvs, put, message: str, verb: str) -> None:
+    put(mini)
+    before = tree(mini)
+    code, _, error = egvs(verb, mini, "--out", mini)
+    told = f"egvs: --out {mini}: holds {message} and a run writes over; a folder of its own, for example runs/mine\n"
+    assert (code, error) == (2, told)
+    assert tree(mini) == before
+
+
+def test_an_input_is_known_through_another_path(mini: Path, tmp_path: Path, egvs) -> None:
+    a_mesh(mini)
+    (tmp_path / "link").symlink_to(mini)
+    code, _, error = egvs("run", mini, "--out", tmp_path / "link")
+    assert (code, "holds statics.ply" in error) == (2, True)
+    (mini / "deep").mkdir()
+    (mini / "deep" / "tpog.parquet").write_text("fcd")
+    named(mini, "fcd.csv", "deep/tpog.parquet")
+    code, _, error = egvs("run", mini, "--out", mini / "deep")
+    assert (code, "holds tpog.parquet, which the scenario names (traffic.fcd)" in error) == (2, True)
+
+
+def test_a_run_within_the_folder_that_writes_over_nothing_is_made(mini: Path, egvs) -> None:
+    before = tree(mini)
+    code, _, error = egvs("run", mini, "--out", mini)
+    assert code == 0, error
+    assert {name: tree(mini)[name] for name in before} == before
+
+
+def test_a_lock_that_is_a_link_is_refused(mini: Path, tmp_path: Path, egvs) -> None:
+    (tmp_path / "mine").write_text("kept")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / ".lock").symlink_to(tmp_path / "mine")
+    code, _, error = egvs("run", mini, "--out", tmp_path / "out")
+    what = "is a symbolic link, and nothing is written through one; remove it"
+    assert (code, error) == (2, f"egvs: {tmp_path / 'out' / '.lock'}: {what}\n")
+    assert (tmp_path / "mine").read_text() == "kept"
+
+
+@pytest.mark.parametrize("place", ["sumo", "sumo/log.txt", "sumo/am"])
+def test_a_link_where_sumo_writes_is_refused(mini: Path, tmp_path: Path, egvs, place: str) -> None:
+    link = tmp_path / "out" / place
+    link.parent.mkdir(parents=True)
+    link.symlink_to(tmp_path / "elsewhere")
+    code, _, error = egvs("run", mini, "--out", tmp_path / "out")
+    what = "is a symbolic link, and nothing is written through one; remove it"
+    assert (code, error) == (2, f"egvs: {link}: {what}\n")
+
+
+def test_artefacts_and_what_becomes_one_replace_links(mini: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine").write_text("kept")
+    out = tmp_path / "out"
+    out.mkdir()
+    names = ("statics.ply", "scans.parquet", "trajectories.parquet", "scores.parquet", "report.html", "run.json")
+    for name in names[:-1]:
+        (out / name).symlink_to(tmp_path / "mine")
+    for name in names:
+        (out / f".{name}.partial").symlink_to(tmp_path / "mine")
+    pipeline.run(pipeline.load(mini), out)
+    assert (tmp_path / "mine").read_text() == "kept"
+    assert not [path for path in out.iterdir() if path.is_symlink()]
+
+
+def test_a_gamma_without_bound_is_json_and_comes_back(mini: Path, tmp_path: Path, egvs) -> None:
+    def no_constant(name: str) -> float:
+        raise AssertionError(f"{name} is no JSON")
+
+    out = tmp_path / "out"
+    code, _, error = egvs("run", mini, "--out", out, "--set", "score.gamma=inf")
+    assert code == 0, error
+    record = json.loads((out / "run.json").read_text(), parse_constant=no_constant)
+    assert record["scenario"]["score"]["gamma"] == "inf"
+    assert egvs("verify", out)[0] == 0
+    assert "unchanged" in egvs("run", mini, "--out", out, "--set", "score.gamma=inf")[2]
+    assert json.loads(files.json_text({"a": [math.nan, -math.inf, 1.5]}), parse_constant=no_constant) == {
+        "a": ["nan", "-inf", 1.5]
+    }
+
+
+NOTHING = {
+    "gamma": (["score.gamma=0"], "score.gamma: egvs is 0 at every site, so none is best: gamma is 0; a gamma above 0"),
+    "roi above the traffic": (
+        ["roi.center_m=[20,0,42.5]"],
+        "roi: egvs is 0 at every site, so none is best: no traffic comes and goes in the region; "
+        "a region with traffic in it",
+    ),
+    "sensors that look up": (
+        ["sensors.small.elevations_deg=[60,80]"],
+        "sites: egvs is 0 at every site, so none is best: no beam crosses a place with traffic; "
+        "sites and sensors that look at the traffic in the region",
+    ),
+} | {
+    score: (
+        ["sensors.small.elevations_deg=[60,80]", f"score.rank_by='{score}'"],
+        f"sites: {score} is 0 at every site, so none is best: no beam crosses a place with traffic; "
+        "sites and sensors that look at the traffic in the region",
+    )
+    for score in ("expected_detections", "seen_well", "points_on_target", "entropy_seen", "coverage")
+}
+
+
+@pytest.mark.parametrize(("settings", "message"), NOTHING.values(), ids=NOTHING.keys())
+def test_nothing_seen_at_any_site_is_no_ranking(mini: Path, tmp_path: Path, egvs, settings, message: str) -> None:
+    changes = [word for setting in settings for word in ("--set", setting)]
+    code, printed, error = egvs("run", mini, "--out", tmp_path / "out", *changes)
+    assert code == 0, error
+    assert printed.splitlines()[0] == f"scenario.toml: {message}"
+    assert f"warning: scenario.toml: {message}" in error
+    assert not re.search(r"rank +site|best pole", printed + error)
+    assert json.loads((tmp_path / "out" / "run.json").read_text())["stages"]["score"]["summary"]["best"] == []
+
+
+def test_names_are_no_markup(mini: Path, tmp_path: Path, egvs) -> None:
+    (mini / "sites.csv").write_text("site,x_m,y_m,z_m\n[red]S1,10,12,3\n[x] :car:,30.5,-12,3\n")
+    code, printed, error = egvs("run", mini, "--out", tmp_path / "out")
+    assert code == 0, error
+    assert "[red]S1" in printed
+    assert "best [x] :car:; worst [red]S1" in error
