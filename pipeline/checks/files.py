@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+from pipeline.checks.mesh_parts import pulled_in
 from pipeline.core import files
 from pipeline.core.errors import InputError
 from pipeline.core.findings import Finding
@@ -76,7 +77,11 @@ def digests(scenario: Scenario, candidates: Iterable[Site]) -> dict[str, str]:
     """
     found = {f"{key} = {name}": _digest(scenario, key, name) for key, name in named(scenario)}
     found |= {f"{key} = {name}": _presence(scenario, key, name) for key, name in measured(candidates)}
-    paths = configured(scenario)
+    meshes = [
+        scenario.find(n, key) for key, n in named(scenario)
+        if key == "statics.meshes" and found[f"{key} = {n}"] != ABSENT
+    ]  # fmt: skip
+    paths = [*configured(scenario), *(part for path in meshes for part in pulled_in(path))]
     return found | {f"{number}: {path.name}": files.sha256_of(path) for number, path in enumerate(paths)}
 
 
