@@ -7,6 +7,8 @@ running; a finished file, of which nothing is promised.
 from __future__ import annotations
 
 import math
+import re
+import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import AbstractContextManager, contextmanager
@@ -16,7 +18,7 @@ from time import perf_counter
 
 import pyarrow as pa
 
-from pipeline.core.errors import InputError
+from pipeline.core.errors import InputError, RunError
 from pipeline.core.findings import Finding
 from pipeline.core.progress import Progress
 from pipeline.formats import safe_xml
@@ -47,6 +49,7 @@ from pipeline.traffic.tally import beside
 
 _LEAST_PATIENCE_S = 180.0
 _MOST_WAITING = 0.02
+_ROOTS = {COLLISIONS: "collisions", STOPS: "stops", STATISTICS: "statistics", DRIVEN: "routes"}
 
 
 @dataclass(frozen=True)
@@ -200,20 +203,45 @@ def simulate(prepared: Prepared, progress: Progress) -> float:
     start = perf_counter()
     flags = ["-c", CONFIG, *as_flags(prepared.outputs)]
     sumo.run("sumo", flags, prepared.folder, prepared.folder / LOG, watch)
+    check_whole(prepared)
     return perf_counter() - start
+
+
+def check_whole(prepared: Prepared) -> None:
+    """RunError where SUMO did not write a file to its end: on a full disk it ends without a word or an error."""
+    folder, outputs = prepared.folder, prepared.outputs.values()
+    for name in (name for name in (FCD, PERSONS, COLLISIONS, STOPS, STATISTICS, DRIVEN) if name in outputs):
+        end = rb"\n" if name not in _ROOTS else rf"(</{_ROOTS[name]}>|<{_ROOTS[name]}[^<>]*/>)\s*\n".encode()
+        if re.search(end + rb"\Z", _tail(folder / name)) is None:
+            raise _cut(folder / name)
+    last_ms = prepared.timing.end_ms - prepared.timing.step_ms
+    if STATISTICS in outputs and _vehicles(prepared)["running"] and (_last_time_ms(folder / FCD) or 0) < last_ms:
+        raise _cut(folder / FCD)
+
+
+def _cut(path: Path) -> RunError:
+    free_mb = shutil.disk_usage(path.parent).free / 1e6
+    return RunError(f"{path}: SUMO did not write it to its end; is the disk full? ({free_mb:,.0f} MB are free there)")
 
 
 def _last_time_ms(path: Path) -> int | None:
     """The time of the last whole row of a CSV that is being written."""
     if not path.is_file():
         return None
-    with path.open("rb") as file:
-        file.seek(max(0, path.stat().st_size - 512))
-        lines = file.read().split(b"\n")
+    lines = _tail(path).split(b"\n")
     try:
         return round(float(lines[-2].split(b";")[0]) * 1000) if len(lines) > 2 else None
     except ValueError:
         return None
+
+
+def _tail(path: Path) -> bytes:
+    """The file's last bytes; none where there is no such file."""
+    if not path.is_file():
+        return b""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - 512))
+        return file.read()
 
 
 def type_sizes(prepared: Prepared) -> dict[str, Size]:
@@ -266,12 +294,18 @@ def _waiting(prepared: Prepared, scenario: Scenario) -> list[Finding]:
     """A warning that many vehicles of a demand could not start for want of room."""
     if prepared.vehicles is not None:
         return []
-    (vehicles,) = (e for e in safe_xml.children(prepared.folder / STATISTICS, "statistics") if e.tag == "vehicles")
-    loaded, waiting = (int(vehicles.get(key, "0")) for key in ("loaded", "waiting"))
+    vehicles = _vehicles(prepared)
+    loaded, waiting = vehicles["loaded"], vehicles["waiting"]
     if waiting <= _MOST_WAITING * loaded:
         return []
     found = f"{waiting} of {loaded} vehicles could not start to the end: the streets where they start are full"
     return [Finding("waiting", sumo_folder.place_of(scenario), found, "less demand there, or more lanes")]
+
+
+def _vehicles(prepared: Prepared) -> dict[str, int]:
+    """How many vehicles were loaded, run at the end, and wait to start."""
+    (vehicles,) = (e for e in safe_xml.children(prepared.folder / STATISTICS, "statistics") if e.tag == "vehicles")
+    return {key: int(vehicles.get(key, "0")) for key in ("loaded", "running", "waiting")}
 
 
 def _met(scenario: Scenario, prepared: Prepared) -> tuple[list[MetCount], list[Finding]]:

@@ -1,18 +1,13 @@
 """Does a scenario that tries to make SUMO write or read foreign files fail to?"""
 
-import shutil
-from pathlib import Path
-
 import pytest
 
 from pipeline.core.errors import InputError
 from pipeline.stages import traffic
 from tests.stages import run_stage
-from tests.traffic.guarded.lanes import first_lane
+from tests.traffic.guarded.lanes import KEPT, SHORT, configured, first_lane
 from tests.traffic.helpers import car, scenario
 
-SHORT = {"frames": 3, "warmup_s": 1.0, "step_s": 1.0, "frame_period_s": 1.0}
-KEPT = "not SUMO's"
 OPTIONS = (
     "netstate-dump", "netstate", "ndump", "tripinfo", "tripinfo-output", "vehroutes", "vehroute-output", "l", "log",
     "C", "save-configuration", "device.ssm.file", "device.toc.file", "save-template", "fcd-output", "summary",
@@ -36,26 +31,6 @@ ADDITIONAL = {
 }
 _ENTITIES = "".join(f'<!ENTITY {c} "{f"&{b};" * 10}">' for b, c in zip("abcdefghi", "bcdefghij", strict=True))
 BOMB = f'<!DOCTYPE routes [<!ENTITY a "{"0123456789" * 5}">{_ENTITIES}]><routes><vType id="&j;"/></routes>'
-
-
-@pytest.fixture
-def place(town, tmp_path) -> Path:
-    """A folder with the town and a car's route; a file beside it that is not SUMO's."""
-    folder = tmp_path / "in"
-    folder.mkdir()
-    shutil.copy(town / "net.xml", folder)
-    edge = first_lane(town / "net.xml")[0]
-    route = f'<vehicle id="v" depart="0"><route edges="{edge}"/></vehicle>'
-    (folder / "own.rou.xml").write_text(f"<routes>{route}</routes>")
-    (tmp_path / "foreign.txt").write_text(KEPT)
-    return folder
-
-
-def configured(folder: Path, options: str = "", additional: str = "<additional/>"):
-    (folder / "own.add.xml").write_text(additional)
-    files = '<net-file value="net.xml"/><route-files value="own.rou.xml"/><additional-files value="own.add.xml"/>'
-    (folder / "own.sumocfg").write_text(f"<configuration>{files}{options}</configuration>")
-    return scenario(folder, sumocfg="own.sumocfg", **SHORT)
 
 
 def test_no_option_of_a_configuration_makes_sumo_write(place, tmp_path):

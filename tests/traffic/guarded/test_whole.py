@@ -1,0 +1,54 @@
+"""Is a file told that SUMO did not write to its end?"""
+
+import pytest
+
+from pipeline.core.errors import RunError
+from pipeline.stages import traffic
+from pipeline.traffic import sumo
+from tests.stages import run_stage
+from tests.traffic.guarded.lanes import configured
+from tests.traffic.helpers import SMALL, scenario
+
+
+@pytest.mark.parametrize("blocks", [0, 8])
+def test_a_full_disk_is_told(town, tmp_path, monkeypatch, blocks):
+    """A limit on the size of files stands in for a full disk: SUMO ends with 0 on both."""
+    limited = tmp_path / "sumo-limited"
+    limited.write_text(f"#!/bin/sh\ntrap '' XFSZ\nulimit -f {blocks}\n{sumo.binary('sumo')} \"$@\"\nexit 0\n")
+    limited.chmod(0o755)
+    monkeypatch.setenv("SUMO_BINARY", str(limited))
+    with pytest.raises(RunError, match=r"fcd\.csv: SUMO did not write it to its end; is the disk full\? \([\d,]+ MB"):
+        run_stage(traffic, scenario(town, network="net.xml", **SMALL), tmp_path / "out")
+
+
+def cut_to_rows(path):
+    text = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(text[: len(text) // 2]))
+
+
+def cut_amid_a_row(path):
+    path.write_text(path.read_text()[:-9])
+
+
+def empty(path):
+    path.write_bytes(b"")
+
+
+@pytest.mark.parametrize(
+    ("name", "damage"),
+    [
+        ("fcd.csv", cut_to_rows), ("fcd.csv", cut_amid_a_row), ("fcd.csv", empty), ("statistics.xml", cut_to_rows),
+        ("statistics.xml", empty), ("collisions.xml", cut_amid_a_row),
+    ],
+)  # fmt: skip
+def test_a_file_that_is_cut_is_told(place, tmp_path, monkeypatch, name, damage):
+    run = sumo.run
+
+    def cut(program, arguments, folder, *more):
+        printed = run(program, arguments, folder, *more)
+        damage(folder / name)
+        return printed
+
+    monkeypatch.setattr(sumo, "run", cut)
+    with pytest.raises(RunError, match=f"{name}: SUMO did not write it to its end"):
+        run_stage(traffic, configured(place), tmp_path / "out")
