@@ -156,7 +156,8 @@ def test_no_vehicle_in_the_region_is_refused_where_vehicles_rank(mini: Path, tmp
     assert not (tmp_path / "a" / "scores.parquet").exists()
     record = pipeline.run(loading.load(mini, away[1::2]), tmp_path / "b", jobs=1)
     assert [it.rule for it in warnings_of(stage.summary for stage in record.stages.values())] == [
-        "traffic in the region"
+        "traffic in the region",
+        "no ranking",
     ]
     assert math.isnan(read_scores(tmp_path / "b" / "scores.parquet")["expected_detections"][0].as_py())
 
