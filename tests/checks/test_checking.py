@@ -388,7 +388,7 @@ def test_warnings_are_told_beside_the_errors_that_stop_a_run(street: Path, egvs)
 def test_a_map_that_netconvert_refuses_is_wrong_input_and_told_once(
     street: Path, monkeypatch: pytest.MonkeyPatch, egvs
 ) -> None:
-    (street / "map.osm").write_text("<osm><node")
+    (street / "map.osm").write_text('<osm version="0.6"></osm>')
     monkeypatch.chdir(street.parent)
     code, _, err = egvs("check", street.name, "--set", 'traffic.network="map.osm"')
     assert (code, err) == (2, "")
@@ -396,6 +396,10 @@ def test_a_map_that_netconvert_refuses_is_wrong_input_and_told_once(
     assert code == 2
     assert err.startswith(f"egvs: {street.name}/map.osm: is no map that streets can be made of: netconvert ended with")
     assert not list((street.parent / "out").glob("*.p*"))
+    (street / "map.osm").write_text("<osm><node")
+    code, _, err = egvs("run", street.name, "--set", 'traffic.network="map.osm"', "--out", "out")
+    assert code == 2
+    assert err.startswith(f"egvs: {street.name}/map.osm: is not well-formed XML: unclosed token")
 
 
 def test_counts_at_edges_and_of_kinds_that_are_not_there(street: Path) -> None:

@@ -36,7 +36,10 @@ def test_a_region_that_no_vehicle_enters(mini: Path, tmp_path: Path) -> None:
     sites(mini, "a,10,52,3")
     told = warnings(mini, tmp_path / "out", "roi.center_m=[20,60,2.5]")
     assert told == {
-        "tpog": ["roi: no vehicle is ever in it, all are between (-1, -2) and (41, 3): the sites cannot be ranked"]
+        "tpog": ["roi: no vehicle is ever in it, all are between (-1, -2) and (41, 3): the sites cannot be ranked"],
+        "score": [
+            "scenario.toml: roi: egvs is 0 at every site, so none is best: no traffic comes and goes in the region"
+        ],
     }
 
 
