@@ -2,7 +2,7 @@
 
 A boosted model of few small trees (scikit-learn's histogram boosting), held to rise and fall as
 :data:`pipeline.scoring.targets.detectability.RISES` says. Its size was settled on the training junctions, each foretold
-by the model of the others: more and larger trees foretold them no better by more than 0.002 of Spearman's rho.
+by the model of the others: docs/validation.md has what more trees, or none of these directions, would change.
 """
 
 from __future__ import annotations
