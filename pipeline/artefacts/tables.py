@@ -127,6 +127,8 @@ _PROMISED: dict[str, tuple[str, ...]] = {
     "visibility": ("grid", "sites"),
     "blindspots": ("sites", "cells", "points"),
     "accuracy": ("inputs", "tolerance", "stages"),
+    "placement": ("inputs", "stages", "score", "bound", "certificate"),
+    "curve": ("inputs", "stages", "score"),
     "detection": ("inputs", "frames", "stages"),
     "correlation": ("inputs", "frames", "stages", "own_score", "shown"),
 }

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.cli import arguments, interrupts, validation_verbs
+from pipeline.cli import arguments, interrupts, placement, validation_verbs
 from pipeline.cli.arguments import Audit, Jobs, Out, ScenarioPath, Set, Top
 from pipeline.core.errors import EgvsError, InputError
 from pipeline.core.findings import FindingsError
@@ -321,7 +321,7 @@ def effects(
         tables.print_ablation(changes)
 
 
-for verb in validation_verbs.VERBS:  # does a score foretell detection?
+for verb in (placement.place, *validation_verbs.VERBS):  # which poles together? does a score foretell detection?
     app.command()(verb)
 
 

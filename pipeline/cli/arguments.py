@@ -28,13 +28,13 @@ Top = Annotated[
 Audit = Annotated[bool, typer.Option("--audit", help="Check every beam's chords, and print the worst case.")]
 
 
-def duration_s(text: str) -> float:
-    """``--budget``: seconds from 90s, 10m or 1.5h."""
+def duration_s(text: str, option: str = "--budget") -> float:
+    """Seconds from 90s, 10m or 1.5h."""
     units = {"s": 1.0, "m": 60.0, "h": 3600.0, "": 1.0}
     match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)([smh]?)", text)
     seconds = float(match[1]) * units[match[2]] if match else 0.0
     if not 0 < seconds < float("inf"):
-        raise InputError("--budget", repr(text), "a time above 0 with one unit, for example 90s, 10m or 1.5h")
+        raise InputError(option, repr(text), "a time above 0 with one unit, for example 90s, 10m or 1.5h")
     return seconds
 
 

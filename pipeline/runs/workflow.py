@@ -13,7 +13,7 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -52,6 +52,7 @@ def run(
     progress: Progress = silent,
     listener: StageListener = unheard,
     options: dict[str, dict[str, Any]] | None = None,
+    only: Collection[str] = STAGES,
 ) -> RunRecord:
     """Bring every stage up to date, in order.
 
@@ -66,6 +67,8 @@ def run(
     options
         Further keyword arguments of single stages, e.g. ``{"score": {"audit": True}}``; such a stage is always run, and
         not kept in the store.
+    only
+        These stages alone, which must read nothing of others.
 
     Returns
     -------
@@ -77,8 +80,11 @@ def run(
     with alone(folder):
         run = _Run(Workspace(scenario, folder, jobs=jobs, progress=progress), listener)
         record = _record_so_far(scenario, folder)
-        for name in STAGES:
+        for name in (stage for stage in STAGES if stage in only):
             record = run.bring(name, record, **(options or {}).get(name, {}))
+        for name in [stage for stage in record.stages if stage not in only and not _is_of(stage, run.work, record)]:
+            record = record.having(name, None)  # of other settings: the record would contradict itself
+            record.write(folder)
         return record
 
 

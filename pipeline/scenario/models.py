@@ -22,6 +22,7 @@ from pipeline.core.strict_model import StrictModel
 from pipeline.core.sumo_home import sumo_home
 from pipeline.scenario.crs import CrsModel
 from pipeline.scenario.effects import EffectsModel
+from pipeline.scenario.placement import CostsModel, PlacementModel
 from pipeline.scenario.score import ScoreModel, gamma_for
 from pipeline.scenario.sensors import SensorModel
 from pipeline.scenario.traffic import TrafficModel
@@ -242,6 +243,8 @@ class Scenario(StrictModel):
     scan: ScanModel = ScanModel()
     score: ScoreModel = ScoreModel()
     effects: EffectsModel = EffectsModel()
+    costs: CostsModel = CostsModel()
+    placement: PlacementModel = PlacementModel()
     validation: ValidationModel = ValidationModel()
 
     _folders: tuple[Path, ...] = PrivateAttr(default=(Path(),))

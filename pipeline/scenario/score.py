@@ -40,20 +40,22 @@ def gamma_for(voxel_m: float, *, moving_occlusion: bool) -> float:
     return float(f"{gamma / 2 if moving_occlusion else gamma:.2g}")
 
 
+def enclosing(polygon_m: tuple[Point2, ...]) -> tuple[Point2, ...]:
+    """The corners of a polygon; ValueError where they enclose no area."""
+    import shapely
+
+    if (why := shapely.is_valid_reason(shapely.Polygon(polygon_m))) != "Valid Geometry":
+        raise ValueError(f"no polygon that encloses an area ({why})")
+    return polygon_m
+
+
 class ZoneModel(StrictModel):
     """A part of the region in which vehicles count more, or less."""
 
     polygon_m: tuple[Point2, ...] = Field(min_length=3, description="Its corners in the world frame, in order")
     weight: float = Field(ge=0, description="How much a vehicle counts whose centre is in it; 1 elsewhere")
 
-    @field_validator("polygon_m")
-    @classmethod
-    def _encloses(cls, polygon_m: tuple[Point2, ...]) -> tuple[Point2, ...]:
-        import shapely
-
-        if (why := shapely.is_valid_reason(shapely.Polygon(polygon_m))) != "Valid Geometry":
-            raise ValueError(f"no polygon that encloses an area ({why})")
-        return polygon_m
+    _encloses = field_validator("polygon_m")(enclosing)
 
 
 class WeightsModel(StrictModel):

@@ -123,7 +123,7 @@ def run(
 
     def score(scan: SiteBeams) -> ScoredSite:
         checked = audit_beams(scan.beams, tpog.grid) if audit else None
-        its = targets.scores(targets.see(scan)) if targets is not None else None
+        its = targets.scores(targets.see(scan.beams)) if targets is not None else None
         if wanted.keep_visibility == "all" or scan.site.name in wanted.keep_visibility:
             worth, hits = scorer.score_and_hits(scan.beams)
             return ScoredSite(scan.site, worth, its, checked, _sparse(hits))

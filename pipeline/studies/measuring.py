@@ -343,7 +343,7 @@ def _judged(work: Workspace, tpog: Tpog, leave_out: LeaveOut, scored: list[Score
     scorer = Scorer(scene_of(again), tpog, again.path("trajectories.parquet"), leave_out)
     targets = Targets(again, tpog.grid) if wanted.rank_by in WORTHS else None
     found = [
-        (scorer.score(scan.beams), targets.scores(targets.see(scan)) if targets is not None else None)
+        (scorer.score(scan.beams), targets.scores(targets.see(scan.beams)) if targets is not None else None)
         for scan in scans(again)
     ]
     return Judged.of(wanted.rank_by, found, leave_out.groups)

@@ -26,9 +26,9 @@ from pipeline.scoring.targets.record import Floats, TargetRecord
 from pipeline.scoring.targets.scores import mean
 from pipeline.scoring.targets.seen import SeenTargets, noticed_in, see
 from pipeline.scoring.targets.weights import people_of, weights_of, without_effect
+from pipeline.scoring.visibility import Beams
 from pipeline.stages.base import Workspace
 from pipeline.stages.shared.blindspots import spots_of
-from pipeline.stages.shared.scans import SiteBeams
 from pipeline.stages.shared.scene import scene_of
 
 TRAJECTORIES = "trajectories.parquet"
@@ -93,9 +93,22 @@ class Targets:
         """Whether no vehicle counts."""
         return not math.fsum(self._weight) > 0.0
 
-    def see(self, scan: SiteBeams) -> SeenTargets:
-        """What a site sees of each vehicle."""
-        return see(self.record, scan.beams, noticed_in(self._scene, scan.beams.sensor))
+    def see(self, beams: Beams) -> SeenTargets:
+        """What an empty scan sees of each vehicle."""
+        return see(self.record, beams, noticed_in(self._scene, beams.sensor))
+
+    @property
+    def counts(self) -> Floats:
+        """How much each vehicle-frame counts in a score, (n,) float64."""
+        return self._weight
+
+    def counts_by_period(self) -> dict[str, Floats]:
+        """The same in the scores of each period alone, by name; empty where there are none."""
+        counts = {}
+        for name, rows in self._periods:
+            counts[name] = np.zeros(len(self.record))
+            counts[name][rows] = 1.0 if self._by_choice is None else self._by_choice[rows]
+        return counts
 
     def scores(self, seen: SeenTargets) -> SiteTargets:
         """The scores that are asked for, of what a site sees, and where it misses vehicles."""

@@ -1,0 +1,112 @@
+"""``egvs place``: parses, calls, and prints a plan of several sensors with what is proved of it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pipeline.cli import arguments
+from pipeline.cli.arguments import Jobs, Out, ScenarioPath, Set
+
+if TYPE_CHECKING:
+    from pipeline.placement.placing import Placement
+
+
+def place(
+    scenario: ScenarioPath,
+    out: Out = None,
+    count: Annotated[int | None, typer.Option(metavar="K", help="The best plan of at most K sensors.")] = None,
+    budget: Annotated[
+        float | None, typer.Option(metavar="COST", help="The best plan that costs no more, see [costs].")
+    ] = None,
+    reach: Annotated[
+        float | None,
+        typer.Option(metavar="SHARE", help="The fewest sensors that reach this share of what all candidates would."),
+    ] = None,
+    exact: Annotated[
+        bool, typer.Option("--exact", help="Search until the best plan is proved, or the time ends.")
+    ] = False,
+    time_limit: Annotated[
+        str, typer.Option(metavar="TIME", help="Of --exact, and of the proof for --reach, e.g. 60s or 5m.")
+    ] = "60s",
+    set_: Set = None,
+    jobs: Jobs = None,
+) -> None:
+    """Which poles together, how many, and how sure: the best plan of several sensors."""
+    from pipeline.cli.progress import Screen
+    from pipeline.placement import placing
+    from pipeline.runs.workflow import default_folder
+    from pipeline.scenario.loading import load
+
+    limit_s = arguments.duration_s(time_limit, "--time-limit")
+    given = {"count": count, "budget": budget, "reach": reach}
+    sets = [*(set_ or ()), *(f"placement.{key}={value!r}" for key, value in given.items() if value is not None)]
+    loaded = load(scenario, sets)
+    folder = out or default_folder(loaded)
+    with Screen("place") as screen:
+        placed = placing.place(
+            loaded, folder, exact=exact, time_limit_s=limit_s, jobs=jobs, progress=screen.progress,
+            listener=screen.stage_event,
+        )  # fmt: skip
+    print_placement(placed)
+
+
+def print_placement(placed: Placement) -> None:
+    """The plan, how much each number of sensors is worth, and what is proved."""
+    from pipeline.cli.terminal import WIDE, console, table
+
+    out = console(WIDE)
+    names = ("", "site", "z m", "yaw deg", "pitch deg", "sensor", "gain", "joint score", "lost if it fails", "cost")
+    plan = table(names, left=("site", "sensor"), whole=names)
+    for number, pick in enumerate(placed.picks, start=1):
+        pose = pick.site.pose
+        mark = f"{number}*" if pick.is_forced else str(number)
+        lost = pick.loss / placed.joint if placed.joint > 0 else 0.0
+        plan.add_row(
+            mark, pick.site.name, f"{pose.z_m:g}", f"{pose.yaw_deg:.1f}", f"{pose.pitch_deg:.1f}", pick.site.sensor,
+            f"{pick.gain:.6g}", f"{pick.score:.6g}", f"{lost:.1%}", f"{pick.cost:g}",
+        )  # fmt: skip
+    out.print(plan)
+    if any(pick.is_forced for pick in placed.picks):
+        out.print("* is there already")
+    curve = table(("sensors", "joint score", "of all", "at least, of the best possible", "sites"), left=("sites",))
+    points = zip(placed.solution.curve, placed.curve_sites, strict=True)
+    for point, sites in points:
+        share = point.worth.joint / placed.together if placed.together > 0 else 0.0
+        curve.add_row(
+            str(point.count), f"{point.worth.joint:.6g}", f"{share:.1%}", _share(point.certificate), ", ".join(sites)
+        )
+    out.print(curve)
+    for zone in placed.zones:
+        by = f" by {zone.by} sensors" if zone.by > 1 else ""
+        out.print(f"zone {zone.name}: {zone.seen:.1%} of its entropy seen{by}, {zone.share:.1%} asked for")
+    out.print(in_words(placed))
+    for path in placed.files:
+        out.print(str(path))
+
+
+def in_words(placed: Placement) -> str:
+    """The plan and its certificate in one sentence."""
+    sites = ", ".join(pick.site.name for pick in placed.picks)
+    share = (
+        f"{placed.joint / placed.together:.1%} of what all {placed.candidates} candidates together would"
+        if placed.together > 0
+        else "nothing"
+    )
+    cost = f" for {placed.cost:g}" if placed.cost else ""
+    plan = f"{sites}{cost}: {placed.score} {placed.joint:.6g}, {share}; "
+    solution = placed.solution
+    if solution.fewest_is_proved is not None:
+        fewer = len(placed.picks) - 1
+        return plan + (f"proved: {fewer} cannot" if solution.fewest_is_proved else f"whether {fewer} can is not proved")
+    if solution.is_best:
+        return plan + "proved: no plan within the rules is better"
+    return plan + f"proved: at least {_share(placed.certificate)} of the best possible"
+
+
+def _share(share: float) -> str:
+    """A share that is proved, never rounded up."""
+    import math
+
+    return "100 %" if share >= 1.0 else f"{math.floor(share * 1e4) / 1e2:.2f} %"

@@ -1,0 +1,1 @@
+"""Kernels of placement: what several sensors see together."""

@@ -1,0 +1,232 @@
+"""From a scenario to the problem that is solved: candidates, their costs, what must be seen.
+
+What cannot be is refused here, with the reason and the nearest that can be had.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.artefacts.readers import Tpog, read_periods, read_tpog
+from pipeline.core.errors import InputError
+from pipeline.core.grid import Grid
+from pipeline.placement import gathering, terms
+from pipeline.placement.gathering import TargetView, View, VoxelView
+from pipeline.placement.problem import Demand, Problem
+from pipeline.placement.rules import Rules
+from pipeline.placement.sight import Floats, Ints, Sight
+from pipeline.scenario.models import Scenario
+from pipeline.scenario.placement import ZoneDemand
+from pipeline.sensing.sites import Site
+from pipeline.sensing.sites import of as sites_of
+from pipeline.stages.base import Workspace
+from pipeline.stages.shared.scene import scene_of
+from pipeline.stages.shared.target_scores import TPOG, Targets
+
+COST = "cost"
+"""The column of a sites file that says what a candidate costs."""
+
+
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """A problem, and whose candidates it is about.
+
+    Attributes
+    ----------
+    sites
+        The candidates, in the order of the scenario's sites.
+    score
+        The name of the joint score.
+    views
+        What each sight is of, for poses that are no candidates; in the order of :attr:`sights`.
+    together
+        The joint score of all candidates that are not excluded.
+    """
+
+    problem: Problem
+    sites: tuple[Site, ...]
+    score: str
+    views: tuple[View, ...]
+    together: float
+
+    @property
+    def names(self) -> list[str]:
+        """Of the candidates."""
+        return [site.name for site in self.sites]
+
+
+def ask(work: Workspace, heard: Callable[[int], None]) -> Asked:
+    """What a scenario's ``[placement]`` asks for, on the traffic and the scans of a run's folder.
+
+    Parameters
+    ----------
+    heard
+        Called with how many candidates were looked from.
+
+    Raises
+    ------
+    InputError
+        For names that are no candidates, costs that are not known, and demands that no plan can meet.
+    """
+    scenario, sites = work.scenario, scene_of(work).sites
+    rules = rules_of(scenario, sites)
+    names = [period.name for period in read_periods(work.path(TPOG)) if period.name]
+    tpogs = [read_tpog(work.path(TPOG)), *(read_tpog(work.path(TPOG), name) for name in names)]
+    wanted, zones = scenario.placement, scenario.placement.zones
+    if wanted.objective == "worst" and not names:
+        found = '"worst", but the traffic has no periods'
+        raise InputError(f"{scenario.file}: placement.objective", found, '"mean", or [[traffic.periods]]')
+    score = scenario.score.rank_by
+    by_voxel = score in terms.VOXEL_SCORES
+    voxels = VoxelView(work, tpogs, scenario.gamma if score == "egvs" else 1.0) if by_voxel or zones else None
+    targets = None if by_voxel else Targets(work, tpogs[0].grid)
+    seen = None if targets is None else TargetView(work, targets, score)
+    views = tuple(view for view in (voxels, seen) if view is not None)
+    sights = gathering.gather(work, views, heard)
+    if voxels is not None and by_voxel:
+        every = [
+            terms.voxel_term(name, score, sights[0], tpog, voxels.voxels, scenario.gamma, voxels.unit)
+            for name, tpog in zip(["", *names], tpogs, strict=True)
+        ]
+    else:
+        assert targets is not None and seen is not None
+        counts = {"": targets.counts, **targets.counts_by_period()}
+        every = [terms.target_term(name, score, sights[-1], its, seen.unit) for name, its in counts.items()]
+    demands = []
+    if voxels is not None:
+        demands = [_zone(scenario, name, zone, sights[0], tpogs[0], voxels.voxels) for name, zone in zones.items()]
+    objective = tuple(every[1:]) if wanted.objective == "worst" else (every[0],)
+    problem = Problem(every[0], objective, tuple(demands), rules, wanted.survives, work.threads)
+    whole = problem.together(problem.candidates.tolist())
+    for demand in demands:
+        _check_zone(scenario, demand, whole.value(demand.term))
+    return Asked(problem, sites, score, views, whole.value(problem.joint))
+
+
+def _zone(scenario: Scenario, name: str, zone: ZoneDemand, sight: Sight, tpog: Tpog, voxels: Ints) -> Demand:
+    inside = _within(zone.polygon_m, tpog.grid, voxels)
+    term = terms.zone_term(name, sight, tpog, voxels, inside, zone.by)
+    if not term.weight.any():
+        place = f"{scenario.file}: placement.zones.{name}"
+        raise InputError(place, "no voxel in it has entropy: no traffic comes and goes there", "a zone with traffic")
+    return Demand(term, zone.share)
+
+
+def _within(polygon_m: Sequence[tuple[float, float]], grid: Grid, voxels: Ints) -> Ints:
+    """Those of some voxels whose centre is in a polygon, or on its edge."""
+    import shapely
+
+    ix, iy, _ = np.unravel_index(voxels, grid.shape)
+    x_m = grid.roi.origin_m[0] + (ix + 0.5) * grid.voxel_m
+    y_m = grid.roi.origin_m[1] + (iy + 0.5) * grid.voxel_m
+    inside: Ints = voxels[shapely.intersects_xy(shapely.Polygon(polygon_m), x_m, y_m)]
+    return inside
+
+
+def _check_zone(scenario: Scenario, demand: Demand, most: float) -> None:
+    """InputError where all candidates together do not see enough of a zone."""
+    if demand.unmet(most) > 0.0:
+        zone = scenario.placement.zones[demand.term.name]
+        by = f" by {zone.by} sensors" if zone.by > 1 else ""
+        raise InputError(
+            f"{scenario.file}: placement.zones.{demand.term.name}.share",
+            f"{zone.share:g}, but all candidates together see {most:.3g} of its entropy{by}",
+            f"at most {np.floor(most * 1000) / 1000:g}, or more candidates",
+        )
+
+
+def check(scenario: Scenario) -> None:
+    """InputError for what can be refused before anything is simulated."""
+    rules_of(scenario, sites_of(scenario))
+
+
+def rules_of(scenario: Scenario, sites: Sequence[Site]) -> Rules:
+    """The rules that ``[placement]`` and ``[costs]`` set for some candidates."""
+    wanted, place = scenario.placement, f"{scenario.file}: placement"
+    if wanted.count is None and wanted.budget is None and wanted.reach is None:
+        right = "--count 3, --budget 120000 or --reach 0.95, or one of them in [placement]"
+        raise InputError(place, "nothing says how many sensors", right)
+    names = [site.name for site in sites]
+    poles: dict[str, int] = {}
+    pole = np.array([poles.setdefault(site.pole or site.name, len(poles)) for site in sites], dtype=np.int64)
+    forced = tuple(_index(name, names, f"{place}.forced") for name in wanted.forced)
+    excluded = np.zeros(len(sites), dtype=np.bool_)
+    for name in wanted.excluded:
+        if name in poles and name not in names:
+            excluded |= pole == poles[name]
+        else:
+            excluded[_index(name, names, f"{place}.excluded")] = True
+    if both := [names[i] for i in forced if excluded[i]]:
+        raise InputError(f"{place}.forced", f"{both[0]}, whose pole is excluded", "one of them")
+    free = int(np.count_nonzero(~excluded))
+    if wanted.count is not None and wanted.count > free:
+        what = "candidates" if free == len(sites) else f"candidates that are not excluded (of {len(sites)})"
+        raise InputError(f"{place}.count", f"{wanted.count} sensors of {free} {what}", f"at most {free}")
+    if wanted.count is not None and wanted.count < len(forced):
+        raise InputError(f"{place}.count", f"{wanted.count}, but {len(forced)} are forced", f"at least {len(forced)}")
+    cost, pole_cost = _costs(scenario, sites)
+    cost[list(forced)] = pole_cost[list(forced)] = 0.0
+    rules = Rules(
+        count=wanted.count if wanted.count is not None else free,
+        budget=wanted.budget if wanted.budget is not None else np.inf,
+        cost=cost,
+        pole_cost=pole_cost,
+        pole=pole,
+        forced=forced,
+        excluded=excluded,
+        most_per_pole=wanted.most_per_pole or len(sites),
+        position_m=np.array([site.pose.position_m for site in sites]).reshape(-1, 3),
+        least_distance_m=wanted.least_distance_m,
+    )
+    _check_forced(rules, names, place)
+    return rules
+
+
+def _index(name: str, names: list[str], place: str) -> int:
+    if name not in names:
+        raise InputError(
+            place, f"no candidate {name!r}", f"one of {', '.join(names[:20])}{', ...' * (len(names) > 20)}"
+        )
+    return names.index(name)
+
+
+def _costs(scenario: Scenario, sites: Sequence[Site]) -> tuple[Floats, Floats]:
+    """What each candidate costs, and what of it is for its pole."""
+    costs, has_budget = scenario.costs, scenario.placement.budget is not None
+    cost, pole_cost = np.zeros(len(sites)), np.zeros(len(sites))
+    for i, site in enumerate(sites):
+        own = site.own.get(COST)
+        if own is not None:
+            if isinstance(own, bool) or not isinstance(own, int | float) or not own >= 0:
+                raise InputError(f"site {site.name}: {COST}", repr(own)[:80], "a number, 0 or above")
+            cost[i] = own
+            continue
+        if has_budget and not costs.are_given:
+            right = f"[costs], or a column {COST} in the sites file"
+            raise InputError(f"{scenario.file}: placement.budget", f"nothing says what {site.name} costs", right)
+        if costs.sensor and site.sensor not in costs.sensor:
+            found = f"nothing says what {site.sensor} of {site.name} costs"
+            raise InputError(f"{scenario.file}: costs.sensor", found, f'"{site.sensor}" = its price')
+        cost[i] = costs.sensor.get(site.sensor, 0.0) + costs.pole + costs.metre * site.pose.z_m
+        pole_cost[i] = costs.pole
+    return cost, pole_cost
+
+
+def _check_forced(rules: Rules, names: list[str], place: str) -> None:
+    """InputError where forced candidates break the rules, or nothing else can be had for the budget."""
+    if not rules.keeps(rules.forced):
+        which = ", ".join(names[i] for i in rules.forced)
+        right = "fewer of them, more per pole, or a smaller distance"
+        raise InputError(f"{place}.forced", f"{which} break most_per_pole or least_distance_m", right)
+    if not rules.forced and np.isfinite(rules.budget) and not rules.may_join(()).any():
+        cheapest = int(np.argmin(np.where(rules.excluded, np.inf, rules.cost)))
+        right = f"at least {rules.cost[cheapest]:g}, what {names[cheapest]} costs"
+        raise InputError(f"{place}.budget", f"{rules.budget:g} is below the cheapest candidate", right)
+
+
+def reaching(problem: Problem, share: float, together: float) -> Demand:
+    """That a share of what all candidates together reach is reached."""
+    return Demand(problem.joint, share * together)

@@ -1,0 +1,238 @@
+"""``egvs place``: the poles that are best together, and how sure that is.
+
+Steps: bring traffic, static world and TPOG up to date as ``egvs run`` does; look from every candidate once; solve what
+``[placement]`` asks for (:mod:`pipeline.placement.planning`); write ``placement.parquet`` and ``curve.parquet`` beside
+the run, and draw its report anew where there is one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.core.errors import InputError
+from pipeline.core.progress import Progress, silent
+from pipeline.placement import asking, planning, writing
+from pipeline.placement.asking import Asked
+from pipeline.placement.planning import Solution
+from pipeline.placement.problem import Problem
+from pipeline.runs import stages, workflow
+from pipeline.runs.locking import alone
+from pipeline.runs.workflow import StageListener, unheard
+from pipeline.scenario.models import Scenario
+from pipeline.sensing.sites import Site
+from pipeline.stages.base import Workspace
+
+NEEDED = ("check", "statics", "scan", "traffic", "tpog")
+"""The stages that a plan is made from."""
+
+
+@dataclass(frozen=True)
+class Pick:
+    """One sensor of a plan.
+
+    Attributes
+    ----------
+    site
+        The candidate.
+    is_forced
+        Whether it is there already.
+    gain, score
+        What it adds to the joint score of those before it, and that with it.
+    cost
+        What it adds to the cost.
+    loss
+        What the whole plan loses of its joint score when it fails.
+    """
+
+    site: Site
+    is_forced: bool
+    gain: float
+    score: float
+    cost: float
+    loss: float
+
+
+@dataclass(frozen=True)
+class ZoneSeen:
+    """A zone that was demanded: the share of its entropy that the plan sees, by so many sensors."""
+
+    name: str
+    seen: float
+    share: float
+    by: int
+
+
+@dataclass(frozen=True)
+class Placement:
+    """A plan, and what is proved of it.
+
+    Attributes
+    ----------
+    picks
+        In the order in which they would be put up: forced ones first, then what adds most.
+    score
+        The name of the joint score.
+    joint
+        That score of the plan.
+    together
+        That of all candidates.
+    zones
+        Those that were demanded.
+    solution
+        The curve, the bound, what was proved.
+    curve_sites, curve_costs
+        Names and cost of the plan of each point of the curve.
+    files
+        What was written.
+    """
+
+    picks: tuple[Pick, ...]
+    score: str
+    joint: float
+    together: float
+    cost: float
+    candidates: int
+    zones: tuple[ZoneSeen, ...]
+    solution: Solution
+    curve_sites: tuple[tuple[str, ...], ...]
+    curve_costs: tuple[float, ...]
+    files: tuple[Path, ...] = ()
+
+    @property
+    def certificate(self) -> float:
+        """The share of the best possible that is proved."""
+        return self.solution.point.certificate
+
+
+def place(
+    scenario: Scenario,
+    out: str | Path | None = None,
+    *,
+    exact: bool = False,
+    time_limit_s: float = 60.0,
+    jobs: int | None = None,
+    progress: Progress = silent,
+    listener: StageListener = unheard,
+) -> Placement:
+    """The poles that are best together, as a scenario's ``[placement]`` asks for.
+
+    Parameters
+    ----------
+    scenario
+        From :func:`pipeline.load`.
+    out
+        The run's folder; ``runs/<scenario name>`` when None.
+    exact
+        Search until the best plan is proved, or the time ends.
+    time_limit_s
+        Of that search, and of the proof that fewer sensors do not reach what is demanded.
+
+    Raises
+    ------
+    InputError
+        For a demand that cannot be met, with what can.
+    """
+    folder = Path(out) if out is not None else workflow.default_folder(scenario)
+    asking.check(scenario)
+    record = workflow.run(scenario, folder, only=NEEDED, jobs=jobs, progress=progress, listener=listener)
+    with alone(folder):
+        work = Workspace(scenario, folder, jobs=jobs, progress=progress, recorded=stages.recorded(record))
+        placed = solved(work, exact=exact, time_limit_s=time_limit_s)
+        keys = {name: record.stages[name].inputs for name in NEEDED}
+        files = writing.write(folder, scenario, placed, keys)
+        report = workflow.refresh_report(folder)
+        return replace(placed, files=files if report is None else (*files, report))
+
+
+def solved(work: Workspace, *, exact: bool, time_limit_s: float) -> Placement:
+    """The plan that ``[placement]`` asks for, from a run's folder; nothing is written."""
+    scenario = work.scenario
+    asked = asking.ask(work, lambda done: work.progress("candidates", done, 0))
+    problem, wanted = asked.problem, scenario.placement
+
+    def heard(count: int) -> None:
+        work.progress("sensors", count, 0)
+
+    if wanted.reach is None:
+        solution = planning.best(problem, search_all=exact, time_limit_s=time_limit_s, heard=heard)
+    else:
+        reaching = asking.reaching(problem, wanted.reach, asked.together)
+        problem = replace(problem, demands=(*problem.demands, reaching))
+        found = planning.fewest(problem, time_limit_s=time_limit_s, heard=heard)
+        if found is None:
+            raise _out_of_reach(scenario, problem, asked)
+        solution = found
+    if solution.point.worth.met < 0.0:
+        raise _unmet(scenario, problem, asked, solution, time_limit_s)
+    return _told(asked, problem, solution, scenario)
+
+
+def _told(asked: Asked, problem: Problem, solution: Solution, scenario: Scenario) -> Placement:
+    """A solution in the words of the scenario."""
+    rules, plan = problem.rules, solution.order
+    whole = problem.together(plan)
+    joint, before = whole.value(problem.joint), problem.together()
+    picks = []
+    for number, candidate in enumerate(plan):
+        so_far = before.value(problem.joint)
+        before.add(candidate)
+        score = before.value(problem.joint)
+        whole.remove(candidate)
+        loss = joint - whole.value(problem.joint)
+        whole.add(candidate)
+        cost = rules.cost_of(plan[: number + 1]) - rules.cost_of(plan[:number])
+        is_forced = candidate in rules.forced
+        picks.append(Pick(asked.sites[candidate], is_forced, score - so_far, score, cost, loss))
+    zones = tuple(
+        ZoneSeen(
+            demand.term.name, whole.value(demand.term), demand.least, scenario.placement.zones[demand.term.name].by
+        )
+        for demand in problem.demands
+        if demand.term.name in scenario.placement.zones
+    )
+    return Placement(
+        picks=tuple(picks),
+        score=asked.score,
+        joint=joint,
+        together=asked.together,
+        cost=rules.cost_of(plan),
+        candidates=len(problem.candidates),
+        zones=zones,
+        solution=solution,
+        curve_sites=tuple(_names(asked, point.plan) for point in solution.curve),
+        curve_costs=tuple(rules.cost_of(point.plan) for point in solution.curve),
+    )
+
+
+def _names(asked: Asked, plan: Sequence[int]) -> tuple[str, ...]:
+    return tuple(asked.names[i] for i in plan)
+
+
+def _out_of_reach(scenario: Scenario, problem: Problem, asked: Asked) -> InputError:
+    """That no plan within the rules reaches the share that was asked for."""
+    nearest = planning.best(replace(problem, demands=problem.demands[:-1]), search_all=False, time_limit_s=0.0,
+                            heard=lambda _: None).point  # fmt: skip
+    reached = nearest.worth.value / asked.together if asked.together > 0.0 else 0.0
+    found = f"{scenario.placement.reach:g}, and no plan within the count, the budget and the other rules was found"
+    right = f"at most {np.floor(reached * 1000) / 1000:g}, as {', '.join(_names(asked, nearest.plan))} reach"
+    return InputError(f"{scenario.file}: placement.reach", found, right)
+
+
+def _unmet(scenario: Scenario, problem: Problem, asked: Asked, solution: Solution, time_limit_s: float) -> InputError:
+    """That no plan within the rules sees enough of every zone."""
+    seen = problem.together(solution.order)
+    short = [its for its in problem.demands if its.unmet(seen.value(its.term)) > 0.0]
+    parts = [f"{its.term.name} {seen.value(its.term):.3g} of {its.least:g}" for its in short]
+    more = planning.fewest(problem.with_count(len(problem.candidates)), time_limit_s=0.0, heard=lambda _: None)
+    nearest = (
+        f"the nearest that was found, {', '.join(_names(asked, solution.order))}, sees of {' and of '.join(parts)}"
+    )
+    right = "a smaller share, or a larger budget"
+    if more is not None and len(more.order) > problem.rules.count:
+        right = f"a count of {len(more.order)}: {', '.join(_names(asked, more.order))} meet it"
+    found = f"no plan of {problem.rules.count} sensors that meets it was found; {nearest}"
+    return InputError(f"{scenario.file}: placement.zones", found, right)
