@@ -144,13 +144,24 @@ def _curve(problem: Problem, heard: Heard) -> tuple[list[CurvePoint], Bounds]:
     points: list[CurvePoint] = []
     its: Bounds = ()
     greedy = heuristics.greedy(problem) if problem.is_plain else ()
-    for count in range(max(1, len(problem.rules.forced)), problem.rules.count + 1):
+    first, most = max(1, len(problem.rules.forced)), problem.rules.most_sensors
+    last, last_its = (None, its) if np.isinf(problem.rules.budget) else _point(problem.with_count(most), (), greedy)
+    for count in range(first, most + 1 if last is None else len(last.plan)):
         point, its = _point(problem.with_count(count), points[-1].plan if points else (), greedy[:count])
-        if points and point.plan == points[-1].plan and not problem.demands:
-            break  # one more adds nothing, or costs too much
         points.append(point)
         heard(count)
+        if last is None and problem.is_plain and not _gains_any(problem, point.plan):
+            break
+    if last is not None:
+        points.append(replace(last, count=max(first, len(last.plan))))
+        its = last_its
     return points, its
+
+
+def _gains_any(problem: Problem, plan: Plan) -> bool:
+    """Whether any candidate would add anything to a plan; where none does, no plan is better."""
+    seen = problem.together(plan)
+    return bool((seen.gains(problem.joint, problem.candidates) > 0.0).any())
 
 
 def _point(problem: Problem, smaller: Plan, greedy: Plan = ()) -> tuple[CurvePoint, Bounds]:

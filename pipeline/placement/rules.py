@@ -73,6 +73,13 @@ class Rules:
         paid[self.pole[list(self.forced)]] = 0.0
         return paid
 
+    @property
+    def most_sensors(self) -> int:
+        """No plan has more: by the count, the candidates and what the cheapest ones cost."""
+        cheapest = np.sort((self.cost - self.pole_cost)[~self.excluded])
+        affordable = int(np.searchsorted(np.cumsum(cheapest), self.budget * (1.0 + _COINS), side="right"))
+        return max(1, min(self.count, affordable))
+
     def may_join(self, chosen: Sequence[int]) -> Mask:
         """Which candidates may be added to a plan that keeps the rules, (n,)."""
         may: Mask = ~self.excluded

@@ -120,6 +120,8 @@ class GrowingSight:
         kind = self._spill()
         cells = np.memmap(self._files[0], dtype=np.int32, mode="r")
         amounts: NDArray[Any] = np.memmap(self._files[1], dtype=kind, mode="r")
+        for file in self._files:
+            file.close()  # the mapping stays
         return Sight(self._number, starts, cells, amounts)
 
     def _spill(self) -> np.dtype[Any]:

@@ -1,0 +1,130 @@
+"""Small problems of every kind, drawn at random, and their answers by trying every subset in plain Python."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.kernels.placement.together import CAPPED, LOGARITHM, SATURATING
+from pipeline.placement.problem import Demand, Problem
+from pipeline.placement.rules import Rules
+from pipeline.placement.sight import Row, Sight
+from pipeline.placement.terms import Term
+
+
+@dataclass(frozen=True)
+class Instance:
+    """A problem, and what it was made of."""
+
+    problem: Problem
+    hits: np.ndarray
+    """(candidates, cells) int64."""
+
+
+def sight_of(hits: np.ndarray, most: int = 2**62) -> Sight:
+    """From hits (candidates, cells)."""
+    return Sight.of((Row.of(row, most) for row in hits), hits.shape[1])
+
+
+def term_of(
+    name: str, sight: Sight, weight: np.ndarray, *, curve: int = CAPPED, scale: float = 3.0, each_once: bool = False
+) -> Term:
+    """A sum whose exact value is :func:`math.fsum`'s."""
+
+    def exact(totals: np.ndarray) -> float:
+        return math.fsum(w * worth(curve, scale, int(t)) for w, t in zip(weight.tolist(), totals.tolist(), strict=True))
+
+    return Term(name, sight, weight, curve, scale, each_once, exact)
+
+
+def worth(curve: int, scale: float, total: int) -> float:
+    """f, by the formula."""
+    if curve == CAPPED:
+        return min(float(total), scale)
+    return math.log(1 + total / scale) if curve == LOGARITHM else 1 - math.exp(-total / scale)
+
+
+def drawn(seed: int) -> Instance:
+    """A problem with 4 to 7 candidates over up to 15 cells: any curve, forced and excluded candidates, costs, shared
+    poles, distances, zones, several records, a failure to survive; each of them in some."""
+    rng = np.random.default_rng(seed)
+    n, cells = int(rng.integers(4, 8)), int(rng.integers(3, 16))
+    hits = rng.integers(0, 6, (n, cells)) * (rng.random((n, cells)) < rng.uniform(0.2, 0.9))
+    sight = sight_of(hits)
+    curve = int(rng.choice([CAPPED, CAPPED, LOGARITHM, SATURATING]))
+    scale, once = float(rng.choice([0.5, 1.0, 2.5, 4.0, np.inf if curve == CAPPED else 7.0])), bool(rng.random() < 0.3)
+    records = [
+        term_of(f"r{i}", sight, rng.random(cells) * (rng.random(cells) < 0.8), curve=curve, scale=scale, each_once=once)
+        for i in range(2)
+    ]
+    mix = term_of("", sight, records[0].weight + records[1].weight, curve=curve, scale=scale, each_once=once)
+    objective = tuple(records) if rng.random() < 0.25 else (mix,)
+    some = rng.permutation(n)
+    forced = tuple(int(i) for i in some[: rng.choice([0, 0, 0, 1])])
+    excluded = np.zeros(n, dtype=bool)
+    excluded[some[len(forced) :][: rng.choice([0, 0, 1])]] = True
+    pole = rng.integers(0, max(2, n - 2), n)
+    cost = rng.integers(1, 9, n).astype(float)
+    pole_cost = np.minimum(cost, rng.integers(0, 3, n)).astype(float)
+    cost[list(forced)] = pole_cost[list(forced)] = 0.0
+    budget = float(rng.integers(6, 20)) if rng.random() < 0.4 else np.inf
+    near = float(rng.choice([0.0, 0.0, 0.35]))
+    at = np.column_stack([rng.random((n, 2)), np.full(n, 3.0)])
+    rules = Rules(
+        count=int(rng.integers(max(1, len(forced)), 5)), budget=budget, cost=cost, pole_cost=pole_cost, pole=pole,
+        forced=forced, excluded=excluded, most_per_pole=int(rng.choice([1, 2, n])), position_m=at, least_distance_m=near,
+    )  # fmt: skip
+    demands = ()
+    if rng.random() < 0.3:
+        zone = rng.random(cells) * (rng.random(cells) < 0.4)
+        zone = zone / zone.sum() if zone.any() else zone
+        share = term_of("zone", sight, zone, scale=1.0, each_once=True)
+        demands = (Demand(share, float(rng.uniform(0.2, 0.8))),) if zone.any() else ()
+    return Instance(Problem(mix, objective, demands, rules, int(rng.random() < 0.15)), hits)
+
+
+def every_plan(problem: Problem):
+    """All subsets that keep the rules, by the rules as a person would read them."""
+    rules, n = problem.rules, len(problem.rules.cost)
+    for size in range(rules.count + 1):
+        for plan in itertools.combinations(range(n), size):
+            if _keeps(rules, plan):
+                yield plan
+
+
+def _keeps(rules: Rules, plan: tuple[int, ...]) -> bool:
+    if not set(rules.forced) <= set(plan) or any(rules.excluded[i] for i in plan):
+        return False
+    on_pole: dict[int, list[int]] = {}
+    for i in plan:
+        on_pole.setdefault(int(rules.pole[i]), []).append(i)
+    if any(len(those) > rules.most_per_pole for those in on_pole.values()):
+        return False
+    for i, j in itertools.combinations(plan, 2):
+        if math.dist(rules.position_m[i], rules.position_m[j]) < rules.least_distance_m:
+            return False
+    total = 0.0
+    for those in on_pole.values():
+        total += sum(float(rules.cost[i] - rules.pole_cost[i]) for i in those)
+        if not set(those) & set(rules.forced):
+            total += max(float(rules.pole_cost[i]) for i in those)
+    return total <= rules.budget + 1e-9
+
+
+def value_of(problem: Problem, plan: tuple[int, ...], hits: np.ndarray) -> tuple[bool, float]:
+    """Whether a plan meets the demands, and its value, by the definitions."""
+
+    def of(term: Term, those: tuple[int, ...]) -> float:
+        rows = hits[list(those)] > 0 if term.each_once else hits[list(those)]
+        totals = rows.sum(axis=0).astype(int) if those else np.zeros(hits.shape[1], dtype=int)
+        return math.fsum(
+            w * worth(term.curve, term.scale, int(t))
+            for w, t in zip(term.weight.tolist(), totals.tolist(), strict=True)
+        )
+
+    met = all(of(demand.term, plan) >= demand.least * (1 - 1e-12) for demand in problem.demands)
+    left = [tuple(j for j in plan if j != i) for i in plan] if problem.survives else [plan]
+    return met, min((min(of(term, those) for term in problem.objective) for those in left), default=0.0)
