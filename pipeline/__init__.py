@@ -22,6 +22,13 @@ Any pose, not only the scenario's sites, in milliseconds::
     pose = pipeline.Pose(x_m=12.0, y_m=30.0, z_m=4.5, yaw_deg=180.0)
     scorer.score(scanner.scan(pose, scene.sensor("VLP-32C"))).egvs
 
+Several poses together, and plans with what is proved of them::
+
+    joint = pipeline.JointScore.of(scenario, "runs/trial")
+    joint.add("c03")
+    joint.gain("c10")
+    pipeline.place(pipeline.load("scenarios/nishishinjuku", ["placement.count=3"])).certificate
+
 Names are imported when they are first used, so that ``import pipeline`` costs nothing.
 """
 
@@ -44,6 +51,8 @@ if TYPE_CHECKING:
     )
     from pipeline.core.errors import EgvsError, InputError, RunError
     from pipeline.effects.scene_building import build_scene
+    from pipeline.placement.joint_score import JointScore
+    from pipeline.placement.placing import place
     from pipeline.runs.workflow import run, verify
     from pipeline.scenario.loading import load
     from pipeline.scenario.models import Scenario
@@ -57,6 +66,7 @@ if TYPE_CHECKING:
 _HOME = {
     "EgvsError": "core.errors",
     "InputError": "core.errors",
+    "JointScore": "placement.joint_score",
     "Pose": "sensing.sites",
     "RunError": "core.errors",
     "Scanner": "sensing.scanner",
@@ -69,6 +79,7 @@ _HOME = {
     "World": "world.mesh",
     "build_scene": "effects.scene_building",
     "load": "scenario.loading",
+    "place": "placement.placing",
     "read_scans": "artefacts.readers",
     "read_scores": "artefacts.readers",
     "read_scores_by_period": "artefacts.readers",
@@ -83,6 +94,7 @@ _HOME = {
 __all__ = [
     "EgvsError",
     "InputError",
+    "JointScore",
     "Pose",
     "RunError",
     "Scanner",
@@ -96,6 +108,7 @@ __all__ = [
     "__version__",
     "build_scene",
     "load",
+    "place",
     "read_scans",
     "read_scores",
     "read_scores_by_period",

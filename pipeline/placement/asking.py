@@ -17,9 +17,10 @@ from pipeline.placement import gathering, terms
 from pipeline.placement.gathering import TargetView, View, VoxelView
 from pipeline.placement.problem import Demand, Problem
 from pipeline.placement.rules import Rules
-from pipeline.placement.sight import Floats, Ints, Sight
+from pipeline.placement.sight import Floats, Ints, Row, Sight
 from pipeline.scenario.models import Scenario
 from pipeline.scenario.placement import ZoneDemand
+from pipeline.scoring.visibility import Beams
 from pipeline.sensing.sites import Site
 from pipeline.sensing.sites import of as sites_of
 from pipeline.stages.base import Workspace
@@ -51,6 +52,10 @@ class Asked:
     score: str
     views: tuple[View, ...]
     together: float
+
+    def row(self, beams: Beams) -> Row:
+        """What an empty scan sees of the cells of the joint score."""
+        return self.views[-1].row(beams)
 
     @property
     def names(self) -> list[str]:
@@ -140,15 +145,16 @@ def _check_zone(scenario: Scenario, demand: Demand, most: float) -> None:
 
 def check(scenario: Scenario) -> None:
     """InputError for what can be refused before anything is simulated."""
+    wanted = scenario.placement
+    if wanted.count is None and wanted.budget is None and wanted.reach is None:
+        right = "--count 3, --budget 120000 or --reach 0.95, or one of them in [placement]"
+        raise InputError(f"{scenario.file}: placement", "nothing says how many sensors", right)
     rules_of(scenario, sites_of(scenario))
 
 
 def rules_of(scenario: Scenario, sites: Sequence[Site]) -> Rules:
     """The rules that ``[placement]`` and ``[costs]`` set for some candidates."""
     wanted, place = scenario.placement, f"{scenario.file}: placement"
-    if wanted.count is None and wanted.budget is None and wanted.reach is None:
-        right = "--count 3, --budget 120000 or --reach 0.95, or one of them in [placement]"
-        raise InputError(place, "nothing says how many sensors", right)
     names = [site.name for site in sites]
     poles: dict[str, int] = {}
     pole = np.array([poles.setdefault(site.pole or site.name, len(poles)) for site in sites], dtype=np.int64)

@@ -17,6 +17,7 @@ from pipeline.core.errors import InputError
 from pipeline.core.progress import Progress, silent
 from pipeline.placement import asking, planning, writing
 from pipeline.placement.asking import Asked
+from pipeline.placement.joint_score import NEEDED
 from pipeline.placement.planning import Solution
 from pipeline.placement.problem import Problem
 from pipeline.runs import stages, workflow
@@ -25,9 +26,6 @@ from pipeline.runs.workflow import StageListener, unheard
 from pipeline.scenario.models import Scenario
 from pipeline.sensing.sites import Site
 from pipeline.stages.base import Workspace
-
-NEEDED = ("check", "statics", "scan", "traffic", "tpog")
-"""The stages that a plan is made from."""
 
 
 @dataclass(frozen=True)

@@ -114,7 +114,9 @@ class Rules:
         """
         left = self.count - len(chosen)
         order = np.argsort(-gains, kind="stable")
-        picked = order[self._first_of_poles(self.pole[candidates[order]], chosen)][: max(left, 0)]
+        if self.most_per_pole < len(self.cost):
+            order = order[self._first_of_poles(self.pole[candidates[order]], chosen)]
+        picked = order[: max(left, 0)]
         by_count = float(gains[picked].sum())
         if not np.isfinite(self.budget) or not len(candidates):
             return by_count, candidates[picked], np.ones(len(picked))
