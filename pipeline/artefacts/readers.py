@@ -123,6 +123,24 @@ def read_accuracy(path: str | Path) -> tuple[list[dict[str, Any]], dict[str, Any
     return table.to_pylist(), about
 
 
+def read_placement(
+    placement: str | Path, curve: str | Path
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]], dict[str, Any]] | None:
+    """Rows of ``placement.parquet`` and of ``curve.parquet``, and their metadata; None where one of them is not there,
+    or they are of different plans."""
+    paths = Path(placement), Path(curve)
+    if not all(path.is_file() for path in paths):
+        return None
+    found = []
+    for path in paths:
+        try:
+            found.append(tables.read(path, path.stem))
+        except InputError as error:
+            raise InputError(path, "is no plan", f"remove it, or run egvs place again ({error})") from None
+    (rows, about), (points, other) = found
+    return None if about != other else (rows.to_pylist(), points.to_pylist(), about)
+
+
 def read_validation(
     detection: str | Path, correlation: str | Path
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]], dict[str, Any]] | None:

@@ -127,8 +127,8 @@ _PROMISED: dict[str, tuple[str, ...]] = {
     "visibility": ("grid", "sites"),
     "blindspots": ("sites", "cells", "points"),
     "accuracy": ("inputs", "tolerance", "stages"),
-    "placement": ("inputs", "stages", "score", "bound", "certificate"),
-    "curve": ("inputs", "stages", "score"),
+    "placement": ("inputs", "stages", "plan"),
+    "curve": ("inputs", "stages", "plan"),
     "detection": ("inputs", "frames", "stages"),
     "correlation": ("inputs", "frames", "stages", "own_score", "shown"),
 }
@@ -172,11 +172,21 @@ def _is_sound(key: str, value: Any) -> bool:
         return isinstance(value, str)
     if key == "cells":
         return _are_cells(value)
+    if key == "plan":
+        return isinstance(value, dict) and all(_is_number(value.get(name)) for name in _OF_PLANS)
     if key in ("stages", "own_score", "shown"):
         return isinstance(value, dict)
     if key in ("tolerance", "memory_frames", "points"):
         return isinstance(value, float) and 0 < value < math.inf
     return isinstance(value, int) and not isinstance(value, bool) and value > 0
+
+
+_OF_PLANS = ("candidates", "joint", "together", "value", "bound", "certificate", "cost")
+"""Numbers that the metadata of a plan holds."""
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < math.inf
 
 
 def _are_cells(value: Any) -> bool:

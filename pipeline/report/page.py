@@ -29,6 +29,7 @@ from pipeline.report.drawing.colours import STYLE_SHEET
 from pipeline.report.drawing.roads import network_file
 from pipeline.report.evidence import disagreement, setting_of
 from pipeline.report.figures import Figures
+from pipeline.report.placement import PLACEMENT, PlacementSummary
 from pipeline.report.ranking import Ranking, ScoredSite
 from pipeline.report.study import ACCURACY, StudySummary
 from pipeline.scenario.models import Scenario
@@ -72,7 +73,7 @@ def inputs(work: Workspace) -> StageInputs:
     else:
         cast = scan_inputs(work)
         settings["scan"], hashes = cast.settings, dict(cast.files)
-    beside = (PERIOD_SCORES, BLINDSPOTS, *ACCURACY, *VALIDATION)
+    beside = (PERIOD_SCORES, BLINDSPOTS, *ACCURACY, *VALIDATION, *PLACEMENT)
     hashes |= work.digests(*(name for name in (*read, *beside) if work.path(name).is_file()))
     if (roads := network_file(work.folder)) is not None:
         hashes[roads.relative_to(work.folder).as_posix()] = files.sha256_of(roads)
@@ -138,7 +139,8 @@ def run(work: Workspace, inputs: StageInputs) -> Summary:
     drawn = figures.draw(work, ranking, _choosable(ranking), tpog)
     work.progress("figures drawn", 2, 3)
     study, detected = StudySummary.read(out, stages), ValidationSummary.read(out, stages)
-    html = page(work.scenario, ranking, tpog, drawn, stages, study, PeriodRanking.read(out), detected)
+    plan = PlacementSummary.read(out, stages, ranking.sites, tpog, drawn.backdrop)
+    html = page(work.scenario, ranking, tpog, drawn, stages, study, PeriodRanking.read(out), detected, plan)
     files.write_text(work.path(ARTEFACTS[0]), html)
     work.progress("page written", 3, 3)
     kilobytes = round(len(html.encode("utf-8")) / 1000)
@@ -156,6 +158,7 @@ def page(
     study: StudySummary | None,
     by_period: PeriodRanking | None = None,
     detected: ValidationSummary | None = None,
+    plan: PlacementSummary | None = None,
 ) -> str:
     """The whole page, HTML text; ``stages`` are those that are known, in the order of ``STAGES``."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -187,6 +190,7 @@ def page(
         artefacts=[artefact for stage in stages.values() for artefact in stage.artefacts.items()],
         study=study,
         detected=detected,
+        plan=plan,
         first=first,
         choices=_choosable(ranking),
         out_of_choice=len(sites) - len(_choosable(ranking)),

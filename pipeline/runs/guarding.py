@@ -10,6 +10,7 @@ from pipeline.artefacts.run_record import RECORD, STAGES
 from pipeline.checks import files
 from pipeline.core.errors import InputError
 from pipeline.report.detected import VALIDATION
+from pipeline.report.placement import PLACEMENT
 from pipeline.report.study import ACCURACY
 from pipeline.runs import stages
 from pipeline.scenario.models import Scenario
@@ -46,7 +47,7 @@ def _is_written(path: Path) -> bool:
     is_cloud = path.name.startswith("scan_") and path.suffix in _CLOUDS
     if len(path.parts) > 1:
         return path.parts[0] in _companions()
-    return is_cloud or path.name in {RECORD, ".lock", *artefacts, *ACCURACY, *VALIDATION}
+    return is_cloud or path.name in {RECORD, ".lock", *artefacts, *ACCURACY, *VALIDATION, *PLACEMENT}
 
 
 def _inputs(scenario: Scenario) -> Iterator[tuple[str, Path]]:

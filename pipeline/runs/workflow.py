@@ -82,7 +82,8 @@ def run(
         record = _record_so_far(scenario, folder)
         for name in (stage for stage in STAGES if stage in only):
             record = run.bring(name, record, **(options or {}).get(name, {}))
-        for name in [stage for stage in record.stages if stage not in only and not _is_of(stage, run.work, record)]:
+        others = [stage for stage in record.stages if stage not in (*only, "report")]
+        for name in [stage for stage in others if not _is_of(stage, run.work, record)]:
             record = record.having(name, None)  # of other settings: the record would contradict itself
             record.write(folder)
         return record

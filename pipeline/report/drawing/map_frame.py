@@ -62,7 +62,7 @@ def extent(grid: Grid, sites: Sequence[MapSite]) -> Box:
 def shared_scale(peak: float, label: str) -> str:
     """The colour scale that several figures share, alone."""
     bar = ColourBar(0.0, peak, label)
-    start = _svg_start(460.0, 52.0, f"Colour scale: {label}, 0 to {peak:.3g}")
+    start = svg_start(460.0, 52.0, f"Colour scale: {label}, 0 to {peak:.3g}")
     return start + bar.svg("scale", 16.0, 4.0, 428.0) + "</svg>"
 
 
@@ -137,7 +137,7 @@ class Plan:
         drawing = "\n".join(parts)
         return "\n".join(
             (
-                _svg_start(self.width, tall, alt),
+                svg_start(self.width, tall, alt),
                 f'<defs>{clip}</defs>{self._axes(base)}\n<g clip-path="url(#{self.prefix}-clip)">{drawing}</g>',
                 self._north_arrow() if self.north else "",
                 bar.svg(self.prefix, self.left, base + 46.0, self.frame_width) if bar else "",
@@ -219,7 +219,8 @@ class ColourBar:
         return placed
 
 
-def _svg_start(width: float, height: float, alt: str) -> str:
+def svg_start(width: float, height: float, alt: str) -> str:
+    """The first tag of a figure."""
     return f'<svg class="plan" viewBox="0 0 {width:.0f} {height:.0f}" role="img" aria-label="{escape(alt)}">'
 
 

@@ -91,18 +91,22 @@ def site_map(grid: Grid, values: ColumnValues, backdrop: Backdrop, sites: Sequen
     crowded, low, high = is_crowded(sites), min(s.score for s in sites), max(s.score for s in sites)
     streets, street_boxes = _street_names(plan, backdrop.roads.names, sites)
     radius = 8.5 if not crowded else 6.0 if len(places) <= 120 else 4.0
-    parts = [
-        _road_paths(plan, backdrop.roads),
-        f'<g class="faint">{_field(plan, grid, values, float(values.max(initial=0.0)))}</g>',
-        f"<g>{_outline_paths(plan, backdrop.outlines)}</g>",
-        plan.roi(grid),
-        *streets,
-    ]
+    parts = [*ground(plan, grid, values, backdrop), *streets]
     parts += [_rings(plan, place, low, high, radius, crowded) for place in reversed(places)]
     named = places if not crowded else [*places[:10], places[-1]]
     parts += _labels(plan, places, named, radius, street_boxes)
     bar = ColourBar(low, high, sites[0].by.label, even=True) if high > low else None
     return plan.svg(parts, alt, bar=bar)
+
+
+def ground(plan: Plan, grid: Grid, values: ColumnValues, backdrop: Backdrop) -> list[str]:
+    """What lies under sites: roads, faint traffic, static outlines, the region."""
+    return [
+        _road_paths(plan, backdrop.roads),
+        f'<g class="faint">{_field(plan, grid, values, float(values.max(initial=0.0)))}</g>',
+        f"<g>{_outline_paths(plan, backdrop.outlines)}</g>",
+        plan.roi(grid),
+    ]
 
 
 def site_view(grid: Grid, values: ColumnValues, peak: float, view: SiteView, prefix: str, alt: str) -> str:
@@ -282,17 +286,26 @@ def _labels(
     plan: Plan, places: Sequence[Place], named: Sequence[Place], radius: float, others: Sequence[Box]
 ) -> list[str]:
     """Names of the ``named`` places, so that they hide little, of ``others`` too; ``radius`` is that of a place's
-    innermost ring.
+    innermost ring."""
+    taken = [_square(plan.x(p[0].x_m), plan.y(p[0].y_m), _reach(p, radius) + 1) for p in places]
+    spots = [(plan.x(p[0].x_m), plan.y(p[0].y_m), _name(p), _reach(p, radius) + 4.0) for p in named]
+    return _beside_spots(plan, spots, [*taken, *others])
+
+
+def labels(plan: Plan, spots: Sequence[tuple[float, float, str, float]]) -> list[str]:
+    """Texts beside spots (x, y, text, radius; in the figure's units), so that they hide little."""
+    taken = [_square(x, y, radius + 1.0) for x, y, _, radius in spots]
+    return _beside_spots(plan, [(x, y, text, radius + 4.0) for x, y, text, radius in spots], taken)
+
+
+def _beside_spots(plan: Plan, spots: Sequence[tuple[float, float, str, float]], hidden: Sequence[Box]) -> list[str]:
+    """Texts beside spots: x, y, the text, and how far away it may begin; ``hidden`` should not be.
 
     Steps, for each: try eight sides at four distances; take the first spot that covers nothing, or else the one that
     covers least; draw a line to one that is further out.
     """
-    taken = [_square(plan.x(p[0].x_m), plan.y(p[0].y_m), _reach(p, radius) + 1) for p in places]
-    taken += others
-    drawn = []
-    for place in named:
-        x, y = plan.x(place[0].x_m), plan.y(place[0].y_m)
-        text, near = _name(place), _reach(place, radius) + 4.0
+    taken, drawn = list(hidden), []
+    for x, y, text, near in spots:
         wide = 7.2 * len(text)
         distances = (near, near + 12, near + 26, near + 42)
         options = [(away, _beside(x, y, away, wide, side)) for away in distances for side in _SIDES]
