@@ -22,11 +22,13 @@ from pipeline.core.errors import EgvsError, InputError
 from pipeline.core.progress import Progress, silent
 from pipeline.effects import registry
 from pipeline.effects.base import Expand
+from pipeline.runs.guarding import keep_inputs
 from pipeline.runs.locking import alone
 from pipeline.runs.stages import RANKING
 from pipeline.runs.workflow import refresh_report
+from pipeline.scenario.loading import load
 from pipeline.scenario.models import Scenario
-from pipeline.studies import comparison, lengths, pareto_figure
+from pipeline.studies import comparison, lengths, measuring, pareto_figure
 from pipeline.studies import variants as study_settings
 from pipeline.studies.comparison import Row
 from pipeline.studies.measuring import SettingListener, SettingRunner, SettingScores, inputs_of
@@ -110,6 +112,7 @@ def study(
     """
     if not 1e-6 <= tolerance <= 1:
         raise InputError("--tolerance", f"{tolerance:g}", "a share from 1e-6 to 1, for example 0.02")
+    keep_inputs(load(path, sets), out, (measuring.FOLDER,))
     with alone(out):
         runner = SettingRunner(path, sets, out, jobs, progress)
         scenario = runner.scenario(OWN)

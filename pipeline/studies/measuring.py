@@ -53,6 +53,9 @@ from pipeline.stages.shared.target_scores import Targets
 from pipeline.studies.lengths import counted_frames
 from pipeline.studies.variants import Setting
 
+FOLDER = "accuracy"
+"""In the run's folder, where results are kept."""
+
 SettingListener = Callable[[str, str, dict[str, Any]], None]
 """Called with (setting, "done" | "kept" | "skipped", its seconds, or why it was skipped) as a study goes on."""
 
@@ -120,7 +123,7 @@ class SettingRunner:
 
     def __init__(self, path: Path, sets: Sequence[str], out: Path, jobs: int | None, progress: Progress) -> None:
         self._path, self._sets, self._jobs, self._progress = path, tuple(sets), jobs, progress
-        self._kept, self._store = out / "accuracy", Store.default()
+        self._kept, self._store = out / FOLDER, Store.default()
         try:
             (self._kept / "times").mkdir(parents=True, exist_ok=True)
             for left in self._kept.glob(".work-*"):  # of a study that was killed

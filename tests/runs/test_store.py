@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import json
+import math
 import os
 import random
 import shutil
@@ -20,9 +21,10 @@ import pytest
 import pipeline
 from pipeline.artefacts import schemas
 from pipeline.core import code_digest, files
+from pipeline.core.cost import Cost
 from pipeline.core.errors import InputError
 from pipeline.runs import stages, workflow
-from pipeline.runs.stages import STAGES
+from pipeline.runs.stages import STAGES, Made
 from pipeline.runs.store import Entry, Store
 from tests.runs import children
 from tests.runs.children import Child, Job
@@ -466,3 +468,25 @@ def test_one_changed_line_makes_what_depends_on_it_again(
         path.write_text(path.read_text(encoding="utf-8") + "\n", encoding="utf-8")
         assert made() - {"report"} == again - {"report"}, name
     forget()
+
+
+@pytest.mark.parametrize("name", [".lock", ".locks", ".work", ".locks/statics-" + "0" * 32])
+def test_locks_and_folders_for_work_are_no_links(mini: Path, tmp_path: Path, store: Path, egvs, name: str) -> None:
+    (tmp_path / "mine").write_text("kept")
+    (store / name).parent.mkdir(parents=True, exist_ok=True)
+    (store / name).symlink_to(tmp_path / "mine")
+    code, _, error = egvs("run", mini, "--out", tmp_path / "out")
+    what = "is a symbolic link, and nothing is written through one; remove it"
+    assert (code, error.splitlines()[-1]) == (2, f"egvs: {store / name}: {what}")
+    assert (tmp_path / "mine").read_text() == "kept"
+
+
+def test_what_an_entry_says_is_json(tmp_path: Path, store: Path) -> None:
+    kept, out = Store(store), tmp_path / "out"
+    out.mkdir()
+    (out / "a").write_text("a")
+    made = Made({"a": files.sha256_of(out / "a")}, {}, {"longest": math.inf}, Cost())
+    kept.put("tpog", "0" * 64, out, made)
+    (entry,) = kept.entries()
+    assert "Infinity" not in (entry.folder / "entry.json").read_text()
+    assert entry.made.summary == {"longest": "inf"}

@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.artefacts.traffic_frames import TrafficFrame
+from pipeline.checks import mesh_parts
 from pipeline.core import files
 from pipeline.core.errors import InputError
 from pipeline.scenario.models import Scenario
@@ -151,9 +152,10 @@ def of_scenario(scenario: Scenario) -> Bodies:
 
 def digests(scenario: Scenario) -> dict[str, str]:
     """The files that bodies come from, by sha256: what clouds depend on beside the program's source."""
-    named = scenario.validation.bodies.items()
-    theirs = {name: files.sha256_of(scenario.find(name, f"validation.bodies.{kind}")) for kind, name in named}
-    return {FILE.name: files.sha256_of(FILE), **theirs}
+    hashes = {FILE.name: files.sha256_of(FILE)}
+    for kind, name in scenario.validation.bodies.items():
+        hashes |= mesh_parts.digests(scenario.find(name, f"validation.bodies.{kind}"), name)
+    return hashes
 
 
 def read(path: Path, place: str) -> tuple[Part, ...]:
