@@ -10,7 +10,6 @@ first place there.
 from __future__ import annotations
 
 import csv
-import json
 import math
 import re
 import reprlib
@@ -23,6 +22,7 @@ import numpy as np
 
 from pipeline.core.errors import InputError
 from pipeline.core.findings import Finding, FindingsError
+from pipeline.core.reading import documents
 from pipeline.formats import located_rows
 from pipeline.formats.georeference import Georeference, Reading
 from pipeline.scenario.models import Scenario, SiteGrid, SiteLine
@@ -317,10 +317,7 @@ def _csv(path: Path, world: Georeference) -> Iterator[_Row]:
 
 def _geojson(path: Path, world: Georeference) -> Iterator[_Row]:
     right = "a FeatureCollection of Points"
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise InputError(path, f"cannot be read as GeoJSON ({error})", right) from None
+    document = documents.read_json(path, right)
     if not isinstance(document, dict) or not isinstance(document.get("features"), list):
         raise InputError(path, f"has no list of features: {reprlib.repr(document)[:120]}", right)
     reading = located_rows.reading_of(document, path, world)

@@ -93,7 +93,7 @@ def _csv(path: Path, who: str) -> Iterator[pa.RecordBatch]:
     from pyarrow import csv
 
     with safe_xml.opened(path) as file:
-        header = file.readline().decode("utf-8", "replace").lstrip("\ufeff").strip()
+        header = safe_xml.line_of(file, path).decode("utf-8", "replace").lstrip("\ufeff").strip()
     delimiter = ";" if ";" in header else ","
     columns = _columns([name.strip('"') for name in header.split(delimiter)], path, who)
     convert = csv.ConvertOptions(
@@ -105,7 +105,7 @@ def _csv(path: Path, who: str) -> Iterator[pa.RecordBatch]:
     reading = csv.ReadOptions(block_size=_BLOCK_BYTES, use_threads=False)
     try:
         with (
-            pa.input_stream(path, compression="gzip" if safe_xml.is_gzip(path) else None) as stream,
+            safe_xml.opened(path) as stream,
             csv.open_csv(stream, reading, csv.ParseOptions(delimiter=delimiter), convert) as batches,
         ):
             for batch in batches:
@@ -132,7 +132,7 @@ def _seekable(path: Path) -> Iterator[Any]:
     """Parquet is read from its end, so a gzipped one is unzipped into memory first."""
     if safe_xml.is_gzip(path):
         with safe_xml.opened(path) as file:
-            yield pa.BufferReader(file.read())
+            yield pa.BufferReader(file.read())  # within the bound of what a packed file may hold
     else:
         yield path
 

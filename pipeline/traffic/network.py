@@ -384,7 +384,8 @@ def may_have_heights(path: Path) -> bool:
     if is_osm(path) or not path.is_file():
         return False
     with safe_xml.opened(path) as file:
-        return any(_HEIGHT.search(line, line.find(b"shape=")) is not None for line in file if b"shape=" in line)
+        lines = iter(lambda: safe_xml.line_of(file, path), b"")
+        return any(_HEIGHT.search(line, line.find(b"shape=")) is not None for line in lines if b"shape=" in line)
 
 
 def _parts(lanes: Sequence[str], links: Sequence[tuple[str, str]]) -> list[int]:

@@ -10,7 +10,6 @@ are strips of that half width.
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -21,6 +20,7 @@ import numpy as np
 
 from pipeline.core.errors import InputError
 from pipeline.core.findings import Finding, FindingsError
+from pipeline.core.reading import documents
 from pipeline.formats.georeference import IN_WORLD, Georeference, Reading, coordinates_of, declared_by
 from pipeline.scenario.near_names import misspelt
 from pipeline.scenario.types import FARTHEST_M
@@ -69,10 +69,7 @@ def read_geojson(path: Path, world: Georeference) -> FootprintFile:
     InputError names the features that cannot be understood, have no height, or are no sound polygons, all at once.
     """
     file = FootprintFile()
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(path, f"is not valid JSON: {error}", "a GeoJSON FeatureCollection") from None
+    document = documents.read_json(path, "a GeoJSON FeatureCollection")
     if not isinstance(document, dict) or not isinstance(document.get("features"), list):
         raise InputError(path, "has no list of features", "a GeoJSON FeatureCollection in world-frame metres")
     declared = declared_by(document, str(path))

@@ -12,7 +12,6 @@ routes may depend on them.
 
 from __future__ import annotations
 
-import re
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -36,9 +35,6 @@ _READS = frozenset({"href", "edgesFile"})
 _READERS = frozenset({"rerouter", "variableSpeedSign"})
 """Elements whose ``file`` is read."""
 
-_ENCODING = re.compile(rb"""(?:\xef\xbb\xbf)?<\?xml[^>]*?\bencoding\s*=\s*["']([^"']*)["']""")
-_DECLARATION_BYTES = 512
-
 
 def safe_name(name: str) -> str:
     """A file's name without what SUMO reads as more than a name: lists, variables of the environment."""
@@ -54,7 +50,7 @@ def copy(path: Path, to: Path) -> list[str]:
     for child in _guarded(path):
         unwritten.update(element.tag for element in child.iter() if _output_keys(element))
     with files.aside(to) as partial, partial.open("wb") as file:
-        if unwritten or not _is_utf8(path):
+        if unwritten or safe_xml.encoding_of_file(path) not in ("utf-8", "ascii"):
             _rewrite(path, file)
         else:
             with safe_xml.opened(path) as source:
@@ -80,15 +76,6 @@ def _guarded(path: Path, on_root: Callable[[Element], None] = lambda root: None)
         for element in child.iter():
             _refuse(element, path)
         yield child
-
-
-def _is_utf8(path: Path) -> bool:
-    """Whether a well-formed file is in UTF-8, as most are: it says so, or says nothing."""
-    with safe_xml.opened(path) as file:
-        declared = _ENCODING.match(start := file.read(_DECLARATION_BYTES))
-    if start.startswith((b"\xff\xfe", b"\xfe\xff", b"\x00", b"<\x00")):
-        return False
-    return declared is None or declared[1].lower() in (b"utf-8", b"us-ascii", b"ascii")
 
 
 def _rewrite(path: Path, file: IO[bytes]) -> None:
