@@ -4,7 +4,6 @@ textures of PLY. They lie beside it.
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from collections.abc import Iterable
@@ -13,9 +12,8 @@ from typing import Any
 from urllib.parse import unquote
 
 from pipeline.core import files
-
-_GLB, _HEADER_BYTES = b"glTF", 20
-"""How a GLB starts, and what stands before its JSON."""
+from pipeline.core.reading import limits
+from pipeline.formats.meshes import gltf
 
 _MATERIALS = re.compile(rb"(?m)^[ \t]*mtllib[ \t]+(.+?)[ \t\r]*$")
 _TEXTURES = re.compile(rb"(?mi)^[ \t]*(?:map_\w+|bump|disp|decal|refl|norm)[ \t]+(.+?)[ \t\r]*$")
@@ -26,14 +24,14 @@ def pulled_in(path: Path) -> list[Path]:
     """What a mesh's file names and is there, in its order; of a damaged file nothing, which its reader tells."""
     match path.suffix.lower():
         case ".gltf" | ".glb":
-            uris = _uris(_gltf(path.read_bytes()))
+            uris = _uris(_gltf(limits.read_bytes(path, limits.FILE)))
             return _there(path, (name for uri in uris for name in (uri, unquote(uri))))
         case ".obj":
-            materials = _there(path, _words(_MATERIALS, path.read_bytes()))
-            textures = [_there(its, _words(_TEXTURES, its.read_bytes())) for its in materials]
+            materials = _there(path, _words(_MATERIALS, limits.read_bytes(path, limits.FILE)))
+            textures = [_there(its, _words(_TEXTURES, limits.read_bytes(its, limits.FILE))) for its in materials]
             return list(dict.fromkeys([*materials, *(one for several in textures for one in several)]))
         case ".ply":
-            head, _, _ = path.read_bytes().partition(b"end_header")
+            head, _, _ = limits.read_bytes(path, limits.FILE).partition(b"end_header")
             return _there(path, _words(_TEXTURES_OF_PLY, head))
     return []
 
@@ -65,10 +63,8 @@ def _words(key: re.Pattern[bytes], data: bytes) -> list[str]:
 
 def _gltf(data: bytes) -> Any:
     """The JSON of a glTF or GLB; None where it is damaged."""
-    if data.startswith(_GLB):
-        data = data[_HEADER_BYTES : _HEADER_BYTES + int.from_bytes(data[12:16], "little")]
     try:
-        return json.loads(data)
+        return gltf.document(data)
     except (ValueError, RecursionError):
         return None
 
