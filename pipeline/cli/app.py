@@ -5,16 +5,14 @@ Heavy modules are imported by the verb that needs them, so that ``egvs --help`` 
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.cli import arguments, interrupts, validation_verbs
+from pipeline.cli import arguments, ending, interrupts, validation_verbs
 from pipeline.cli.arguments import Audit, Jobs, Out, ScenarioPath, Set, Top
-from pipeline.core.errors import EgvsError, InputError
-from pipeline.core.findings import FindingsError
+from pipeline.core.errors import InputError
 from pipeline.core.version import __version__
 
 if TYPE_CHECKING:
@@ -28,30 +26,11 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-_INTERRUPTED = 130
-"""Exit code after Ctrl-C."""
-
 
 def main() -> None:
     """Entry point: errors of this program become one message and an exit code."""
-    try:
-        with interrupts.after_imports():
-            app()
-    except EgvsError as error:
-        for warning in error.warnings if isinstance(error, FindingsError) else ():
-            print(f"warning: {warning}", file=sys.stderr)
-        _fail(str(error), error.exit_code)
-    except OSError as error:
-        _fail(f"{error.filename or 'system'}: {error.strerror or error}", 1)
-    except SystemExit as end:  # typer's own way to end, of an interrupt too
-        if end.code == _INTERRUPTED:
-            _fail("interrupted; run the same command again to go on from the last whole stage", _INTERRUPTED)
-        raise
-
-
-def _fail(message: str, code: int) -> None:
-    print(f"egvs: {message}", file=sys.stderr)
-    sys.exit(code)
+    with ending.told(), interrupts.after_imports():
+        app()
 
 
 def _print_version(wanted: bool) -> None:

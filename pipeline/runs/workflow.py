@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -257,8 +256,7 @@ def verify(
     scenario = from_values(record.scenario, source, str(folder / RECORD))
     made_by_stages = {name: digest for stage in record.stages.values() for name, digest in stage.artefacts.items()}
     wrong = [f"{name} was altered after the run" for name in made_by_stages if not _holds(folder, name, made_by_stages)]
-    with tempfile.TemporaryDirectory(prefix="egvs-verify-") as temporary:
-        elsewhere = Path(temporary)
+    with files.scratch() as elsewhere:
         work = Workspace(scenario, elsewhere, jobs=jobs, progress=progress)
         again = _record_so_far(scenario, elsewhere)
         for name, before in record.stages.items():

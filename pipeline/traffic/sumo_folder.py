@@ -11,7 +11,6 @@ compared exactly.
 from __future__ import annotations
 
 import shutil
-import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -143,9 +142,9 @@ def roads(scenario: Scenario) -> network.Network | None:
     path = network_path(scenario)
     if path is None or not network.is_osm(path):
         return None if path is None else network.read(path)
-    with tempfile.TemporaryDirectory(prefix="egvs-roads-") as folder:
-        convert_osm(path, Path(folder) / NETWORK)
-        return network.read(Path(folder) / NETWORK, path)
+    with files.scratch() as folder:
+        convert_osm(path, folder / NETWORK)
+        return network.read(folder / NETWORK, path)
 
 
 def may_have_heights(scenario: Scenario) -> bool:
@@ -313,14 +312,15 @@ def _copies(given: Sources, folder: Path, others: Iterable[str]) -> tuple[dict[s
 
 def convert_osm(path: Path, network_path: Path) -> None:
     """Turn a map of OpenStreetMap into a network; its world frame starts at the network's south-west corner."""
-    network_path.write_bytes(_converted(path, files.sha256_of(path)))
+    content = _converted(path, files.sha256_of(path))
+    with files.naming(network_path):
+        network_path.write_bytes(content)
 
 
 @lru_cache(maxsize=1)
 def _converted(path: Path, _content: str) -> bytes:
     """The network of a map, converted once for the check and the traffic."""
-    with tempfile.TemporaryDirectory(prefix="egvs-map-") as temporary:
-        folder = Path(temporary)
+    with files.scratch() as folder:
         if osm.is_pbf(path):  # netconvert reads XML only
             osm.write_xml(path, folder / MAP)
         else:

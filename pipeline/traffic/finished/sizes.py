@@ -8,12 +8,12 @@ Metres.
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement, tostring
 
 from pipeline.core.errors import InputError
+from pipeline.core.files import scratch
 from pipeline.formats import safe_xml
 from pipeline.scenario.models import Scenario
 from pipeline.scenario.traffic import VehicleKind
@@ -113,8 +113,7 @@ def _asked(vtypes: Collection[Element]) -> dict[str, Size]:
     document = Element("additional")
     for vtype in vtypes:
         SubElement(document, vtype.tag, vtype.attrib)
-    with tempfile.TemporaryDirectory(prefix="egvs-vtypes-") as temporary:
-        folder = Path(temporary)
+    with scratch() as folder:
         (folder / "least.net.xml").write_text(_NETWORK, encoding="utf-8")
         (folder / "types.add.xml").write_bytes(tostring(document, encoding="utf-8"))
         named = ["-n", "least.net.xml", "-a", "types.add.xml", "--route-steps", "0"]
