@@ -13,14 +13,14 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
 from pipeline.kernels.boxes import SHRINK_M
+from pipeline.kernels.compile_cache import compiled
 from pipeline.kernels.occlusion import face
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
-_inlined = numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+_kernel = compiled()
+_inlined = compiled(inline="always")
 
 _MARGIN_RAD = 1e-9
 """Spans are widened by this: rounding loses no beam."""

@@ -461,7 +461,7 @@ def with_fault(*replacements):
     for old, new in replacements:
         assert old in source, f"the fault does not fit the source any more: {old}"
         source = source.replace(old, new)
-    source = re.sub(r"^_kernel = numba\.njit\(.*\)$", "_kernel = lambda function: function", source, flags=re.MULTILINE)
+    source = re.sub(r"^_kernel = compiled\(.*\)$", "_kernel = lambda function: function", source, flags=re.MULTILINE)
     namespace = {"__name__": "faulty"}
     exec(compile(source, "faulty boxes", "exec"), namespace)
     return SimpleNamespace(**namespace)
