@@ -327,8 +327,8 @@ class Scenario(StrictModel):
             if (path := folder / name.removeprefix(_SUMO)).is_file():
                 if os.access(path, os.R_OK):
                     return path
-                found = f"may not be read ({path}: permission denied)"
-                raise InputError(f"{self.file}: {key} = {name!r}", found, "a file that you may read")
+                found = f"cannot be read ({path}: Permission denied)"
+                raise InputError(f"{self.file}: {key} = {name!r}", found, "a file that may be read")
         shown = folders[0] / name.removeprefix(_SUMO)
         found = f"no such file ({shown})"
         raise InputError(f"{self.file}: {key} = {name!r}", found, "a path relative to the scenario's folder")

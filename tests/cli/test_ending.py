@@ -92,11 +92,11 @@ def test_what_a_user_can_put_right_is_wrong_input(number: int, name: str | None,
 
 _PLACE = "{mini}/scenario.toml: "
 CLOSED = {
-    "fcd.csv": _PLACE + "traffic.fcd = 'fcd.csv': may not be read ({mini}/fcd.csv: permission denied); "
-    "a file that you may read",
-    "sites.csv": _PLACE + "sites.file = 'sites.csv': may not be read ({mini}/sites.csv: permission denied); "
-    "a file that you may read",
-    "scenario.toml": "{mini}/scenario.toml: Permission denied",
+    "fcd.csv": _PLACE + "traffic.fcd = 'fcd.csv': cannot be read ({mini}/fcd.csv: Permission denied); "
+    "a file that may be read",
+    "sites.csv": _PLACE + "sites.file = 'sites.csv': cannot be read ({mini}/sites.csv: Permission denied); "
+    "a file that may be read",
+    "scenario.toml": "{mini}/scenario.toml: cannot be read (Permission denied); a file that may be read",
 }
 
 
