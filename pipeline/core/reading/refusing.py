@@ -30,7 +30,7 @@ def reading(place: object, right: str = A_WHOLE_FILE, doing: str = "cannot be re
     except OSError as error:
         if error.errno in _NO_ROOM:
             raise
-        raise InputError(place, f"{doing} ({error.strerror or _first_line(error)})", right) from error
+        raise InputError(place, f"{doing} ({why(error)})", right) from error
     except Exception as error:
         raise InputError(place, f"{doing} ({why(error)})", right) from error
 
@@ -44,6 +44,8 @@ def why(error: BaseException) -> str:
             return "it is nested too deeply"
         case UnicodeDecodeError():
             return f"it is no text in {error.encoding}: byte {error.start} is {error.object[error.start]:#x}"
+        case OSError() if error.strerror:
+            return error.strerror
         case UnicodeError():
             return f"it is no sound text: {error}"
     return _first_line(error)
