@@ -137,12 +137,14 @@ def _simulated(
 ) -> Iterator[Recording]:
     """From SUMO as a subprocess; its FCD file is removed once it is read."""
     prepared = sumo_folder.prepare(scenario, folder, extensions)
-    sizes = kind_sizes(scenario.traffic.kinds) if prepared.drawn else type_sizes(prepared)
+    with _sumo_runs(prepared, scenario):
+        sizes = kind_sizes(scenario.traffic.kinds) if prepared.drawn else type_sizes(prepared)
     for extension in extensions:
         sizes |= extension.sizes()
     path, persons = folder / FCD, folder / PERSONS
     try:
-        seconds, flags = round(simulate(prepared, progress), 3), as_flags(prepared.options | prepared.outputs)
+        with _sumo_runs(prepared, scenario):
+            seconds, flags = round(simulate(prepared, progress), 3), as_flags(prepared.options | prepared.outputs)
         crashes = _collisions(prepared)
         met, warnings = _met(scenario, prepared)
         warnings += [*_crashed(crashes, scenario), *_waiting(prepared, scenario)]
@@ -161,6 +163,17 @@ def _simulated(
     finally:
         for written in (path, persons, folder / DRIVEN, folder / STATISTICS):
             written.unlink(missing_ok=True)
+
+
+@contextmanager
+def _sumo_runs(prepared: Prepared, scenario: Scenario) -> Iterator[None]:
+    """What SUMO refuses came from the scenario: an InputError that names the files."""
+    try:
+        yield
+    except sumo.RefusedError as error:
+        names = ", ".join(path.name for path in prepared.given)
+        right = "what SUMO runs without an error; it read copies of these files"
+        raise InputError(sumo_folder.place_of(scenario), f"SUMO cannot run {names}: {error}", right) from None
 
 
 @contextmanager

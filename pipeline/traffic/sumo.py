@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import subprocess
 import sys
 import tempfile
@@ -34,11 +35,14 @@ _POLL_S = 0.1
 _LISTENS_S = 0.02
 _OPENS_WITHIN_S = 60.0
 _ENDS_WITHIN_S = 10.0
-_SHOWN_ERRORS = 12
+_SHOWN_ERRORS, _SHOWN_SIGNS = 12, 300
+
+_CRASHES = frozenset({signal.SIGSEGV, signal.SIGABRT, signal.SIGFPE, signal.SIGILL, getattr(signal, "SIGBUS", 0)})
+"""Signals by which a program ends itself."""
 
 
 class RefusedError(RunError):
-    """A program of SUMO refused what it was given: it ended by itself, with an error."""
+    """A program of SUMO refused what it was given: it ended by itself, with an error, or crashed."""
 
 
 def binary(name: str) -> Path:
@@ -113,7 +117,7 @@ def run(
     Raises
     ------
     RefusedError
-        When it ends with an error: its own error text and exit code. RunError when it is killed.
+        When it ends with an error, or crashes: its own error text and exit code. RunError when it is killed.
     MissingBackendError
         When it, or a system library that it needs, is not installed.
     """
@@ -190,9 +194,11 @@ def failure(name: str, code: int, text: str) -> RunError:
     if code == confined.CANNOT_START:
         return MissingBackendError(f"{name} cannot be started: {(lines or ['this process has ended'])[-1]}")
     errors = [line for line in lines if not line.startswith(("Warning", "Quitting", "pj_obj_create"))] or lines[-1:]
-    how = f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
-    kind = RunError if code < 0 else RefusedError
-    return kind("\n".join([f"{name} {how}:", *(f"  {line}" for line in errors[:_SHOWN_ERRORS])]))
+    how = f"ended with exit code {code}"
+    if code < 0:
+        how = f"{'crashed with' if -code in _CRASHES else 'was killed by'} signal {-code}"
+    kind = RefusedError if code > 0 or -code in _CRASHES else RunError
+    return kind("\n".join([f"{name} {how}:", *(f"  {line[:_SHOWN_SIGNS]}" for line in errors[:_SHOWN_ERRORS])]))
 
 
 @contextmanager

@@ -158,6 +158,8 @@ class Prepared:
     """A folder that SUMO can run in."""
 
     folder: Path
+    given: tuple[Path, ...]
+    """The user's files of which it holds copies."""
     options: dict[str, str]
     timing: Timing
     roads: network.Network
@@ -228,7 +230,10 @@ def prepare(scenario: Scenario, folder: Path, extensions: Iterable[TrafficExtens
     if delay_s := traffic.max_depart_delay_s or (_DRAWN_DEPART_DELAY_S if drawn and not traffic.counts else None):
         options["max-depart-delay"] = f"{delay_s:g}"
     files.write_text(folder / CONFIG, _config_xml(options))
-    return Prepared(folder, options, when, roads, vehicles, drawn, bool(traffic.counts), bool(adding), left_out + notes)
+    return Prepared(
+        folder, tuple(given.all()), options, when, roads, vehicles, drawn, bool(traffic.counts), bool(adding),
+        left_out + notes,
+    )  # fmt: skip
 
 
 def _make_fresh(folder: Path, given: Sources) -> None:

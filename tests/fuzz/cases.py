@@ -3,7 +3,8 @@
 The process is forked from this one, in which everything is imported and every kernel compiled, so that a case costs
 what the program costs and nothing else. Verdicts that are well: ``refused`` (exit code 2, one message, which names the
 file), ``same`` (the ranking of the file as it was), ``legal`` (another ranking of a file that other code reads, and
-reads as something else than before). Any other verdict is a fault.
+reads as something else than before), ``unkept`` (exit code 1: the traffic that such a file describes does not keep what
+the scenario promises; with one message). Any other verdict is a fault.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ _ADDRESSES = 6 << 30
 _MOST_WRITTEN = 1 << 30
 _LONGEST_MESSAGE = 4000
 _SCORES = ("egvs", "egvs_limit", "rank", "entropy_seen", "expected_detections", "points_on_target", "seen_well")
-WELL = ("refused", "same", "legal")
+WELL = ("refused", "same", "legal", "unkept")
 
 
 @dataclass(frozen=True)
@@ -162,6 +163,8 @@ class Bench:
         last = next((line for line in reversed(ended.err.splitlines()) if line.strip()), "")
         if ended.code == 0 or (ended.code == 1 and self.kind.may_differ and not ended.err):
             return self._ranking(file, data)
+        if ended.code == 1 and self.kind.simulated and last.startswith("egvs: scenario/scenario.toml: traffic"):
+            return self._if_it_says_something_else(file, data, Verdict("unkept", last[:300]))
         if ended.code != 2:
             return Verdict(f"exit code {ended.code}", last[:300])
         if len(ended.err) > _LONGEST_MESSAGE:
@@ -179,12 +182,16 @@ class Bench:
             return Verdict("same")
         if _has_nan(outcome):
             return Verdict("NaN score", repr(outcome)[:300])
+        return self._if_it_says_something_else(file, data, Verdict("legal"))
+
+    def _if_it_says_something_else(self, file: Path, data: bytes, then: Verdict) -> Verdict:
+        """``then`` where other code reads the mutant, and reads something else than before."""
         try:
             if self.kind.meaning(data) == self.kind.meaning(file.read_bytes()):
-                return Verdict("ranking changed, meaning did not", repr(outcome)[:300])
+                return Verdict("changed, but means the same")
         except DAMAGED as error:
-            return Verdict("ranking of a damaged file", repr(error)[:300])
-        return Verdict("legal")
+            return Verdict("read, but damaged", repr(error)[:300])
+        return then
 
     def _outcome_of(self, folder: Path) -> list[object]:
         """What of the results is compared: scores of the sites, or the bytes of other results."""

@@ -37,6 +37,8 @@ class Kind:
         Whether a message may name another file: what the mutant names, or what was made of it.
     may_differ
         Whether exit code 1 is an answer: files differ.
+    simulated
+        Whether traffic is, of which a scenario promises something.
     """
 
     name: str
@@ -49,11 +51,18 @@ class Kind:
     store: bool = False
     names_others: bool = False
     may_differ: bool = False
+    simulated: bool = False
 
 
 def _input(name: str, file: str, make: Callable[[Path], None], reads: Meaning, names_others: bool = False) -> Kind:
     """A file in the scenario's folder, and a whole run."""
     return Kind(name, f"scenario/{file}", make, reads, names_others=names_others)
+
+
+def _simulated(name: str, file: str, make: Callable[[Path], None], names_others: bool = False) -> Kind:
+    """What SUMO reads a copy of."""
+    reads = meaning.gzipped(meaning.xml)
+    return Kind(name, f"scenario/{file}", make, reads, names_others=names_others, simulated=True)
 
 
 def _artefact(name: str, verb: str) -> Kind:
@@ -73,11 +82,9 @@ _ALL = (
     _input("scenario.toml", "scenario.toml", bases.plain, meaning.toml, True),
     Kind("extended scenario.toml", "scenario/scenario.toml", bases.heir, meaning.toml,
          verb=("run", "heir", "--out", "out", "--jobs", "1"), names_others=True),
-    _input("net.xml", "net.net.xml", bases.drawn, meaning.gzipped(meaning.xml)),
-    _input("net.xml.gz", "net.net.xml.gz", bases.drawn_gz, meaning.gzipped(meaning.xml)),
-    _input("rou.xml", "own.rou.xml", bases.routed, meaning.gzipped(meaning.xml)),
-    _input("sumocfg", "own.sumocfg", bases.configured, meaning.gzipped(meaning.xml), True),
-    _input("add.xml", "own.add.xml", bases.configured, meaning.gzipped(meaning.xml)),
+    _simulated("net.xml", "net.net.xml", bases.drawn), _simulated("net.xml.gz", "net.net.xml.gz", bases.drawn_gz),
+    _simulated("rou.xml", "own.rou.xml", bases.routed), _simulated("sumocfg", "own.sumocfg", bases.configured, True),
+    _simulated("add.xml", "own.add.xml", bases.configured),
     *(_input(f"fcd.{form}", f"fcd.{form}", bases.finished(form), reads) for form, reads in (
         ("csv", meaning.gzipped(meaning.semicolons)), ("csv.gz", meaning.gzipped(meaning.semicolons)),
         ("xml", meaning.gzipped(meaning.xml)), ("xml.gz", meaning.gzipped(meaning.xml)),
