@@ -23,6 +23,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from types import CodeType
 
 from tests.fuzz.kinds import Kind
 from tests.fuzz.meaning import DAMAGED
@@ -233,10 +234,21 @@ def warm_up(folder: Path) -> None:
     import contextlib
     import io
 
+    import jinja2
+
     from pipeline.cli.app import main
     from tests.conftest import write_mini
 
     os.environ["EGVS_STORE"] = ""
+    plain, compiled = jinja2.Environment.compile, {}
+
+    def compile_once(environment: jinja2.Environment, *of: str) -> CodeType:
+        """Of the report's page, for that is half the time of a case."""
+        if of not in compiled:
+            compiled[of] = plain(environment, *of)
+        return compiled[of]
+
+    jinja2.Environment.compile = compile_once
     sys.argv = ["egvs", "run", str(write_mini(folder / "mini")), "--out", str(folder / "out"), "--jobs", "1"]
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
