@@ -29,7 +29,7 @@ LANE_WIDTH_M, DEFAULT_SPEED_M_S = 3.2, 13.89
 """A lane's width and speed limit where the network names none: SUMO's defaults."""
 
 _TURNAROUNDS = ("t", "T")
-_HEIGHT = re.compile(rb'[" ][^", ]+,[^", ]+,[^", ]+[" ]')
+_HEIGHT = re.compile(rb"(?:^|\s)[^,\s]+,[^,\s]+,[^,\s]+(?:\s|$)")
 """A point with a third coordinate. (SUMO writes none where a height is 0.)"""
 
 _PEDESTRIAN = "pedestrian"
@@ -383,9 +383,7 @@ def may_have_heights(path: Path) -> bool:
     """Whether any shape has a third coordinate: a quick look, so that a flat network need not be read."""
     if is_osm(path) or not path.is_file():
         return False
-    with safe_xml.opened(path) as file:
-        lines = iter(lambda: safe_xml.line_of(file, path), b"")
-        return any(_HEIGHT.search(line, line.find(b"shape=")) is not None for line in lines if b"shape=" in line)
+    return any(_HEIGHT.search(shape) is not None for shape in safe_xml.values_of(path, "shape"))
 
 
 def _parts(lanes: Sequence[str], links: Sequence[tuple[str, str]]) -> list[int]:

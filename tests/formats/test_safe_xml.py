@@ -96,3 +96,21 @@ def test_a_line_without_end_is_refused(tmp_path: Path) -> None:
     (tmp_path / "fcd.csv.gz").write_bytes(gzip.compress(b"1;2" * 700_000, mtime=0))
     with safe_xml.opened(tmp_path / "fcd.csv.gz") as file, pytest.raises(InputError, match="has a line without end"):
         safe_xml.line_of(file, "fcd.csv.gz")
+
+
+def test_values_of_an_attribute_are_found_wherever_the_file_is_cut_for_reading(tmp_path: Path) -> None:
+    """A mebibyte is read at a time; values lie across each border."""
+    values = [f"{i:07d}," * 9000 for i in range(50)]
+    text = "".join(
+        f"<lane id='{i}' shape{mark}{v}{mark[1:]} width='3'/>\n" for i, v in enumerate(values) for mark in ('="', "='")
+    )
+    (tmp_path / "n.net.xml").write_text(text + "<e shape=")
+    found = [value.decode() for value in safe_xml.values_of(tmp_path / "n.net.xml", "shape")]
+    assert found == [value for value in values for _ in range(2)]
+
+
+def test_a_value_without_end_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("EGVS_MAX_ELEMENT_MB", "1")
+    (tmp_path / "n.net.xml").write_bytes(b"<net><e shape='" + b"1,2 " * 1_000_000)
+    with pytest.raises(InputError, match=r"n.net.xml: has a value without end; at most 1 MB"):
+        list(safe_xml.values_of(tmp_path / "n.net.xml", "shape"))

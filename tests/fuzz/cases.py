@@ -22,6 +22,7 @@ import traceback
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from types import CodeType
 
@@ -235,6 +236,7 @@ def warm_up(folder: Path) -> None:
     import io
 
     import jinja2
+    import typer.main
 
     from pipeline.cli.app import main
     from tests.conftest import write_mini
@@ -249,6 +251,7 @@ def warm_up(folder: Path) -> None:
         return compiled[of]
 
     jinja2.Environment.compile = compile_once
+    typer.main.get_command = cache(typer.main.get_command)  # and so are the verbs, which are made anew at each call
     sys.argv = ["egvs", "run", str(write_mini(folder / "mini")), "--out", str(folder / "out"), "--jobs", "1"]
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
