@@ -1,5 +1,7 @@
 """``python -m tests.fuzz [--cases N] [--seed S] [--kinds A,B]``: mutants of every kind of file, judged one by one.
 
+``python -m tests.fuzz --kills N``: runs that are killed at random moments, and run again.
+
 Every verdict is a line of ``results.jsonl`` in the folder ``--keep``; mutants that fare badly lie beside it. A fuzzer
 that was interrupted goes on where it was when it is called again with the same folder. Ends with 1 where anything fared
 badly.
@@ -15,7 +17,7 @@ import tempfile
 from collections import Counter
 from pathlib import Path
 
-from tests.fuzz import cases
+from tests.fuzz import cases, kills
 from tests.fuzz.cases import Bench, Verdict
 from tests.fuzz.kinds import KINDS
 from tests.fuzz.mutating import mutant
@@ -70,6 +72,15 @@ def _told(counts: Results, kind: str) -> str:
     return ", ".join(f"{count} {verdict}" for (name, verdict), count in sorted(counts.items()) if name == kind)
 
 
+def kill(number: int, seed: int) -> int:
+    """How ``number`` kills ended; 1 where one ended badly."""
+    with tempfile.TemporaryDirectory(prefix="egvs-fuzz-") as temporary:
+        cases.warm_up(Path(temporary))
+        counts = kills.kill(number, seed, Path(temporary) / "kills")
+    print(f"{number} kills: " + ", ".join(f"{count} {verdict}" for verdict, count in counts.most_common()), flush=True)
+    return int(set(counts) != {kills.SAME})
+
+
 def main() -> int:
     """Parse, fuzz, print the table."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__.split(":")[0])
@@ -77,7 +88,10 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--kinds", default="", help=f"some of: {', '.join(KINDS)}; all by default")
     parser.add_argument("--keep", type=Path, default=Path("build/fuzz"), help="folder of results and of bad mutants")
+    parser.add_argument("--kills", type=int, default=0, help="instead: runs that are killed, and run again")
     given = parser.parse_args()
+    if given.kills:
+        return kill(given.kills, given.seed)
     kinds = [name.strip() for name in given.kinds.split(",") if name.strip()] or list(KINDS)
     if unknown := [name for name in kinds if name not in KINDS]:
         parser.error(f"unknown kinds {', '.join(unknown)}; some of: {', '.join(KINDS)}")

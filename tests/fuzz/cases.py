@@ -67,14 +67,14 @@ def run(folder: Path, arguments: Sequence[str], store: bool = False) -> Ended:
     sys.stdout.flush()
     sys.stderr.flush()
     if not (child := os.fork()):
-        _become(folder, arguments, printed, store)
+        become(folder, arguments, printed, store)
     code, peak = _wait(child)
     out, err = (path.read_text(errors="replace") for path in printed)
     return Ended(code, out, err, peak)
 
 
-def _become(folder: Path, arguments: Sequence[str], printed: Sequence[Path], store: bool) -> None:
-    """The child's side; never returns."""
+def become(folder: Path, arguments: Sequence[str], printed: Sequence[Path], store: bool) -> None:
+    """The command line in this process, which was forked for it; never returns."""
     code = 70
     try:
         os.setpgid(0, 0)
