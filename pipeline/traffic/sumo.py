@@ -121,10 +121,25 @@ def run(
     MissingBackendError
         When it, or a system library that it needs, is not installed.
     """
-    log = log or Path(os.devnull)
+    return _run(name, [str(binary(name)), *arguments], folder, log or Path(os.devnull), watch)
+
+
+def run_tool(name: str, arguments: Sequence[str], folder: Path) -> str:
+    """Run one of SUMO's Python tools, e.g. ``"routeSampler.py"``, to its end and return what it printed; as :func:`run`
+    does, it may write in its folder only.
+
+    RunError when it ends with an error; MissingBackendError when it is not installed.
+    """
+    tool = sumo_home() / "tools" / name
+    if not tool.is_file():
+        raise MissingBackendError(f"SUMO's tool {name} is not in {tool.parent}: pip install eclipse-sumo")
+    return _run(name, [sys.executable, "-B", str(tool), *arguments], folder, Path(os.devnull), None)
+
+
+def _run(name: str, command: Sequence[str], folder: Path, log: Path, watch: Callable[[], None] | None) -> str:
     with log.open("wb") as errors:
         capture = subprocess.PIPE if str(log) == os.devnull else errors
-        with _started(name, arguments, folder, subprocess.PIPE, capture) as process:
+        with _started(command, folder, subprocess.PIPE, capture) as process:
             printed, complaint = _wait(process, watch)
     if process.returncode:
         text = complaint if capture == subprocess.PIPE else log.read_bytes()
@@ -132,31 +147,14 @@ def run(
     return printed.decode("utf-8", "replace")
 
 
-def run_tool(name: str, arguments: Sequence[str], folder: Path) -> str:
-    """Run one of SUMO's Python tools, e.g. ``"routeSampler.py"``, to its end and return what it printed.
-
-    RunError when it ends with an error; MissingBackendError when it is not installed.
-    """
-    tool = sumo_home() / "tools" / name
-    if not tool.is_file():
-        raise MissingBackendError(f"SUMO's tool {name} is not in {tool.parent}: pip install eclipse-sumo")
-    command = [sys.executable, str(tool), *arguments]
-    done = subprocess.run(command, cwd=folder, env=environment(), stdin=subprocess.DEVNULL, capture_output=True)
-    if done.returncode:
-        raise failure(name, done.returncode, done.stderr.decode("utf-8", "replace"))
-    return done.stdout.decode("utf-8", "replace")
-
-
 @contextmanager
-def _started(
-    name: str, arguments: Sequence[str], folder: Path, printed: Any, complaints: Any
-) -> Iterator[subprocess.Popen[bytes]]:
+def _started(command: Sequence[str], folder: Path, printed: Any, complaints: Any) -> Iterator[subprocess.Popen[bytes]]:
     """A program that ends with the block, and with this process. It may write in its folder only."""
     launcher = [sys.executable, "-I", "-S", confined.__file__, os.curdir, str(os.getpid())]
     reading, holding = os.pipe()
     try:
         process = subprocess.Popen(
-            [*launcher, str(binary(name)), *arguments], cwd=folder, env=environment(), stdin=reading, stdout=printed,
+            [*launcher, *command], cwd=folder, env=environment(), stdin=reading, stdout=printed,
             stderr=complaints,
         )  # fmt: skip
     except BaseException:
@@ -240,8 +238,8 @@ def served(arguments: Sequence[str], folder: Path) -> Iterator[Any]:
     port = getFreeSocketPort()
     # a file, because SUMO would wait for ever on a full pipe that nobody reads
     with tempfile.TemporaryFile() as complaints:
-        flags = [*arguments, "--remote-port", str(port)]
-        with _started("sumo", flags, folder, subprocess.DEVNULL, complaints) as process:
+        command = [str(binary("sumo")), *arguments, "--remote-port", str(port)]
+        with _started(command, folder, subprocess.DEVNULL, complaints) as process:
             try:
                 connection = _attach(process, port)
                 try:

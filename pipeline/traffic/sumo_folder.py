@@ -169,6 +169,8 @@ class Prepared:
     """Whether the traffic is made here, of drawn trips or counts, and is not a user's."""
     counted: bool
     """Whether it follows counts."""
+    exactly: bool
+    """Whether each recorded frame must have that many, so that one that is missing is noticed."""
     adds_traffic: bool
     """Whether extensions added traffic to it."""
     notes: list[str]
@@ -187,7 +189,7 @@ class Prepared:
         }
         if self.adds_traffic or not self.drawn:  # else SUMO writes a user's persons among the vehicles
             wanted |= {"person-fcd-output": PERSONS}
-        if self.vehicles is None:
+        if not self.exactly:  # else nothing would tell a file that ends too early from roads that got empty
             wanted |= {"statistic-output": STATISTICS}
         if self.counted:
             wanted |= {"vehroute-output": DRIVEN, "vehroute-output.exit-times": "true",
@@ -230,9 +232,10 @@ def prepare(scenario: Scenario, folder: Path, extensions: Iterable[TrafficExtens
     if delay_s := traffic.max_depart_delay_s or (_DRAWN_DEPART_DELAY_S if drawn and not traffic.counts else None):
         options["max-depart-delay"] = f"{delay_s:g}"
     files.write_text(folder / CONFIG, _config_xml(options))
+    exactly, notes = vehicles is not None and traffic.hold == "exactly", left_out + notes
     return Prepared(
-        folder, tuple(given.all()), options, when, roads, vehicles, drawn, bool(traffic.counts), bool(adding),
-        left_out + notes,
+        folder, tuple(given.all()), options, when, roads, vehicles, drawn, bool(traffic.counts), exactly, bool(adding),
+        notes,
     )  # fmt: skip
 
 

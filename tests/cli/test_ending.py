@@ -110,7 +110,7 @@ def test_a_file_that_may_not_be_read_is_wrong_input(mini: Path, tmp_path: Path, 
 
 @pytest.mark.system
 def test_a_folder_that_may_not_be_entered_is_wrong_input(mini: Path, tmp_path: Path) -> None:
-    mini.chmod(0)
+    mini.chmod(0o400)
     try:
         done = python(FEWER_RIGHTS, "check", mini)
     finally:
