@@ -12,6 +12,8 @@ from __future__ import annotations
 import os
 import re
 import signal
+import socket
+import struct
 import subprocess
 import sys
 import tempfile
@@ -39,6 +41,11 @@ _SHOWN_ERRORS, _SHOWN_SIGNS = 12, 300
 
 _CRASHES = frozenset({signal.SIGSEGV, signal.SIGABRT, signal.SIGFPE, signal.SIGILL, getattr(signal, "SIGBUS", 0)})
 """Signals by which a program ends itself."""
+_ANSWERS_WITHIN_S, _STEPS_WITHIN_S = 30.0, 600.0
+"""How long somebody else's SUMO may take to answer first, and then each time: it may be paused by hand."""
+
+_NO_TRACI = (struct.error, UnicodeDecodeError)
+"""What reading an answer raises that is none of SUMO's."""
 
 
 class RefusedError(RunError):
@@ -203,17 +210,28 @@ def failure(name: str, code: int, text: str) -> RunError:
 def connected(host: str, port: int) -> Iterator[Any]:
     """A TraCI connection to a SUMO that is already running.
 
-    InputError when nothing answers there; RunError when SUMO ends the connection early.
+    InputError when nothing answers there, or not as SUMO does; RunError when SUMO ends the connection early, or falls
+    silent.
     """
     import traci
 
+    place = f"--traci {host}:{port}"
     connection = _connect(host, port)
     if connection is None:
-        raise InputError(f"--traci {host}:{port}", "no SUMO answers there", "start one with --remote-port first")
+        raise InputError(place, "no SUMO answers there", "start one with --remote-port first")
     try:
+        try:
+            connection.getVersion()
+        except (*_NO_TRACI, traci.exceptions.TraCIException, traci.exceptions.FatalTraCIError):
+            found = f"who listens there does not answer as SUMO does within {_ANSWERS_WITHIN_S:g} s"
+            raise InputError(place, found, "the port that SUMO was given with --remote-port") from None
+        connection._socket.settimeout(_STEPS_WITHIN_S)
         yield connection
     except traci.exceptions.FatalTraCIError as error:
-        raise RunError(f"SUMO at {host}:{port} ended the connection: {error}") from None
+        what = f"ended the connection, or did not answer for {_STEPS_WITHIN_S:g} s"
+        raise RunError(f"SUMO at {host}:{port} {what}: {error}") from None
+    except (*_NO_TRACI, traci.exceptions.TraCIException) as error:
+        raise RunError(f"SUMO at {host}:{port} gave an answer that cannot be understood: {error}") from None
     finally:
         _close(connection)
 
@@ -222,11 +240,11 @@ def _close(connection: Any) -> None:
     """Close without a word when SUMO has hung up first."""
     import traci
 
-    socket = connection._socket
-    with suppress(traci.exceptions.FatalTraCIError, OSError):
+    its = connection._socket
+    with suppress(*_NO_TRACI, traci.exceptions.TraCIException, traci.exceptions.FatalTraCIError, OSError):
         connection.close(False)
-    if socket is not None:
-        socket.close()
+    if its is not None:
+        its.close()
 
 
 @contextmanager
@@ -271,6 +289,7 @@ def _attach(process: subprocess.Popen[bytes], port: int) -> Any:
         if time.monotonic() > deadline:
             raise RunError(f"sumo did not open its TraCI port within {_OPENS_WITHIN_S:g} s")
         time.sleep(_LISTENS_S)
+    connection._socket.settimeout(None)  # one of our own, which may think as long as it likes
     return connection
 
 
@@ -278,14 +297,18 @@ def _connect(host: str, port: int) -> Any:
     """A connection, or None where nobody listens (traci forgets to close the socket then: Python would warn of it)."""
     import traci
 
+    patience_s = socket.getdefaulttimeout()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ResourceWarning)
         try:
+            socket.setdefaulttimeout(_ANSWERS_WITHIN_S)
             connection = traci.connect(port=port, host=host, numRetries=0)
         except (traci.exceptions.FatalTraCIError, OSError):
             return None
-    socket = connection._socket
-    if socket.getsockname() == socket.getpeername():  # TCP may connect a free local port to itself, and wait for ever
-        socket.close()
+        finally:
+            socket.setdefaulttimeout(patience_s)
+    ends = connection._socket.getsockname(), connection._socket.getpeername()
+    if ends[0] == ends[1]:  # TCP may connect a free local port to itself, and wait for ever
+        connection._socket.close()
         return None
     return connection
