@@ -212,3 +212,15 @@ def test_names_are_no_markup(mini: Path, tmp_path: Path, egvs) -> None:
     assert code == 0, error
     assert "[red]S1" in printed
     assert "best [x] :car:; worst [red]S1" in error
+
+
+def test_another_score_that_is_0_everywhere_is_told(mini: Path, tmp_path: Path, egvs) -> None:
+    settings = ("--set", "score.rank_by='seen_well'", "--set", "score.gamma=0")
+    code, printed, error = egvs("run", mini, "--out", tmp_path / "out", *settings)
+    assert code == 0, error
+    told = "egvs is 0 at every site, so it tells none from another; sites, sensors and settings by which it is above 0"
+    assert [line for line in error.splitlines() if "is 0 at" in line] == [
+        f"warning: scenario.toml: score: {told} somewhere"
+    ]
+    assert "   1  pole_" in printed, "the other score ranks all the same"
+    assert "is 0 at every site" not in egvs("run", mini, "--out", tmp_path / "two")[2]
