@@ -41,6 +41,7 @@ _SHOWN_ERRORS, _SHOWN_SIGNS = 12, 300
 
 _CRASHES = frozenset({signal.SIGSEGV, signal.SIGABRT, signal.SIGFPE, signal.SIGILL, getattr(signal, "SIGBUS", 0)})
 """Signals by which a program ends itself."""
+
 _ANSWERS_WITHIN_S, _STEPS_WITHIN_S = 30.0, 600.0
 """How long somebody else's SUMO may take to answer first, and then each time: it may be paused by hand."""
 
