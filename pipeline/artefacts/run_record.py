@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,8 @@ class StageRecord:
         What the stage says of it.
     cost
         Of the run that made it, which may be another one where it came from the store.
+    companions
+        Name -> sha256 of what it wrote beside its artefacts, by the path in the run's folder: ``sumo/run.sumocfg``.
     """
 
     inputs: str
@@ -38,6 +40,7 @@ class StageRecord:
     artefacts: dict[str, str]
     summary: dict[str, Any]
     cost: Cost
+    companions: dict[str, str] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """As ``run.json`` holds it."""
@@ -53,9 +56,13 @@ class StageRecord:
                 "artefacts": dict(artefacts),
                 "summary": dict(summary),
                 "cost": {"seconds": int() | float() as seconds, "peak_mb": int() | float() as peak_mb},
-            } if all(isinstance(digest, str) for digest in (*read.values(), *artefacts.values())):
-                return cls(inputs, read, artefacts, summary, Cost(seconds=seconds, peak_mb=peak_mb))
+            } if _are_digests(read, artefacts, beside := value.get("companions", {})):
+                return cls(inputs, read, artefacts, summary, Cost(seconds=seconds, peak_mb=peak_mb), beside)
         return None
+
+
+def _are_digests(*tables: Any) -> bool:
+    return all(isinstance(table, dict) and all(isinstance(its, str) for its in table.values()) for table in tables)
 
 
 @dataclass(frozen=True)
@@ -102,7 +109,7 @@ class RunRecord:
         settings were others then.
         """
         read = [stage.files for stage in self.stages.values()]
-        written = [stage.artefacts for stage in self.stages.values()]
+        written = [stage.artefacts | stage.companions for stage in self.stages.values()]
         return {name: digest for part in (*read, *written) for name, digest in part.items()}
 
     def having(self, name: str, stage: StageRecord | None) -> RunRecord:

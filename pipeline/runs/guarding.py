@@ -6,6 +6,7 @@ import os
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
+from pipeline.artefacts.readers import ACCURACY_SUMS, VALIDATION_SUMS
 from pipeline.artefacts.run_record import RECORD, STAGES
 from pipeline.checks import files
 from pipeline.checks.mesh_parts import pulled_in
@@ -18,7 +19,7 @@ from pipeline.scenario.models import Scenario
 _CLOUDS = (".ply", ".pcd")
 """Ends of ``scan_<site>``, which ``egvs scan --points`` writes."""
 
-_UNSHOWN = ("surrogates.parquet",)
+_UNSHOWN = ("surrogates.parquet", ACCURACY_SUMS, VALIDATION_SUMS)
 """What studies leave beside what the report shows."""
 
 

@@ -16,7 +16,8 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from pipeline.artefacts import schemas, tables
+from pipeline.artefacts import checksums, schemas, tables
+from pipeline.artefacts.readers import ACCURACY_SUMS
 from pipeline.core import files
 from pipeline.core.errors import EgvsError, InputError
 from pipeline.core.progress import Progress, silent
@@ -179,9 +180,11 @@ class _Work:
         rows = comparison.judge(rows, tolerance)
         best = next((row for row in rows if row.recommended), None)
         written = (out / "accuracy.parquet", out / "accuracy.png")
+        (out / ACCURACY_SUMS).unlink(missing_ok=True)
         times = times if REFERENCE in scores else 1
         _write(written[0], scenario, rows, own, times, tolerance)
         pareto_figure.draw_figure(rows, tolerance, scenario.name, written[1])
+        checksums.write(out / ACCURACY_SUMS, written)
         neighbours = scores.get(REFERENCE, own).neighbours
         empty = not any(own.shares)
         return AccuracyStudy(rows, self.skipped, tolerance, best, times, neighbours, written, None, repeated, empty)

@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.artefacts import schemas, tables
+from pipeline.artefacts import checksums, schemas, tables
+from pipeline.artefacts.readers import VALIDATION_SUMS
 from pipeline.artefacts.traffic_frames import TrafficFrame
 from pipeline.core import files
 from pipeline.core.errors import InputError
@@ -220,6 +221,7 @@ def _write(
     done.surrogates.write(aside / gathering.ARTEFACT, scenario)
     _write_correlation(aside / CORRELATION, done, about)
     figure.draw(aside / figure.ARTEFACT, scenario, done)
+    checksums.write(aside / VALIDATION_SUMS, sorted(aside.iterdir()))
     for made in sorted(aside.iterdir()):
         made.replace(out / made.name)
 

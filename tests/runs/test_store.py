@@ -113,6 +113,27 @@ def test_a_second_folder_makes_nothing(
     assert_whole(store)
 
 
+def test_what_sumo_read_and_the_report_draws_is_held_against_its_digest(junction: Path, tmp_path: Path, egvs) -> None:
+    out, scenario = tmp_path / "out", pipeline.load(junction)
+    states(scenario, out)
+    network, routes = out / "sumo" / "network.net.xml", out / "sumo" / "trips.rou.xml"
+    whole = network.read_bytes()
+    kept = json.loads((out / "run.json").read_text())["stages"]["traffic"]["companions"]
+    assert kept["sumo/network.net.xml"] == files.sha256_of(network)
+    network.write_bytes(whole.replace(b"speed", b"sqeed", 1))
+    routes.write_text("<routes/>")
+    (out / "sumo" / "vtypes.add.xml").unlink()
+    code, _, error = egvs("report", junction, "--out", out)
+    assert (code, error.split(" (")[0]) == (2, f"egvs: {network}: was altered or replaced")
+    assert sorted(workflow.verify(out))[:2] == [
+        f"sumo/{path.name} was altered after the run" for path in (network, routes)
+    ]
+    again = {name: "skipped" for name in STAGES} | {"traffic": "fetched"}
+    assert states(scenario, out) == again
+    assert network.read_bytes() == whole
+    assert workflow.verify(out) == []
+
+
 def test_a_changed_and_a_former_setting(done: tuple[pipeline.Scenario, Path]) -> None:
     """What a folder held before it was run with other settings comes back from the store."""
     scenario, out = done

@@ -21,6 +21,7 @@ from rich.console import Console
 
 import pipeline
 from pipeline.artefacts import tables
+from pipeline.artefacts.readers import read_accuracy
 from pipeline.cli import study_tables
 from pipeline.core.errors import InputError, RunError
 from pipeline.runs import stages
@@ -123,6 +124,14 @@ def test_study_of_a_finished_file(mini: Path, tmp_path: Path, few: None) -> None
     assert (own.error, own.tau, own.regret, own.best_kept, own.best_three_kept) == (0.0, 1.0, 0.0, True, True)
     recommended = [row for row in study.rows if row.recommended]
     assert recommended == [study.best]
+    path = tmp_path / "out" / "accuracy.parquet"
+    assert read_accuracy(path) is not None
+    data = path.read_bytes()
+    path.write_bytes(data[:99] + bytes([data[99] ^ 1]) + data[100:])
+    with pytest.raises(
+        InputError, match=r"accuracy\.parquet: is not the file of which accuracy\.sha256 has the checksum"
+    ):
+        read_accuracy(path)
     again = shares(mini, words(recommended[0]), tmp_path / "again")
     against = shares(mini, [], tmp_path / "plain")
     assert np.abs(again / against - 1).max() == pytest.approx(recommended[0].error, abs=1e-12)
