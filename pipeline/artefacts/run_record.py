@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -10,8 +9,11 @@ from typing import Any
 from pipeline.core import files
 from pipeline.core.cost import Cost
 from pipeline.core.errors import InputError
+from pipeline.core.reading import documents
+from pipeline.core.reading.seals import SEAL, is_sealed, sealed
 
 RECORD = "run.json"
+_RIGHT = "remove it and run again"
 
 STAGES = ("check", "statics", "scan", "traffic", "tpog", "score", "report")
 """In the order of running: what can be refused is refused first; the quick branch comes before SUMO runs."""
@@ -89,18 +91,18 @@ class RunRecord:
     def read(cls, folder: Path) -> RunRecord:
         """From ``folder / "run.json"``; InputError when it is none."""
         path = folder / RECORD
-        try:
-            value: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-            stages = {name: StageRecord.from_json(stage) for name, stage in value["stages"].items()}
-        except (FileNotFoundError, NotADirectoryError):
-            raise InputError(path, "no such file", "a folder that egvs run has written") from None
-        except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise InputError(path, f"is not a run's record ({error})", "remove it and run again") from None
-        for key, kind in (("egvs", str), ("seed", int), ("scenario", dict), ("scenario_folder", str)):
-            if not isinstance(value.get(key), kind):
-                found = f"is not a run's record ({key!r} is {value.get(key)!r})"
-                raise InputError(path, found, "remove it and run again")
-        known = {name: stage for name in STAGES if (stage := stages.get(name)) is not None}
+        if not path.is_file():
+            raise InputError(path, "no such file", "a folder that egvs run has written")
+        value = documents.read_json(path, _RIGHT)
+        if isinstance(value, dict) and SEAL in value and not is_sealed(value):
+            raise InputError(path, "was altered after the run: its own_sha256 is of other content", _RIGHT)
+        kinds = {"egvs": str, "seed": int, "scenario": dict, "scenario_folder": str, "stages": dict}
+        for key, kind in kinds.items():
+            found = value.get(key) if isinstance(value, dict) else value
+            if not isinstance(found, kind):
+                raise InputError(path, f"is not a run's record ({key!r} is {found!r})", _RIGHT)
+        stages = value["stages"] if SEAL in value else {}  # without a seal: of another version of this program
+        known = {n: stage for n in STAGES if (stage := StageRecord.from_json(stages.get(n))) is not None}
         return cls(value["egvs"], value["seed"], value["scenario"], value["scenario_folder"], known)
 
     @property
@@ -120,4 +122,4 @@ class RunRecord:
     def write(self, folder: Path) -> None:
         """Write ``folder / "run.json"``."""
         value = {**self.__dict__, "stages": {name: stage.to_json() for name, stage in self.stages.items()}}
-        files.write_text(folder / RECORD, files.json_text(value, indent=2) + "\n")
+        files.write_text(folder / RECORD, files.json_text(sealed(value), indent=2) + "\n")

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.core.reading.seals import sealed
 from tests.conftest import BUILDING, collection, fcd, feature
 
 Change = Callable[[Path], object]
@@ -370,7 +371,7 @@ def record_what_lies_there(out: Path, stage: str) -> None:
     record = json.loads((out / "run.json").read_text())
     made = record["stages"][stage]["artefacts"]
     record["stages"][stage]["artefacts"] = {name: files.sha256_of(out / name) for name in made}
-    (out / "run.json").write_text(json.dumps(record))
+    (out / "run.json").write_text(json.dumps(sealed(record)))
 
 
 @pytest.mark.parametrize(
