@@ -22,6 +22,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from pipeline.core.errors import InputError
+from pipeline.core.reading import refusing
 from pipeline.formats import safe_xml
 from pipeline.formats.georeference import Georeference, Reading
 from pipeline.scenario.types import FARTHEST_M
@@ -35,6 +36,10 @@ SCHEMA = pa.schema(
 _NEEDED = ("time", "id", "x", "y", "angle", "type")
 _OPTIONAL = {"z": 0.0, "slope": 0.0, "speed": float("nan")}
 _STRINGS = ("id", "type")
+_MAY_MISS = ("speed",)
+"""NaN, where a file has none."""
+
+_WHOLE = "a whole file; make it again"
 _OTHERS = {"vehicle": ("person_", "container_"), "person": ("vehicle_", "container_", "person_slope")}
 """Columns that belong to others, or (a person's slope) mean nothing."""
 _BLOCK_BYTES = 1 << 20
@@ -102,29 +107,28 @@ def _csv(path: Path, who: str) -> Iterator[pa.RecordBatch]:
         null_values=[""],
         strings_can_be_null=True,
     )
-    reading = csv.ReadOptions(block_size=_BLOCK_BYTES, use_threads=False)
-    try:
-        with (
-            safe_xml.opened(path) as stream,
-            csv.open_csv(stream, reading, csv.ParseOptions(delimiter=delimiter), convert) as batches,
-        ):
-            for batch in batches:
-                yield batch.rename_columns(list(columns))
-    except (pa.ArrowInvalid, OSError) as error:
-        raise _damaged(path, "CSV", error) from None
+    options = csv.ReadOptions(block_size=_BLOCK_BYTES, use_threads=False)
+    with (
+        refusing.reading(path, _WHOLE, "cannot be read as CSV"),
+        safe_xml.opened(path) as stream,
+        csv.open_csv(stream, options, csv.ParseOptions(delimiter=delimiter), convert) as batches,
+    ):
+        for batch in batches:
+            yield batch.rename_columns(list(columns))
 
 
 def _parquet(path: Path, who: str) -> Iterator[pa.RecordBatch]:
     import pyarrow.parquet as pq
 
-    with _seekable(path) as source:
-        try:
-            with pq.ParquetFile(source) as file:
-                columns = _columns(file.schema_arrow.names, path, who)
-                for batch in file.iter_batches(_BATCH_ROWS, columns=list(columns.values())):
-                    yield batch.select(list(columns.values())).rename_columns(list(columns))
-        except (pa.ArrowInvalid, OSError) as error:
-            raise _damaged(path, "Parquet", error) from None
+    with (
+        refusing.reading(path, _WHOLE, "cannot be read as Parquet"),
+        _seekable(path) as source,
+        pq.ParquetFile(source) as file,
+    ):
+        columns = _columns(file.schema_arrow.names, path, who)
+        for batch in file.iter_batches(_BATCH_ROWS, columns=list(columns.values())):
+            batch.validate(full=True)  # its texts are UTF-8
+            yield batch.select(list(columns.values())).rename_columns(list(columns))
 
 
 @contextmanager
@@ -184,7 +188,7 @@ def _checked(batches: Iterable[pa.RecordBatch], path: Path, unit: str) -> Iterat
         piece = _Piece(batch, done, path, unit)
         done += batch.num_rows
         piece.check_types()
-        for name in ("time", "x", "y", "angle", *(n for n in _OPTIONAL if n in piece.values and n != "speed")):
+        for name in ("time", "x", "y", "angle", *(n for n in _OPTIONAL if n in piece.values)):
             piece.check_finite(name)
         time_ms = piece.milliseconds()
         if time_ms.size:
@@ -209,7 +213,8 @@ class _Piece:
             raise self._wrong(i, f"{self._vehicle(i)} has no type", "the vehicle's type, which its size comes from")
 
     def check_finite(self, name: str) -> None:
-        for i in np.flatnonzero(~(np.abs(_floats(self.values[name])) <= FARTHEST_M)):
+        values = np.abs(_floats(self.values[name]))
+        for i in np.flatnonzero(~((values <= FARTHEST_M) | (np.isnan(values) & (name in _MAY_MISS)))):
             value = self.values[name][int(i)].as_py()
             what = f"{name} of {self._vehicle(i)} is {'empty' if value is None else value}"
             raise self._wrong(i, what, f"a finite number, at most {FARTHEST_M:g}")
@@ -249,7 +254,3 @@ def _floats(column: Any) -> NDArray[np.float64]:
 
 def _rows_of(mask: Any) -> NDArray[np.int64]:
     return np.flatnonzero(mask.to_numpy(zero_copy_only=False))
-
-
-def _damaged(path: Path, what: str, error: Exception) -> InputError:
-    return InputError(path, f"cannot be read as {what} ({str(error).splitlines()[0]})", "a whole file; make it again")

@@ -84,6 +84,8 @@ class Recording:
         Vehicles that may stand longer; of a running SUMO filled as rows come.
     summary
         To be asked for when the rows are through; None of a finished file.
+    source
+        For messages about rows: the finished file; empty where SUMO wrote them.
     """
 
     rows: Iterable[pa.Table]
@@ -95,6 +97,7 @@ class Recording:
     stopped_on_purpose: Set[str] = frozenset()
     persons: Iterable[pa.Table] | None = None
     summary: Callable[[], RecordingSummary | None] = lambda: None
+    source: str = ""
 
 
 def record(
@@ -128,7 +131,8 @@ def _finished(scenario: Scenario, world: Georeference) -> Iterator[Recording]:
     assert name is not None
     when, held = survey.window(scenario)
     path, sizes = scenario.find(name, "traffic.fcd"), finished_sizes.of_types(scenario, held.types)
-    yield Recording(fcd.located(fcd.read(path), world, path), when, sizes, place)
+    rows = fcd.located(fcd.read(path), world, path)
+    yield Recording(rows, when, sizes, place, source=f"{place}.fcd = {name!r}")
 
 
 @contextmanager

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from pipeline.core.errors import InputError
 from pipeline.core.findings import WARNINGS, Finding
 from pipeline.core.progress import Progress, silent
+from pipeline.core.reading.refusing import reading
 from pipeline.formats.georeference import Georeference
 from pipeline.formats.meshes import loading as meshes
 from pipeline.formats.meshes.pieces import are_closed, pieces_of
@@ -130,8 +131,9 @@ def _add_mesh(builder: _Builder, path: Path, model: MeshModel, world: Georeferen
         bad, right = int(np.flatnonzero(~near)[0]), f"finite coordinates, at most {FARTHEST_M:g} m"
         raise InputError(f"{path}: vertex {bad}", f"{mesh.vertices[bad].tolist()}", right)
     faces = len(mesh.faces)
-    mesh.merge_vertices(merge_tex=True, merge_norm=True)
-    mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
+    with reading(path, meshes.A_MESH, "cannot be taken apart"):
+        mesh.merge_vertices(merge_tex=True, merge_norm=True)
+        mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
     if len(mesh.faces) == 0:
         raise InputError(path, f"none of its {faces} triangles has an area", "a triangle mesh")
     if dropped := faces - len(mesh.faces):

@@ -46,12 +46,13 @@ ROWS = {
 }
 
 
-def parquet_bytes():
+def parquet_bytes(name=b"b"):
     nan = float("nan")
+    names = pa.array([b"", name, b"a", name]).view(pa.string())
     table = pa.table(
         {
             "timestep_time": [0.0, 0.5, 0.5, 1.0],
-            "vehicle_id": ["", "b", "a", "b"],
+            "vehicle_id": names,
             "vehicle_x": [nan, 1.0, -1.25, 2.5],
             "vehicle_y": [nan, 2.0, 1000.0, 2.0],
             "vehicle_angle": pa.array([nan, 90.0, 360.0, 90.0], pa.float32()),
@@ -126,6 +127,15 @@ BAD = {
     "XML with NaN": (XML.replace('"360.00"', '"nan"').encode(), r"vehicle element 2: angle of vehicle 'a' is nan"),
     "XML with entities": (b'<!DOCTYPE f [<!ENTITY a "b">]><fcd-export>&a;</fcd-export>', r"declares XML entities"),
     "truncated Parquet": (parquet_bytes()[:-30], r"cannot be read as Parquet"),
+    "Parquet with a name that is no text": (
+        parquet_bytes().replace(b"vehicle_angle", b"vehicle\xffangle"),
+        r"cannot be read as Parquet \(it is no text in utf-8: byte 7 is 0xff\)",
+    ),
+    "Parquet with an id that is no text": (parquet_bytes(b"\xff"), r"cannot be read as Parquet \(.*UTF8"),
+    "infinite speed": (
+        f"{HEADER}\n{row(speed='inf')}\n".encode(),
+        r"row 1: speed of vehicle 'v' is inf; a finite number",
+    ),
 }
 
 

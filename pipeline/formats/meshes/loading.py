@@ -28,6 +28,11 @@ KINDS = ("ply", "obj", "stl", "glb", "gltf", "off")
 A_MESH = "a mesh that trimesh reads: PLY, OBJ, STL, GLB"
 
 _ELEMENT = re.compile(rb"(?m)^element[ \t]+(\S+)[ \t]+(\d+)[ \t\r]*$")
+_WRONG_IN_OBJ = (
+    (re.compile(rb"(?m)^[ \t]*[-+.0-9][^\n]*"), "is of no kind of line"),
+    (re.compile(rb"(?m)^v(?:[ \t]+[^ \t\r\n]+){0,2}[ \t\r]*$"), "has fewer than three coordinates"),
+    (re.compile(rb"(?m)^f[ \t](?:[^\n]*[ \t])?0+(?=[ \t\r\n/]|\Z)"), "names vertex 0, and the first is 1"),
+)
 _HALF_UNDERSTOOD = ("failed to populate", "didn't decode")
 """What trimesh goes on after, with a part of the file."""
 
@@ -52,6 +57,8 @@ def load(path: Path, place: str) -> trimesh.Trimesh:
         if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
             raise InputError(place, "holds no triangles", "a triangle mesh")
         limits.TRIANGLES.check(place, max(len(mesh.faces), len(mesh.vertices) / 3))
+        if mesh.vertices.ndim != 2 or mesh.vertices.shape[1] != 3:
+            raise InputError(place, f"its vertices have the shape {mesh.vertices.shape}", "x, y and z of each")
         if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
             wrong = mesh.faces.min() if mesh.faces.min() < 0 else mesh.faces.max()
             raise InputError(place, f"a triangle names vertex {wrong} of {len(mesh.vertices)}", "a whole mesh")
@@ -63,6 +70,8 @@ def _check_size(path: Path, place: str, kind: str) -> None:
     data = limits.read_bytes(path, limits.FILE, place)
     if kind in ("glb", "gltf"):
         gltf.check(path, place, data)
+    elif kind == "obj":
+        _check_obj(data, place)
     elif kind == "ply":
         head, _, body = data.partition(b"end_header")
         counts = [(name.decode("latin-1"), int(digits[:18])) for name, digits in _ELEMENT.findall(head)]
@@ -72,6 +81,17 @@ def _check_size(path: Path, place: str, kind: str) -> None:
             told = " and ".join(f"{count} of {name!r}" for name, count in counts)
             raise InputError(place, f"says that it holds {told} in {lines} {'lines' if is_text else 'bytes'}", A_MESH)
         limits.TRIANGLES.check(place, declared / 4)
+
+
+def _check_obj(data: bytes, place: str) -> None:
+    """InputError where an OBJ has a line that no reader should guess at: numbers of nothing, a vertex without three
+    coordinates, a face that names vertex 0, where counting starts at 1."""
+    joined = data.replace(b"\\\n", b"  ").replace(b"\\\r\n", b"   ")  # lines that go on
+    for wrong, what in _WRONG_IN_OBJ:
+        if (found := wrong.search(joined)) is not None:
+            line = data.count(b"\n", 0, found.start()) + 1
+            text = found[0].strip()[:80].decode("utf-8", "replace")
+            raise InputError(f"{place}: line {line}", f"{text!r} {what}", A_MESH)
 
 
 @contextmanager
