@@ -239,7 +239,7 @@ def test_a_rule_of_too_many_places_is_refused_at_once(mini: Path, setting: str, 
 
 
 def test_too_many_combinations_are_refused(mini: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sites, "MOST_CANDIDATES", 5)
+    monkeypatch.setenv("EGVS_MAX_SITES", "5")
     rule = "sites.grid={low_m=[0,0],high_m=[1,0],spacing_m=1,heights_m=[3,4,5]}"
     with pytest.raises(
         InputError, match=r"more than 5 candidates \(each combination of place, height and pitch is one\)"
