@@ -85,7 +85,7 @@ class Recording:
     summary
         To be asked for when the rows are through; None of a finished file.
     source
-        For messages about rows: the finished file; empty where SUMO wrote them.
+        For messages about rows: the finished file, or the files that SUMO ran; empty of a running SUMO.
     """
 
     rows: Iterable[pa.Table]
@@ -163,6 +163,7 @@ def _simulated(
             _stopped_on_purpose(prepared),
             None if not prepared.adds_traffic else (fcd.read(persons, "person") if _has_rows(persons) else ()),
             lambda: summary,
+            f"{sumo_folder.place_of(scenario)} ({_names(prepared)})",
         )
     finally:
         for written in (path, persons, folder / DRIVEN, folder / STATISTICS):
@@ -175,9 +176,14 @@ def _sumo_runs(prepared: Prepared, scenario: Scenario) -> Iterator[None]:
     try:
         yield
     except sumo.RefusedError as error:
-        names = ", ".join(path.name for path in prepared.given)
         right = "what SUMO runs without an error; it read copies of these files"
-        raise InputError(sumo_folder.place_of(scenario), f"SUMO cannot run {names}: {error}", right) from None
+        raise InputError(
+            sumo_folder.place_of(scenario), f"SUMO cannot run {_names(prepared)}: {error}", right
+        ) from None
+
+
+def _names(prepared: Prepared) -> str:
+    return ", ".join(path.name for path in prepared.given)
 
 
 @contextmanager

@@ -168,11 +168,9 @@ def polygons_of(
         shape = shape.buffer(radius, quad_segs=_QUARTER_SIDES, cap_style=cap)
     elif "Polygon" not in shape.geom_type:
         raise InputError(shape_place, f"is a {shape.geom_type}", "a Polygon, LineString or Point, or their Multi forms")
-    parts = [
-        p
-        for p in shapely.get_parts(_sound(shape, shape_place, mended, reading.convert is not None, mends_crossings))
-        if "Polygon" in p.geom_type
-    ]
+    sound = _sound(shape, shape_place, mended, reading.convert is not None, mends_crossings)
+    areas = [part for part in shapely.get_parts(sound) if "Polygon" in part.geom_type]
+    parts = [polygon for area in areas for polygon in shapely.get_parts(area)]  # mended ones lie deeper
     if not parts:
         raise InputError(shape_place, "encloses no area", "a polygon with three corners that are not in line")
     return parts
