@@ -202,7 +202,7 @@ def _network(extract: Extract, osm: Path, flags: Sequence[str]) -> tuple[str, St
     with files.scratch() as work:
         write_streets(extract, work / "streets.osm.xml")
         try:
-            sumo.run("netconvert", ["--osm-files", "streets.osm.xml", *flags, "-o", NETWORK], work)
+            sumo.netconvert(["--osm-files", "streets.osm.xml", *flags], work, NETWORK)
             streets = junctions.read(work / NETWORK)
         except (RunError, InputError) as error:
             if re.search(r"No (nodes|edges) loaded|has no road", str(error)):

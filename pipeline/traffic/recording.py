@@ -7,8 +7,6 @@ running; a finished file, of which nothing is promised.
 from __future__ import annotations
 
 import math
-import re
-import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import AbstractContextManager, contextmanager
@@ -18,7 +16,7 @@ from time import perf_counter
 
 import pyarrow as pa
 
-from pipeline.core.errors import InputError, RunError
+from pipeline.core.errors import InputError
 from pipeline.core.findings import Finding
 from pipeline.core.progress import Progress
 from pipeline.formats import safe_xml
@@ -33,6 +31,7 @@ from pipeline.traffic.finished import sizes as finished_sizes
 from pipeline.traffic.finished import survey
 from pipeline.traffic.finished.sizes import kind_sizes
 from pipeline.traffic.frames import Window
+from pipeline.traffic.guarded import endings
 from pipeline.traffic.sumo_folder import (
     COLLISIONS,
     CONFIG,
@@ -234,37 +233,24 @@ def check_whole(prepared: Prepared) -> None:
     """RunError where SUMO did not write a file to its end: on a full disk it ends without a word or an error."""
     folder, outputs = prepared.folder, prepared.outputs.values()
     for name in (name for name in (FCD, PERSONS, COLLISIONS, STOPS, STATISTICS, DRIVEN) if name in outputs):
-        end = rb"\n" if name not in _ROOTS else rf"(</{_ROOTS[name]}>|<{_ROOTS[name]}[^<>]*/>)\s*\n".encode()
-        if re.search(end + rb"\Z", _tail(folder / name)) is None:
-            raise _cut(folder / name)
+        if name in _ROOTS:
+            endings.check_xml(folder / name, _ROOTS[name])
+        else:
+            endings.check_table(folder / name)
     last_ms = prepared.timing.end_ms - prepared.timing.step_ms
     if STATISTICS in outputs and _vehicles(prepared)["running"] and (_last_time_ms(folder / FCD) or 0) < last_ms:
-        raise _cut(folder / FCD)
-
-
-def _cut(path: Path) -> RunError:
-    free_mb = shutil.disk_usage(path.parent).free / 1e6
-    return RunError(f"{path}: SUMO did not write it to its end; is the disk full? ({free_mb:,.0f} MB are free there)")
+        raise endings.cut(folder / FCD)
 
 
 def _last_time_ms(path: Path) -> int | None:
     """The time of the last whole row of a CSV that is being written."""
     if not path.is_file():
         return None
-    lines = _tail(path).split(b"\n")
+    lines = endings.tail(path).split(b"\n")
     try:
         return round(float(lines[-2].split(b";")[0]) * 1000) if len(lines) > 2 else None
     except ValueError:
         return None
-
-
-def _tail(path: Path) -> bytes:
-    """The file's last bytes; none where there is no such file."""
-    if not path.is_file():
-        return b""
-    with path.open("rb") as file:
-        file.seek(max(0, path.stat().st_size - 512))
-        return file.read()
 
 
 def type_sizes(prepared: Prepared) -> dict[str, Size]:

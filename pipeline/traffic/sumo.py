@@ -28,7 +28,7 @@ from typing import IO, Any
 
 from pipeline.core.errors import InputError, MissingBackendError, RunError
 from pipeline.core.sumo_home import sumo_home
-from pipeline.traffic.guarded import confined
+from pipeline.traffic.guarded import confined, endings
 
 APT_LINE = "apt-get install libatomic1 libx11-6 libxext6 libxrender1 libgl1"
 """What SUMO's binaries need on a minimal Debian."""
@@ -130,6 +130,13 @@ def run(
         When it, or a system library that it needs, is not installed.
     """
     return _run(name, [str(binary(name)), *arguments], folder, log or Path(os.devnull), watch)
+
+
+def netconvert(arguments: Sequence[str], folder: Path, name: str) -> None:
+    """Have netconvert make the network ``name`` in a folder; raises what :func:`run` does, and RunError where it did
+    not write the network to its end."""
+    run("netconvert", [*arguments, "-o", name], folder)
+    endings.check_xml(folder / name, "net")
 
 
 def run_tool(name: str, arguments: Sequence[str], folder: Path) -> str:

@@ -334,7 +334,7 @@ def _converted(path: Path, _content: str) -> bytes:
         else:
             copies.copy(path, folder / MAP)
         try:
-            sumo.run("netconvert", ["--osm-files", MAP, *_OSM_FLAGS, "-o", NETWORK], folder)
+            sumo.netconvert(["--osm-files", MAP, *_OSM_FLAGS], folder, NETWORK)
         except sumo.RefusedError as error:
             raise InputError(
                 path, f"is no map that streets can be made of: {error}", "a whole map; fetch it again"

@@ -70,3 +70,11 @@ def damaged(monkeypatch, name, damage):
         return printed
 
     monkeypatch.setattr(sumo, "run", cut)
+
+
+def test_a_network_that_netconvert_did_not_write_to_its_end_is_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(sumo, "run", lambda *_: (tmp_path / "a.net.xml").write_text("<net>\n <edge"))
+    with pytest.raises(RunError, match=r"a\.net\.xml: SUMO did not write it to its end; is the disk full\?"):
+        sumo.netconvert([], tmp_path, "a.net.xml")
+    monkeypatch.setattr(sumo, "run", lambda *_: (tmp_path / "a.net.xml").write_text("<net>\n</net>\n"))
+    sumo.netconvert([], tmp_path, "a.net.xml")
