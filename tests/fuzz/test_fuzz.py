@@ -44,6 +44,7 @@ FAULTS = {
     "signal 6": "os.abort()",
     "exit code 1": "sys.exit(1)",
     "memory": "bytearray(b'1') * (600 << 20)",
+    "out of time": "while True: pass",
     "file not named": "sys.exit(2)",
     "result unreadable": "[path.write_bytes(b'') for path in pathlib.Path('out').glob('*.parquet')]",
 }
@@ -60,6 +61,7 @@ from tests.fuzz import cases
 from tests.fuzz.kinds import KINDS
 cases.MOST_BYTES = 1 << 29
 bench = cases.Bench(KINDS["sites.csv"], Path({str(tmp_path)!r}) / "bench")
+cases.MOST_SECONDS = 0.5
 for fault, line in {FAULTS!r}.items():
     def main(): exec(line)
     pipeline.cli.app.main = main
