@@ -30,6 +30,8 @@ _OPEN_FLAGS = (os.O_RDONLY, os.O_WRONLY, os.O_WRONLY)
 _USERS = (FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError)
 """What the system says of a file that the user can put right."""
 
+_LESS = "larger voxels, a smaller region, fewer beams or fewer --jobs take less"
+
 
 @contextmanager
 def told() -> Iterator[None]:
@@ -46,6 +48,8 @@ def told() -> Iterator[None]:
         sys.exit(_FAILED)
     except OSError as error:
         _fail(*of_system(error))
+    except MemoryError as error:
+        _fail(f"there is not enough memory for this ({error or 'none is left'}); {_LESS}", _FAILED)
     except SystemExit as end:  # typer's own way to end, of an interrupt too
         if end.code == _INTERRUPTED:
             _fail("interrupted; run the same command again to go on from the last whole stage", _INTERRUPTED)

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from pipeline.core import files
 from pipeline.core.errors import InputError
 from pipeline.formats import safe_xml
+from pipeline.scenario.types import coordinate_m
 
 LANE_WIDTH_M, DEFAULT_SPEED_M_S = 3.2, 13.89
 """A lane's width and speed limit where the network names none: SUMO's defaults."""
@@ -68,7 +69,7 @@ class Shape:
     def shape_m(self) -> NDArray[np.float64]:
         """(n, 3) float64, metres; z is 0 where the file names none. InputError when the text holds no coordinates."""
         try:
-            points = [[float(v) for v in point.split(",")] for point in self.text.split()]
+            points = [[coordinate_m(v) for v in point.split(",")] for point in self.text.split()]
             return np.array([[*point, 0.0][:3] for point in points], dtype=np.float64).reshape(-1, 3)
         except ValueError as error:
             raise InputError(self.place, f"a shape holds no coordinates ({error})", _RIGHT) from None
@@ -346,7 +347,7 @@ def _lane(lane: Element, path: Path) -> Lane:
 
 
 def _junction(junction: dict[str, str], path: Path) -> Junction:
-    name, at_m = junction["id"], (float(junction["x"]), float(junction["y"]))
+    name, at_m = junction["id"], (coordinate_m(junction["x"]), coordinate_m(junction["y"]))
     incoming = tuple(junction.get("incLanes", "").split())
     shape, place = junction.get("shape", ""), f"{path}: junction {name}"
     return Junction(shape, place, name, junction.get("type", ""), at_m, incoming)
@@ -371,7 +372,7 @@ def _road_connections(connections: Iterable[dict[str, str]], roads: Sequence[Edg
 
 def _point(text: str) -> tuple[float, float]:
     x, y = text.split(",")[:2]
-    return float(x), float(y)
+    return coordinate_m(x), coordinate_m(y)
 
 
 def is_osm(path: Path) -> bool:

@@ -15,6 +15,7 @@ from __future__ import annotations
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import lru_cache
 from pathlib import Path
 from typing import IO
 from xml.etree.ElementTree import Element, tostring
@@ -46,9 +47,7 @@ def copy(path: Path, to: Path) -> list[str]:
 
     InputError when it is not well-formed, declares entities, or names a further file that SUMO would read.
     """
-    unwritten: Counter[str] = Counter()
-    for child in _guarded(path):
-        unwritten.update(element.tag for element in child.iter() if _output_keys(element))
+    unwritten = _outputs_of(path, files.sha256_of(path))
     with files.aside(to) as partial, partial.open("wb") as file:
         if unwritten or safe_xml.encoding_of_file(path) not in ("utf-8", "ascii"):
             _rewrite(path, file)
@@ -57,8 +56,22 @@ def copy(path: Path, to: Path) -> list[str]:
                 shutil.copyfileobj(source, file)
     if not unwritten:
         return []
-    told = ", ".join(f"{count} of <{tag}>" for tag, count in sorted(unwritten.items()))
+    told = ", ".join(f"{count} of <{tag}>" for tag, count in unwritten)
     return [f"{path.name}: SUMO's outputs that it asks for are not written: {told}"]
+
+
+def check(path: Path) -> None:
+    """InputError where :func:`copy` would refuse a file."""
+    _outputs_of(path, files.sha256_of(path))
+
+
+@lru_cache(maxsize=32)
+def _outputs_of(path: Path, _content: str) -> tuple[tuple[str, int], ...]:
+    """The elements of a file that ask for an output, and how many; read once for the check and the copy."""
+    found: Counter[str] = Counter()
+    for child in _guarded(path):
+        found.update(element.tag for element in child.iter() if _output_keys(element))
+    return tuple(sorted(found.items()))
 
 
 def _guarded(path: Path, on_root: Callable[[Element], None] = lambda root: None) -> Iterator[Element]:

@@ -73,3 +73,15 @@ def test_what_would_have_sumo_read_a_further_file_is_refused(tmp_path, text):
         '<additional><variableSpeedSign id="v"><step time="0" speed="9"/></variableSpeedSign></additional>'
     )
     assert copies.copy(tmp_path / "a.xml", tmp_path / "copy.xml") == []
+
+
+def test_what_was_checked_is_not_parsed_again_unless_it_is_another(tmp_path, monkeypatch):
+    path = tmp_path / "a.xml"
+    path.write_text('<routes><a x="1"/></routes>')
+    copies.check(path)
+    with monkeypatch.context() as patch:
+        patch.setattr(copies, "_guarded", None)
+        assert copies.copy(path, tmp_path / "copy.xml") == []
+    path.write_text('<routes><include href="f"/></routes>')
+    with pytest.raises(InputError, match="has SUMO read a further file"):
+        copies.check(path)
