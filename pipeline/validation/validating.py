@@ -111,7 +111,7 @@ def validate(
 
 def _keep_inputs(scenario: Scenario, out: Path, detections: Path | None, *, keep: bool) -> None:
     """InputError where something that is read lies where something is written."""
-    keep_inputs(scenario, out, (keeping.FOLDER,) if keep else ())
+    keep_inputs(scenario, out, (keeping.FOLDER, keeping.ASIDE) if keep else ())
     if keep and detections is not None and detections.resolve().is_relative_to((out / keeping.FOLDER).resolve()):
         found = "lies where --keep writes anew"
         raise InputError(f"--detections {detections}", found, "a copy of it elsewhere, or no --keep")

@@ -143,6 +143,17 @@ def test_a_link_where_sumo_writes_is_refused(mini: Path, tmp_path: Path, egvs, p
     assert (code, error) == (2, f"egvs: {link}: {what}\n")
 
 
+@pytest.mark.parametrize("place", ["validation_kitti", ".validation_kitti.partial", "validation_kitti/pole_a"])
+def test_a_link_where_detections_are_kept_is_refused(mini: Path, tmp_path: Path, egvs, place: str) -> None:
+    link = tmp_path / "out" / place
+    link.parent.mkdir(parents=True)
+    (tmp_path / "elsewhere").mkdir()
+    link.symlink_to(tmp_path / "elsewhere")
+    code, _, error = egvs("validate", mini, "--out", tmp_path / "out", "--keep")
+    what = "is a symbolic link, and nothing is written through one; remove it"
+    assert (code, error) == (2, f"egvs: {link}: {what}\n")
+
+
 def test_artefacts_and_what_becomes_one_replace_links(mini: Path, tmp_path: Path) -> None:
     (tmp_path / "mine").write_text("kept")
     out = tmp_path / "out"

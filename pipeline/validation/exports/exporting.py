@@ -171,7 +171,8 @@ def _aside(folder: Path) -> Iterator[Path]:
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir()
         try:
-            yield partial
+            with files.naming(target):
+                yield partial
             partial.replace(target)
         except BaseException:
             shutil.rmtree(partial, ignore_errors=True)
