@@ -10,6 +10,7 @@ from tests.fuzz import bases, meaning
 from tests.fuzz.meaning import Meaning
 
 _RUN = ("run", "scenario", "--out", "out", "--jobs", "1")
+_STUDY = ("accuracy", "scenario", "--out", "out", "--budget", "1s", "--jobs", "1")
 _SCORES = ("out/scores.parquet",)
 
 
@@ -123,6 +124,7 @@ _ALL = (
          names_others=True),
     Kind("store note", "store/*/entry.json", bases.plain, meaning.nothing_else,
          (("run", "scenario", "--out", "first", "--jobs", "1"),), store=True),
+    Kind("study cache", "out/accuracy/**/*.json", bases.plain, meaning.nothing_else, (_STUDY,), _STUDY, (), store=True),
     Kind("store artefact", "store/*/*.p*", bases.plain, meaning.nothing_else,
          (("run", "scenario", "--out", "first", "--jobs", "1"),), store=True),
 )  # fmt: skip
