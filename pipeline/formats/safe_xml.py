@@ -130,6 +130,19 @@ def encoding_of_file(path: Path, name: Path | None = None) -> str:
     return encoding
 
 
+def copy_as_utf8(path: Path, to: Path) -> None:
+    """Write a file in another encoding anew, in UTF-8 and without the declaration that says otherwise."""
+    with opened(path) as file, to.open("wb") as copy:
+        text = AsUtf8(file, encoding_of_file(path))
+        start = text.read(_HEAD_BYTES)
+        while b"?>" not in start and (more := text.read(_HEAD_BYTES)):
+            start += more
+            limits.ELEMENT.check_bytes(path, len(start), "has no end of its declaration")
+        copy.write(start.partition(b"?>")[2])
+        while chunk := text.read(1 << 20):
+            copy.write(chunk)
+
+
 class _Bounded(io.RawIOBase):
     """What a packed file holds, up to the bound; beyond, InputError."""
 

@@ -11,6 +11,8 @@ milliseconds, SUMO's own unit. Rows without a vehicle (SUMO writes one for an em
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 from collections.abc import Generator, Iterable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -22,7 +24,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from pipeline.core.errors import InputError
-from pipeline.core.reading import refusing
+from pipeline.core.reading import limits, refusing
 from pipeline.formats import safe_xml
 from pipeline.formats.georeference import Georeference, Reading
 from pipeline.scenario.types import FARTHEST_M
@@ -46,6 +48,8 @@ _BLOCK_BYTES = 1 << 20
 """Arrow reads dozens of blocks ahead: with 4 MiB they take 150 MB, and reading is no faster."""
 
 _BATCH_ROWS = 1 << 16
+_MOST_ROWS_A_BYTE = 10
+"""Positions and angles that change take at least a bit a row."""
 RIGHT = "FCD with the attributes id, x, y, angle and type (--fcd-output.attributes id,x,y,z,angle,slope,type,speed)"
 """What a message asks for where a file is not right."""
 
@@ -126,6 +130,7 @@ def _parquet(path: Path, who: str) -> Iterator[pa.RecordBatch]:
         pq.ParquetFile(source) as file,
     ):
         columns = _columns(file.schema_arrow.names, path, who)
+        _check_rows(file.metadata, path)
         for batch in file.iter_batches(_BATCH_ROWS, columns=list(columns.values())):
             batch.validate(full=True)  # its texts are UTF-8
             yield batch.select(list(columns.values())).rename_columns(list(columns))
@@ -133,12 +138,24 @@ def _parquet(path: Path, who: str) -> Iterator[pa.RecordBatch]:
 
 @contextmanager
 def _seekable(path: Path) -> Iterator[Any]:
-    """Parquet is read from its end, so a gzipped one is unzipped into memory first."""
+    """Parquet is read from its end, so a gzipped one is unzipped first."""
     if safe_xml.is_gzip(path):
-        with safe_xml.opened(path) as file:
-            yield pa.BufferReader(file.read())  # within the bound of what a packed file may hold
+        with safe_xml.opened(path) as file, tempfile.TemporaryFile() as plain:
+            shutil.copyfileobj(file, plain)
+            plain.seek(0)
+            yield plain
     else:
         yield path
+
+
+def _check_rows(about: Any, path: Path) -> None:
+    """InputError where a Parquet file says that it holds more than it can."""
+    groups = [about.row_group(number) for number in range(about.num_row_groups)]
+    largest = max((group.total_byte_size for group in groups), default=0)
+    limits.UNPACKED.check_bytes(path, largest, f"has a row group of {largest / limits.MB:,.0f} MB, unpacked")
+    packed = sum(group.column(i).total_compressed_size for group in groups for i in range(group.num_columns))
+    if about.num_rows > _MOST_ROWS_A_BYTE * packed:
+        raise InputError(path, f"says that it holds {about.num_rows:,} rows in {packed:,} bytes", _WHOLE)
 
 
 def _xml(path: Path, who: str) -> Iterator[pa.RecordBatch]:

@@ -74,11 +74,12 @@ TRIANGLES = Limit("EGVS_MAX_TRIANGLES", 5_000_000, "triangles", "a mesh")
 SITES = Limit("EGVS_MAX_SITES", 100_000, "candidates", "a scenario's sites")
 BEAMS = Limit("EGVS_MAX_BEAMS", 3_000_000, "beams", "one turn of a sensor")
 VOXELS = Limit("EGVS_MAX_VOXELS", 2**30, "voxels", "a region of interest")
+ROWS = Limit("EGVS_MAX_ROWS", 3_000_000, "rows", "the frames of an FCD file that are held at a time")
 OBJECTS = Limit("EGVS_MAX_MAP_OBJECTS", 5_000_000, "objects", "a map of OpenStreetMap")
 GROUND = Limit("EGVS_MAX_GROUND_POINTS", 2_000_000, "points", "the ground that is laid through a network")
 CHILD = Limit("EGVS_MAX_READER_MB", 2000, "MB", "the program that unpacks a LAZ file")
 
-ALL = (DOCUMENT, FILE, UNPACKED, ELEMENT, POINTS, TRIANGLES, SITES, BEAMS, VOXELS, OBJECTS, GROUND, CHILD)
+ALL = (DOCUMENT, FILE, UNPACKED, ELEMENT, POINTS, TRIANGLES, SITES, BEAMS, VOXELS, ROWS, OBJECTS, GROUND, CHILD)
 
 
 def size_of(path: Path, limit: Limit, place: object = "") -> int:
