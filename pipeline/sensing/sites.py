@@ -357,7 +357,7 @@ def _lines(rules: tuple[SiteLine, ...]) -> Iterator[_Row]:
     for rule in rules:
         line = np.asarray(rule.line_m)
         along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
-        _check_number(along[-1] / rule.spacing_m, "sites.along", f"spacing_m = {rule.spacing_m:g}")
+        _check_number(float(along[-1]) / rule.spacing_m, "sites.along", f"spacing_m = {rule.spacing_m:g}")
         where = np.arange(math.floor(along[-1] / rule.spacing_m + 1e-9) + 1) * rule.spacing_m
         xs, ys = np.interp(where, along, line[:, 0]), np.interp(where, along, line[:, 1])
         _check_number(len(spots) + len(where), "sites.along", f"spacing_m = {rule.spacing_m:g}")

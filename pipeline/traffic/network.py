@@ -325,7 +325,8 @@ def location_of(path: Path, root: str = "net") -> Location | None:
 
 
 def _location(element: Element) -> Location:
-    return Location(element.get("projParameter", ""), _point(element.attrib["netOffset"]))
+    x, y = map(float, element.attrib["netOffset"].split(",")[:2])  # -1e10 in a network of no road
+    return Location(element.get("projParameter", ""), (x, y))
 
 
 def _edge(element: Element, path: Path) -> Edge:
