@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: run test test-train unit lint bench scaling numerics validity detectability pictures schema docs clean
+.PHONY: run test test-train unit lint bench scaling numerics validity detectability pictures schema docs fuzz clean
 
 run: $(VENV)/.installed
 	$(BIN)/egvs run scenarios/nishishinjuku
@@ -51,6 +51,10 @@ detectability: $(VENV)/.installed-dev
 
 pictures: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.pictures
+
+# FUZZ: options, as in FUZZ="--cases 10000 --seed 2"; what is bad lies in build/fuzz
+fuzz: $(VENV)/.installed-dev
+	$(BIN)/python -m tests.fuzz $(FUZZ)
 
 schema: $(VENV)/.installed
 	$(BIN)/python -c "from pipeline.scenario.loading import json_schema; print(json_schema(), end='')" > data_schemas/scenario.schema.json

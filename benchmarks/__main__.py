@@ -24,7 +24,7 @@ from rich.console import Console
 from rich.table import Table
 
 import pipeline
-from benchmarks import casting, clouds, detection, effects, judging, others, savings, stability
+from benchmarks import casting, clouds, detection, effects, guards, judging, others, savings, stability
 from benchmarks.scenes import run_stage
 from pipeline.artefacts.readers import read_tpog
 from pipeline.core.parallel import in_order
@@ -182,6 +182,7 @@ def main() -> None:
         ("what stability costs", stability.rows),
         ("what exact hits cost", casting.rows),
         ("what leaving out the unseen saves", savings.rows),
+        ("what it costs not to trust files", guards.rows),
         ("what other ways cost, and how wrong they are", others.rows),
     ):
         console.print(f"\n{title}")

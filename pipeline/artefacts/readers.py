@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from pipeline.artefacts import tables
+from pipeline.artefacts import checksums, tables
 from pipeline.artefacts.periods import PeriodBlocks, periods_of, times_of_blocks
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Grid
@@ -23,6 +23,9 @@ from pipeline.kernels.crossings import accumulate
 
 SEPARABLE = 0.9
 """Neighbours in rank are told apart when the chance that the better is better (``beats_next``) reaches this."""
+
+ACCURACY_SUMS, VALIDATION_SUMS, PLACEMENT_SUMS = "accuracy.sha256", "validation.sha256", "placement.sha256"
+"""Checksums of what ``egvs accuracy``, ``egvs validate`` and ``egvs place`` leave."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +119,7 @@ def read_accuracy(path: str | Path) -> tuple[list[dict[str, Any]], dict[str, Any
     path = Path(path)
     if not path.is_file():
         return None
+    checksums.check(path.with_name(ACCURACY_SUMS), "remove it, or run egvs accuracy again")
     try:
         table, about = tables.read(path, "accuracy")
     except InputError as error:
@@ -131,6 +135,7 @@ def read_placement(
     paths = Path(placement), Path(curve)
     if not all(path.is_file() for path in paths):
         return None
+    checksums.check(paths[0].with_name(PLACEMENT_SUMS), "remove it, or run egvs place again")
     found = []
     for path in paths:
         try:
@@ -150,6 +155,7 @@ def read_validation(
     paths = Path(detection), Path(correlation)
     if not all(path.is_file() for path in paths):
         return None
+    checksums.check(paths[0].with_name(VALIDATION_SUMS), "remove it, or run egvs validate again")
     found = []
     for path in paths:
         try:

@@ -15,8 +15,9 @@ from pipeline.core.errors import InputError
 from pipeline.core.grid import Grid
 
 COLUMNS = ("x_m", "y_m", "z_m", "yaw_rad", "pitch_rad", "length_m", "width_m", "height_m")
-SMALLEST_M = 1e-3
-"""What is smaller than this is no box: it must stay one when it is made smaller on each side."""
+SMALLEST_M, LARGEST_M = 1e-3, 2000.0
+"""What is smaller than this is no box: it must stay one when it is made smaller on each side; what is larger than any
+train, no vehicle."""
 
 
 @dataclass(frozen=True)
@@ -69,10 +70,13 @@ def _may_hold(statistics: Any, wanted: NDArray[np.int64]) -> bool:
 
 
 def _check(path: Path, frame: NDArray[np.int64], values: NDArray[np.float64]) -> None:
-    sound = np.isfinite(values).all(axis=1) & (values[:, 5:8] >= SMALLEST_M).all(axis=1)
+    of_vehicles = (values[:, 5:8] >= SMALLEST_M) & (values[:, 5:8] <= LARGEST_M)
+    sound = np.isfinite(values).all(axis=1) & of_vehicles.all(axis=1)
     if not sound.all():
         bad = int(np.flatnonzero(~sound)[0])
         shown = ", ".join(f"{name} = {value:g}" for name, value in zip(COLUMNS, values[bad], strict=True))
         raise InputError(
-            f"{path}: frame {frame[bad]}", f"a box with {shown}", f"finite values, sizes of at least {SMALLEST_M} m"
+            f"{path}: frame {frame[bad]}",
+            f"a box with {shown}",
+            f"finite values, sizes of at least {SMALLEST_M} m and at most {LARGEST_M:g} m",
         )

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from pipeline.core import files
 from pipeline.core.cost import Cost
 from pipeline.core.errors import InputError
+from pipeline.core.reading import documents
+from pipeline.core.reading.seals import SEAL, is_sealed, sealed
 
 RECORD = "run.json"
+_RIGHT = "remove it and run again"
 
 STAGES = ("check", "statics", "scan", "traffic", "tpog", "score", "report")
 """In the order of running: what can be refused is refused first; the quick branch comes before SUMO runs."""
@@ -31,6 +33,8 @@ class StageRecord:
         What the stage says of it.
     cost
         Of the run that made it, which may be another one where it came from the store.
+    companions
+        Name -> sha256 of what it wrote beside its artefacts, by the path in the run's folder: ``sumo/run.sumocfg``.
     """
 
     inputs: str
@@ -38,6 +42,7 @@ class StageRecord:
     artefacts: dict[str, str]
     summary: dict[str, Any]
     cost: Cost
+    companions: dict[str, str] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """As ``run.json`` holds it."""
@@ -53,9 +58,13 @@ class StageRecord:
                 "artefacts": dict(artefacts),
                 "summary": dict(summary),
                 "cost": {"seconds": int() | float() as seconds, "peak_mb": int() | float() as peak_mb},
-            } if all(isinstance(digest, str) for digest in (*read.values(), *artefacts.values())):
-                return cls(inputs, read, artefacts, summary, Cost(seconds=seconds, peak_mb=peak_mb))
+            } if _are_digests(read, artefacts, beside := value.get("companions", {})):
+                return cls(inputs, read, artefacts, summary, Cost(seconds=seconds, peak_mb=peak_mb), beside)
         return None
+
+
+def _are_digests(*tables: Any) -> bool:
+    return all(isinstance(table, dict) and all(isinstance(its, str) for its in table.values()) for table in tables)
 
 
 @dataclass(frozen=True)
@@ -82,18 +91,18 @@ class RunRecord:
     def read(cls, folder: Path) -> RunRecord:
         """From ``folder / "run.json"``; InputError when it is none."""
         path = folder / RECORD
-        try:
-            value: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-            stages = {name: StageRecord.from_json(stage) for name, stage in value["stages"].items()}
-        except (FileNotFoundError, NotADirectoryError):
-            raise InputError(path, "no such file", "a folder that egvs run has written") from None
-        except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise InputError(path, f"is not a run's record ({error})", "remove it and run again") from None
-        for key, kind in (("egvs", str), ("seed", int), ("scenario", dict), ("scenario_folder", str)):
-            if not isinstance(value.get(key), kind):
-                found = f"is not a run's record ({key!r} is {value.get(key)!r})"
-                raise InputError(path, found, "remove it and run again")
-        known = {name: stage for name in STAGES if (stage := stages.get(name)) is not None}
+        if not path.is_file():
+            raise InputError(path, "no such file", "a folder that egvs run has written")
+        value = documents.read_json(path, _RIGHT)
+        if isinstance(value, dict) and SEAL in value and not is_sealed(value):
+            raise InputError(path, "was altered after the run: its own_sha256 is of other content", _RIGHT)
+        kinds = {"egvs": str, "seed": int, "scenario": dict, "scenario_folder": str, "stages": dict}
+        for key, kind in kinds.items():
+            found = value.get(key) if isinstance(value, dict) else value
+            if not isinstance(found, kind):
+                raise InputError(path, f"is not a run's record ({key!r} is {found!r})", _RIGHT)
+        stages = value["stages"] if SEAL in value else {}  # without a seal: of another version of this program
+        known = {n: stage for n in STAGES if (stage := StageRecord.from_json(stages.get(n))) is not None}
         return cls(value["egvs"], value["seed"], value["scenario"], value["scenario_folder"], known)
 
     @property
@@ -102,7 +111,7 @@ class RunRecord:
         settings were others then.
         """
         read = [stage.files for stage in self.stages.values()]
-        written = [stage.artefacts for stage in self.stages.values()]
+        written = [stage.artefacts | stage.companions for stage in self.stages.values()]
         return {name: digest for part in (*read, *written) for name, digest in part.items()}
 
     def having(self, name: str, stage: StageRecord | None) -> RunRecord:
@@ -113,4 +122,4 @@ class RunRecord:
     def write(self, folder: Path) -> None:
         """Write ``folder / "run.json"``."""
         value = {**self.__dict__, "stages": {name: stage.to_json() for name, stage in self.stages.items()}}
-        files.write_text(folder / RECORD, files.json_text(value, indent=2) + "\n")
+        files.write_text(folder / RECORD, files.json_text(sealed(value), indent=2) + "\n")

@@ -6,7 +6,6 @@ the Parquet key ``egvs``. Nothing in a file depends on the clock, the machine, t
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -19,7 +18,8 @@ import pyarrow.parquet as pq
 from pipeline.artefacts import periods, schemas
 from pipeline.core import files
 from pipeline.core.errors import InputError
-from pipeline.core.grid import MAX_VOXELS, Grid
+from pipeline.core.grid import Grid
+from pipeline.core.reading import documents, limits
 
 _KEY = b"egvs"
 _WRITE = {"compression": "zstd", "compression_level": 3, "version": "2.6", "write_statistics": True}
@@ -141,7 +141,7 @@ def _metadata(path: Path, artefact: str, raw: bytes) -> dict[str, Any]:
     """The checked metadata; InputError naming what is wrong with it."""
     right = "an unaltered file; make it again"
     try:
-        metadata = json.loads(raw)
+        metadata = documents.json_value(raw)
     except (ValueError, RecursionError) as error:
         raise InputError(path, f"its metadata is no JSON ({error})", right) from None
     if not isinstance(metadata, dict):
@@ -163,7 +163,7 @@ def _is_sound(key: str, value: Any) -> bool:
             grid = Grid.from_json(value)
         except (KeyError, TypeError, ValueError, AttributeError):
             return False
-        return grid.voxel_m > 0 and min(grid.shape) > 0 and math.prod(grid.shape) <= MAX_VOXELS
+        return grid.voxel_m > 0 and min(grid.shape) > 0 and math.prod(grid.shape) <= limits.VOXELS.most
     if key == "sites":
         return isinstance(value, list) and all(isinstance(s, dict) and all(k in s for k in _SITE) for s in value)
     if key == "periods":
@@ -196,7 +196,7 @@ def _are_cells(value: Any) -> bool:
         grid = Grid.from_json({"origin_m": [x, y, 0.0], "voxel_m": edge, "shape": [nx, ny, 1]})
     except (KeyError, TypeError, ValueError):
         return False
-    return grid.voxel_m > 0 and min(grid.shape) > 0 and math.prod(grid.shape) <= MAX_VOXELS
+    return grid.voxel_m > 0 and min(grid.shape) > 0 and math.prod(grid.shape) <= limits.VOXELS.most
 
 
 @contextmanager

@@ -16,9 +16,9 @@ from pipeline.scenario.models import Scenario
 from pipeline.world.mesh import World
 
 RULES: tuple[Callable[[Subject], Iterator[Finding]], ...] = (
-    region.lanes, region.of_periods, traffic.times, traffic.weights, traffic.demand_there, traffic.recorded_places,
-    traffic.finished, traffic.kinds, traffic.counts, sensing.known, sensing.repeated, sensing.complete,
-    sites.poses, sites.on_lanes, sites.dropped, solids.over_lanes, solids.far_away,
+    region.lanes, region.of_periods, traffic.times, traffic.readable, traffic.weights, traffic.demand_there,
+    traffic.recorded_places, traffic.finished, traffic.kinds, traffic.counts, sensing.known, sensing.repeated,
+    sensing.complete, sites.poses, sites.on_lanes, sites.dropped, solids.over_lanes, solids.far_away,
 )  # fmt: skip
 """In the order in which findings are told. A further rule is a function here."""
 

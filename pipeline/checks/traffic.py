@@ -13,10 +13,11 @@ from pipeline.core.errors import InputError
 from pipeline.core.findings import Finding
 from pipeline.effects import on_traffic
 from pipeline.scenario.models import Scenario
-from pipeline.traffic import fcd, sumo, sumo_folder
+from pipeline.traffic import fcd, network, sumo, sumo_folder
 from pipeline.traffic.demand import counts as demand
 from pipeline.traffic.demand import given, trips
 from pipeline.traffic.finished import sizes, survey
+from pipeline.traffic.guarded import copies
 from pipeline.world import world_frame
 
 Rule = Callable[[Subject], Iterator[Finding]]
@@ -42,6 +43,20 @@ def times(subject: Subject) -> Iterator[Finding]:
         given = refusals.unless_refused("traffic", lambda: sumo_folder.sources(scenario))
         begin_s = 0.0 if given is None else given.begin_s
         refusals.unless_refused("traffic", lambda: sumo_folder.timing(scenario.traffic, begin_s, place))
+    yield from refusals.found
+
+
+@_of_each_period
+def readable(subject: Subject) -> Iterator[Finding]:
+    """An error for each file that SUMO may not read: damaged, hostile, or one that pulls in another."""
+    refusals = Refusals()
+    try:
+        given = [] if subject.scenario.traffic.fcd is not None else sumo_folder.sources(subject.scenario).all()
+    except InputError:
+        return  # which is told elsewhere
+    for path in given:
+        if path.is_file() and not network.is_osm(path):
+            refusals.unless_refused("traffic", partial(copies.check, path))
     yield from refusals.found
 
 

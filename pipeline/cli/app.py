@@ -5,16 +5,14 @@ Heavy modules are imported by the verb that needs them, so that ``egvs --help`` 
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.cli import arguments, interrupts, placement, validation_verbs
+from pipeline.cli import arguments, ending, interrupts, placement, validation_verbs
 from pipeline.cli.arguments import Audit, Jobs, Out, ScenarioPath, Set, Top
-from pipeline.core.errors import EgvsError, InputError
-from pipeline.core.findings import FindingsError
+from pipeline.core.errors import InputError
 from pipeline.core.version import __version__
 
 if TYPE_CHECKING:
@@ -28,30 +26,11 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-_INTERRUPTED = 130
-"""Exit code after Ctrl-C."""
-
 
 def main() -> None:
     """Entry point: errors of this program become one message and an exit code."""
-    try:
-        with interrupts.after_imports():
-            app()
-    except EgvsError as error:
-        for warning in error.warnings if isinstance(error, FindingsError) else ():
-            print(f"warning: {warning}", file=sys.stderr)
-        _fail(str(error), error.exit_code)
-    except OSError as error:
-        _fail(f"{error.filename or 'system'}: {error.strerror or error}", 1)
-    except SystemExit as end:  # typer's own way to end, of an interrupt too
-        if end.code == _INTERRUPTED:
-            _fail("interrupted; run the same command again to go on from the last whole stage", _INTERRUPTED)
-        raise
-
-
-def _fail(message: str, code: int) -> None:
-    print(f"egvs: {message}", file=sys.stderr)
-    sys.exit(code)
+    with ending.told(), interrupts.after_imports():
+        app()
 
 
 def _print_version(wanted: bool) -> None:
@@ -227,7 +206,7 @@ def compare(
     top: Top = None,
 ) -> None:
     """Runs side by side: scores, ranks, how well they agree, and what differs in their settings."""
-    from pipeline.cli import comparison_tables
+    from pipeline.cli.studies import comparison_tables
     from pipeline.studies import run_comparison
 
     comparison_tables.print_comparison(run_comparison.compare(runs), top)
@@ -254,8 +233,8 @@ def accuracy(
     ] = 0,
 ) -> None:
     """What accuracy costs in time, and the cheapest setting within a tolerance."""
-    from pipeline.cli import study_tables
     from pipeline.cli.progress import Screen
+    from pipeline.cli.studies import accuracy_tables
     from pipeline.studies.accuracy import study
 
     _, folder = _resolved(scenario, set_, out)
@@ -271,7 +250,7 @@ def accuracy(
             progress=screen.progress,
             listener=screen.setting_event,
         )
-    study_tables.print_study(outcome, arguments.command("run", scenario, set_))
+    accuracy_tables.print_study(outcome, arguments.command("run", scenario, set_))
 
 
 @app.command()

@@ -7,6 +7,14 @@ with.
 
 from __future__ import annotations
 
+import re
+
+LONGEST_LINE, MOST_LINES = 600, 200
+"""Characters and lines of a message: a file's whole content helps nobody."""
+
+_STEERS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+"""Signs that a terminal obeys, and halves of characters, which no file can hold."""
+
 
 class EgvsError(Exception):
     """Base of all errors that this program raises on purpose."""
@@ -30,8 +38,8 @@ class InputError(EgvsError):
     exit_code = 2
 
     def __init__(self, place: object, found: str, right: str = "") -> None:
-        self.place, self.found, self.right = str(place), found, right
-        super().__init__(f"{place}: {found}" + (f"; {right}" if right else ""))
+        self.place, self.found, self.right = cut(str(place)), cut(found), cut(right)
+        super().__init__(f"{self.place}: {self.found}" + (f"; {self.right}" if right else ""))
 
     def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
         return InputError, (self.place, self.found, self.right)  # to be told in another process
@@ -49,3 +57,17 @@ class MissingExtraError(MissingBackendError):
     """The user asked for a part whose libraries only an extra of this package brings, and it was not installed."""
 
     exit_code = InputError.exit_code
+
+
+def cut(text: str) -> str:
+    """A text without what is too long for a message, and without signs that would steer a terminal."""
+    lines = text.split("\n")
+    shown = [_cut_line(line) for line in lines[:MOST_LINES]]
+    return "\n".join([*shown, f"... and {len(lines) - MOST_LINES:,} more"] if len(lines) > MOST_LINES else shown)
+
+
+def _cut_line(line: str) -> str:
+    if len(line) > LONGEST_LINE:
+        end = LONGEST_LINE // 4
+        line = f"{line[: LONGEST_LINE - end]} ... ({len(line):,} characters) ... {line[-end:]}"
+    return _STEERS.sub(lambda sign: sign[0].encode("unicode_escape").decode("ascii"), line)

@@ -1,20 +1,43 @@
 """Files appear whole or not at all, and are known by their hashes.
 
 A file is written aside first (``.<name>.partial``), then renamed, so that a killed run leaves no half-written artefact.
+Folders for work in the system's temporary directory are held by a lock, so that the next program removes those of one
+that was killed.
 """
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import hashlib
 import json
 import math
+import os
+import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from pipeline.core.errors import InputError
+
+FULL = (errno.ENOSPC, errno.EDQUOT)
+"""What the system says where a disk, or a user's share of it, is full."""
+
+_SCRATCH = "egvs-work-"
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """What the system says against writing a file names it: Python's files and Arrow's leave that open."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in FULL and error.filename is None:
+            error.filename = str(path)
+        raise
 
 
 @contextmanager
@@ -25,11 +48,54 @@ def aside(path: Path) -> Iterator[Path]:
     _refuse_folder(path)
     partial.unlink(missing_ok=True)  # what a killed run left, or a link: nothing is written through one
     try:
-        yield partial
+        with naming(path):
+            yield partial
         partial.replace(path)
     except BaseException:
         partial.unlink(missing_ok=True)
         raise
+
+
+@contextmanager
+def scratch() -> Iterator[Path]:
+    """A folder for work in the system's temporary directory; removed at the end, those of killed programs at once."""
+    parent = Path(tempfile.gettempdir())
+    _clear(parent)
+    while True:
+        with tempfile.TemporaryDirectory(prefix=_SCRATCH, dir=parent, ignore_cleanup_errors=True) as name:
+            held = _held(Path(name))
+            if held is None:  # another program took it for one that was left, before it was held
+                continue
+            try:
+                with naming(Path(name)):
+                    yield Path(name)
+            finally:
+                os.close(held)
+            return
+
+
+@cache
+def _clear(parent: Path) -> None:
+    """Remove the folders for work of programs that were killed; once in a process."""
+    for left in parent.glob(f"{_SCRATCH}*"):
+        if (held := _held(left)) is not None:
+            try:
+                shutil.rmtree(left, ignore_errors=True)
+            finally:
+                os.close(held)
+
+
+def _held(folder: Path) -> int | None:
+    """A descriptor that holds a folder of one's own until it is closed; None where it is another's, held, or gone."""
+    with suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        with suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            status = os.fstat(descriptor)
+            if status.st_uid == os.geteuid() and os.path.samestat(status, folder.stat()):
+                return descriptor
+        os.close(descriptor)
+    return None
 
 
 def make_room(path: Path) -> None:

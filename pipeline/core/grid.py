@@ -23,9 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core.errors import InputError
-
-MAX_VOXELS = 2**30
-"""More voxels than this do not fit into the dense counters of one machine with 24 GB."""
+from pipeline.core.reading.limits import VOXELS
 
 ON_PLANE_M = 1e-9
 """What is this close to a plane between voxels lies on it."""
@@ -63,14 +61,14 @@ class Grid:
         ------
         InputError
             When the size is no whole number of voxels along an axis (decimal arithmetic: 0.3 / 0.1 is 3), naming the
-            nearest sizes that fit; or when there are more than ``MAX_VOXELS`` voxels.
+            nearest sizes that fit; or when there are more voxels than :data:`pipeline.core.reading.limits.VOXELS`.
         """
         shape = []
         for axis, size in zip("xyz", roi.size_m, strict=True):
             count = _exact(size) / _exact(voxel_m)
             if count.denominator != 1:
                 low, high = count // 1, count // 1 + 1
-                near = " or ".join(f"{float(n * _exact(voxel_m)):g}" for n in (low, high) if n > 0)
+                near = " or ".join(_in_words(n * _exact(voxel_m)) for n in (low, high) if n > 0)
                 raise InputError(
                     f"{place}.size_m",
                     f"{size:g} m along {axis} is no whole number of voxels of {voxel_m:g} m",
@@ -78,12 +76,10 @@ class Grid:
                 )
             shape.append(int(count))
         nx, ny, nz = shape
-        if nx * ny * nz > MAX_VOXELS:
-            raise InputError(
-                f"{place}.voxel_m",
-                f"{voxel_m:g} m gives {nx} x {ny} x {nz} = {nx * ny * nz:.3g} voxels",
-                f"at most {MAX_VOXELS:.3g} fit; take larger voxels or a smaller region",
-            )
+        if nx * ny * nz > VOXELS.most:
+            found = f"{' x '.join(map(_in_words, shape))} = {_in_words(nx * ny * nz)} voxels"
+            right = f"larger voxels or a smaller region; {VOXELS.right}"
+            raise InputError(f"{place}.voxel_m", f"{voxel_m:g} m gives {found}", right)
         return cls(roi.origin_m, float(voxel_m), (nx, ny, nz))
 
     @property
@@ -138,6 +134,11 @@ class Grid:
         x, y, z = (float(v) for v in value["origin_m"])
         nx, ny, nz = (int(n) for n in value["shape"])
         return cls((x, y, z), float(value["voxel_m"]), (nx, ny, nz))
+
+
+def _in_words(value: Fraction | int) -> str:
+    """A number, however large."""
+    return f"{float(value):g}" if value < 10**300 else "more than 1e+300"
 
 
 def _exact(value: float) -> Fraction:

@@ -17,6 +17,7 @@ from pipeline.core.errors import InputError
 from pipeline.formats.point_records import A_NUMBER, columns_of, number
 
 _COLUMNS = ("x_m", "y_m", "z_m")
+_MOST_COLUMNS = 10_000
 
 
 def read(path: Path, place: str) -> NDArray[np.float64]:
@@ -28,6 +29,8 @@ def read(path: Path, place: str) -> NDArray[np.float64]:
     except csv.Error as error:
         raise InputError(place, f"cannot be read as CSV ({error})", "a header row, then one return a row") from None
     names = [name.strip() for name in header]
+    if len(names) > _MOST_COLUMNS:
+        raise InputError(place, f"has {len(names):,} columns", f"at most {_MOST_COLUMNS:,}")
     for name in _COLUMNS:
         if names.count(name) != 1:
             right = f"a header row with {', '.join(_COLUMNS)}"

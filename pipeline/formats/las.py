@@ -1,11 +1,20 @@
 """LAS and LAZ files are read through laspy (``pip install egvs[las]``): the scaled coordinates, as the file gives them.
 
+A packed file (LAZ) is unpacked by another process, this module run as a program: what unpacks it asks for as much
+memory as a damaged file says, and ends the process that it runs in where there is none.
+
 Frame: that of the file, which may say its coordinate reference system (:func:`crs_of`).
 """
 
 from __future__ import annotations
 
+import os
 import struct
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -13,9 +22,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core.errors import InputError
+from pipeline.core.reading import limits
+from pipeline.core.reading.refusing import reading
 from pipeline.formats.point_records import columns_of
 
 _CHUNK = 1_000_000
+_RIGHT = "a whole LAS or LAZ file"
+_CANNOT = "cannot be read as LAS"
+_ROOT = Path(__file__).resolve().parents[2]
 
 
 def read(path: Path, place: str) -> NDArray[np.float64]:
@@ -24,35 +38,76 @@ def read(path: Path, place: str) -> NDArray[np.float64]:
         import laspy
     except ImportError:
         raise InputError(place, "needs laspy, which is not installed", "pip install egvs[las]") from None
-    # The serial backend: the parallel one ends the whole process on a damaged file.
-    backend = laspy.LazBackend.Lazrs
-    damaged = (laspy.LaspyException, RuntimeError, ValueError, struct.error, MemoryError)  # RuntimeError: lazrs
-    quiet = np.errstate(over="ignore", invalid="ignore")  # what a scale makes infinite is dropped
-    size = path.stat().st_size
-    with path.open("rb") as file:
+    size = limits.size_of(path, limits.FILE, place)
+    with reading(place, _RIGHT, _CANNOT), path.open("rb") as file:
         packed = _is_packed(place, file.read(375), size)
-        if packed and backend not in laspy.LazBackend.detect_available():
+        if packed and laspy.LazBackend.Lazrs not in laspy.LazBackend.detect_available():
             raise InputError(place, "needs lazrs, which is not installed", "pip install egvs[las]")
-        try:
-            if packed:
-                _check_chunks(place, file, size)
-            file.seek(0)
-            with quiet, laspy.open(file, closefd=False, read_evlrs=False, laz_backend=backend) as las:
-                declared = int(las.header.point_count)
-                need, held = declared * las.header.point_format.size, size - las.header.offset_to_point_data
-                if held < need and not packed:
-                    right = f"{need}, as its header says; a whole file"
-                    raise InputError(place, f"holds {held} bytes of points", right)
-                chunks = [columns_of([chunk.x, chunk.y, chunk.z]) for chunk in las.chunk_iterator(_CHUNK)]
-        except BaseException as error:
-            # lazrs panics, which is no Exception, and its class cannot be imported.
-            if not isinstance(error, damaged) and type(error).__name__ != "PanicException":
-                raise
-            raise InputError(place, f"cannot be read as LAS ({error})", "a whole LAS or LAZ file") from None
-    points = np.concatenate([np.empty((0, 3)), *chunks])
+        if packed:
+            _check_chunks(place, file, size)
+        file.seek(0)
+        with laspy.open(file, closefd=False, read_evlrs=False) as las:
+            declared = int(las.header.point_count)
+            need, held = declared * las.header.point_format.size, size - las.header.offset_to_point_data
+        if held < need and not packed:
+            right = f"{need}, as its header says; a whole file"
+            raise InputError(place, f"holds {held} bytes of points", right)
+        limits.POINTS.check(place, declared)
+        points = _unpacked(path, place, declared) if packed else np.concatenate([np.empty((0, 3)), *_chunks(path)])
     if len(points) != declared:
         raise InputError(place, f"holds {len(points)} points", f"{declared}, as its header says; a whole file")
     return points
+
+
+def _chunks(path: Path) -> Iterator[NDArray[np.float64]]:
+    """The points, piece by piece."""
+    import laspy
+
+    # The serial backend: what the parallel one raises in its threads is printed there.
+    backend = laspy.LazBackend.Lazrs
+    quiet = np.errstate(over="ignore", invalid="ignore")  # what a scale makes infinite is dropped
+    with quiet, path.open("rb") as file, laspy.open(file, read_evlrs=False, laz_backend=backend) as las:
+        for chunk in las.chunk_iterator(_CHUNK):
+            yield columns_of([chunk.x, chunk.y, chunk.z])
+
+
+def _unpacked(path: Path, place: str, declared: int) -> NDArray[np.float64]:
+    """The points of a packed file, at most ``declared``, as another process tells them."""
+    points = np.empty((declared, 3))
+    command = [sys.executable, "-P", "-m", __name__, os.fspath(path.resolve()), str(limits.CHILD.most)]
+    own = os.environ.get("PYTHONPATH")
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(_ROOT), *([own] if own else [])])}
+    with (
+        tempfile.TemporaryFile() as complaint,
+        subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=complaint) as reader,
+    ):
+        assert reader.stdout is not None
+        held, told = points.data.cast("B"), 0
+        while told < len(held) and (got := reader.stdout.readinto(held[told:])):  # type: ignore[attr-defined]
+            told += got
+        more = reader.stdout.read(1)
+        reader.stdout.close()
+        code = reader.wait()
+        complaint.seek(0)
+        lines = complaint.read(100_000).decode("utf-8", "replace").strip().splitlines()
+    if code < 0:
+        found = f"{_CANNOT} (what unpacks it ended, by signal {-code}: it asked for too much memory)"
+        raise InputError(place, found, f"{_RIGHT}, of {limits.CHILD.right}")
+    if code or more:
+        raise InputError(place, f"{_CANNOT} ({lines[-1] if lines else 'more points than its header says'})", _RIGHT)
+    return points[: told // points.itemsize // 3]
+
+
+def tell(path: Path, most_mb: int) -> None:
+    """Write the points of a file to standard output, as float64, within so much memory."""
+    with suppress(ImportError):  # where the system knows no such bound
+        import resource
+
+        hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+        most = most_mb * limits.MB if hard == resource.RLIM_INFINITY else min(hard, most_mb * limits.MB)
+        resource.setrlimit(resource.RLIMIT_AS, (most, hard))
+    for points in _chunks(path):
+        sys.stdout.buffer.write(points.data)
 
 
 def crs_of(path: Path, place: str) -> str | None:
@@ -61,14 +116,14 @@ def crs_of(path: Path, place: str) -> str | None:
     InputError at ``place`` where it declares one that is damaged. For a file that :func:`read` has read.
     """
     import laspy
-    from pyproj.exceptions import CRSError
 
-    try:
-        with path.open("rb") as file, laspy.open(file, closefd=False, read_evlrs=False) as las:
-            found = las.header.parse_crs()
-    except (CRSError, laspy.LaspyException, ValueError, struct.error) as error:
-        raise InputError(place, f"its coordinate reference system cannot be read ({error})", "a whole header") from None
-    return None if found is None else str(found.to_wkt())
+    with (
+        reading(place, "a whole header", "its coordinate reference system cannot be read"),
+        path.open("rb") as file,
+        laspy.open(file, closefd=False, read_evlrs=False) as las,
+    ):
+        found = las.header.parse_crs()
+        return None if found is None else str(found.to_wkt())
 
 
 def _is_packed(place: str, head: bytes, size: int) -> bool:
@@ -92,3 +147,7 @@ def _check_chunks(place: str, file: BinaryIO, size: int) -> None:
 def _number_at(file: BinaryIO, kind: str, at: int) -> int:
     file.seek(at)
     return int(struct.unpack(kind, file.read(struct.calcsize(kind)))[0])
+
+
+if __name__ == "__main__":
+    tell(Path(sys.argv[1]), int(sys.argv[2]))

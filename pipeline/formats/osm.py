@@ -20,7 +20,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipeline.core import files
 from pipeline.core.errors import InputError
+from pipeline.core.reading import limits
+from pipeline.core.reading.encodings import OF_THE_PARSER
+from pipeline.core.reading.refusing import reading
 from pipeline.formats import safe_xml
 
 if TYPE_CHECKING:
@@ -104,9 +108,13 @@ def read(path: Path) -> Extract:
     deleted = frozenset() if is_pbf(path) else _check_xml(path)
     nodes, node_tags = dict[int, tuple[float, float]](), dict[int, Tags]()
     ways, relations = dict[int, Way](), dict[int, Relation]()
+    most = limits.OBJECTS.most
     with _opened(path) as objects:
         box = objects.header.box()
-        for o in objects:
+        for number, o in enumerate(objects):
+            if number == most:
+                right = f"a part of the map; {limits.OBJECTS.right}"
+                raise InputError(path, f"holds more than {most:,} objects", right)
             if isinstance(o, osmium.osm.Changeset) or not o.visible or (o.type_str(), o.id) in deleted:
                 continue
             match o:
@@ -197,12 +205,15 @@ def _opened(path: Path) -> Iterator[osmium.FileProcessor]:
     """The file's objects; what osmium says against them becomes an InputError."""
     import osmium
 
-    kind = "pbf" if is_pbf(path) else "osm.gz" if safe_xml.is_gzip(path) else "osm"
-    try:
-        yield osmium.FileProcessor(osmium.io.File(path, kind))
-    except (RuntimeError, ValueError, osmium.InvalidLocationError) as error:
-        problem = f"cannot be read as OpenStreetMap data ({error})"
-        raise InputError(path, problem, "a whole file; fetch it again") from None
+    with reading(path, "a whole file; fetch it again", "cannot be read as OpenStreetMap data"):
+        if is_pbf(path):
+            yield osmium.FileProcessor(osmium.io.File(path, "pbf"))
+        elif safe_xml.encoding_of_file(path) in OF_THE_PARSER:
+            yield osmium.FileProcessor(osmium.io.File(path, "osm.gz" if safe_xml.is_gzip(path) else "osm"))
+        else:
+            with files.scratch() as folder:
+                safe_xml.copy_as_utf8(path, folder / "map.osm")
+                yield osmium.FileProcessor(osmium.io.File(folder / "map.osm", "osm"))
 
 
 def _bounds(box: osmium.osm.Box, nodes: dict[int, tuple[float, float]]) -> Bounds:

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core.errors import InputError
+from pipeline.core.reading import limits
 from pipeline.formats.point_records import AXES, RecordLayout, number, records_of, whole_number
 
 _IDENTITY = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
@@ -154,7 +155,7 @@ def _to_world(points: NDArray[np.float64], viewpoint: tuple[float, ...]) -> NDAr
     return np.stack(rows, axis=1)
 
 
-def _unpacked(place: str, body: bytes, need: int) -> bytes:
+def _unpacked(place: str, body: bytes, need: int) -> bytearray:
     right = f"{need}, as its header says; a whole file"
     if len(body) < 8:
         raise InputError(place, f"ends before its points ({len(body)} bytes of them)", right)
@@ -163,13 +164,14 @@ def _unpacked(place: str, body: bytes, need: int) -> bytes:
         raise InputError(place, f"holds {size} bytes of points, unpacked", right)
     if len(body) < 8 + packed:
         raise InputError(place, f"holds {len(body) - 8} bytes of packed points", f"{packed}; a whole file")
+    limits.UNPACKED.check_bytes(place, size)
     unpacked = _lzf(body[8 : 8 + packed], size)
     if unpacked is None:
         raise InputError(place, "its packed points are damaged", f"LZF data of {right}")
     return unpacked
 
 
-def _lzf(packed: bytes, size: int) -> bytes | None:
+def _lzf(packed: bytes, size: int) -> bytearray | None:
     """Undo LZF, the format of Marc Lehmann's liblzf; None when the outcome would not have ``size`` bytes.
 
     A control byte c below 32 is followed by c + 1 plain bytes. Any other copies from what is already there: its upper
@@ -200,4 +202,4 @@ def _lzf(packed: bytes, size: int) -> bytes | None:
             out += piece if back >= length else (piece * (length // back + 1))[:length]
     except IndexError:
         return None
-    return bytes(out) if at == end and len(out) == size else None
+    return out if at == end and len(out) == size else None

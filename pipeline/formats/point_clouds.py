@@ -23,6 +23,8 @@ from numpy.typing import NDArray
 from pipeline.core import plugins
 from pipeline.core.errors import EgvsError, InputError, MissingBackendError
 from pipeline.core.files import aside
+from pipeline.core.reading import limits
+from pipeline.core.reading.refusing import why
 
 GROUP = "egvs.point_clouds"
 
@@ -81,13 +83,14 @@ def read_points(path: Path, place: str) -> tuple[NDArray[np.float64], int]:
     kind = _kind(place, path, plugins.names(GROUP))
     point_format: PointFormat = plugins.load(GROUP, kind)
     reader = f"its reader {plugins.module_of(GROUP, kind)} (package {plugins.package_of(GROUP, kind)})"
+    if path.is_file():
+        limits.size_of(path, limits.FILE, place)
     try:
         points = point_format.read(path, place)
-    except (EgvsError, MemoryError):
+    except EgvsError:
         raise
-    except OSError as error:
-        problem = f"cannot be read ({error.strerror or error})"
-        raise InputError(place, problem, "a file that is there and may be read") from None
+    except (OSError, MemoryError) as error:
+        raise InputError(place, f"cannot be read ({why(error)})", "a file that is there and may be read") from None
     except (Exception, SystemExit) as error:  # whatever somebody else's reader does
         raise InputError(place, f"{reader} ended with {error!r}", "a whole file, or a mended reader") from error
     if not isinstance(points, np.ndarray) or points.dtype.kind not in "fiu":
@@ -95,6 +98,7 @@ def read_points(path: Path, place: str) -> tuple[NDArray[np.float64], int]:
         raise InputError(place, f"{reader} returns {found}", "an array of numbers, (n, 3)")
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(place, f"{reader} returns an array of the shape {points.shape}", "(n, 3)")
+    limits.POINTS.check(place, len(points))
     points = points.astype(np.float64, copy=False)
     finite = np.isfinite(points).all(axis=1)
     dropped = len(points) - int(np.count_nonzero(finite))

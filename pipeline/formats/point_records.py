@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core.errors import InputError
+from pipeline.core.reading import limits
 
 AXES = ("x", "y", "z")
 A_NUMBER = "a number, or nan where nothing returned"
@@ -40,6 +41,7 @@ class RecordLayout:
         """From the fields in their order; ``formats`` are numpy's, with byte order."""
         if n == 0:
             raise InputError(place, "holds no points, says its header", "at least one return")
+        limits.POINTS.check(place, n)
         for axis in AXES:
             if names.count(axis) != 1 or counts[names.index(axis)] != 1:
                 problem = f"has no single field {axis!r} (its fields: {' '.join(names) or 'none'})"
@@ -75,7 +77,7 @@ class RecordLayout:
         records = np.frombuffer(body[:need], dtype=kind)
         return columns_of([records[axis] for axis in AXES])
 
-    def from_blocks(self, body: bytes) -> NDArray[np.float64]:
+    def from_blocks(self, body: bytes | bytearray) -> NDArray[np.float64]:
         """Points from binary data that holds each field of all records as one block (PCD's binary_compressed)."""
         parts = zip(self.formats, self.offsets, strict=True)
         return columns_of([np.frombuffer(body, dtype=f, count=self.n, offset=offset * self.n) for f, offset in parts])

@@ -19,7 +19,6 @@ import json
 import math
 import re
 import shutil
-import tempfile
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,6 +29,7 @@ from typing import Any
 import tomlkit
 from pydantic import TypeAdapter, ValidationError
 
+from pipeline.core import files
 from pipeline.core.errors import InputError, RunError
 from pipeline.formats.osm import Extract, write_streets
 from pipeline.formats.osm import read as read_extract
@@ -164,8 +164,8 @@ def new(
         raise InputError(osm, problem, "another junction: --at LAT,LON")
     notes = (*_notes(junction, roi, counts), *([PEOPLE] if walk else []))
     made = NewScenario(folder, junction, roi, streets, len(places), counts, notes)
-    files = {NETWORK: network, STATICS: _geojson(mapped, counts), SITES: _sites(places), FILE: _toml(name, made)}
-    _publish(folder, files)
+    texts = {NETWORK: network, STATICS: _geojson(mapped, counts), SITES: _sites(places), FILE: _toml(name, made)}
+    _publish(folder, texts)
     return made
 
 
@@ -199,11 +199,10 @@ def _network(extract: Extract, osm: Path, flags: Sequence[str]) -> tuple[str, St
     missing = InputError(osm, "has no drivable streets that meet", right)
     if not any("highway" in way.tags for way in extract.ways.values()):
         raise missing
-    with tempfile.TemporaryDirectory() as name:
-        work = Path(name)
+    with files.scratch() as work:
         write_streets(extract, work / "streets.osm.xml")
         try:
-            sumo.run("netconvert", ["--osm-files", "streets.osm.xml", *flags, "-o", NETWORK], work)
+            sumo.netconvert(["--osm-files", "streets.osm.xml", *flags], work, NETWORK)
             streets = junctions.read(work / NETWORK)
         except (RunError, InputError) as error:
             if re.search(r"No (nodes|edges) loaded|has no road", str(error)):
@@ -338,14 +337,14 @@ def _counts(flows: Sequence[CountModel]) -> Any:
     return rows
 
 
-def _publish(folder: Path, files: dict[str, str]) -> None:
+def _publish(folder: Path, texts: dict[str, str]) -> None:
     """Write the files aside, check the scenario, and rename the folder: it appears whole or not at all."""
     partial = folder.resolve().with_name(f".{folder.resolve().name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     try:
-        for name, text in files.items():
-            (partial / name).write_bytes(text.encode("utf-8"))
+        for name, text in texts.items():
+            files.write_text(partial / name, text)
         load(partial)
         if folder.is_dir():
             folder.rmdir()

@@ -18,10 +18,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
 from pipeline.kernels.boxes import axes_of
+from pipeline.kernels.compile_cache import compiled
 
 SLACK = 1e-9
 GRAZE = 1e-9
@@ -33,8 +33,8 @@ _PAD = 1e-9
 
 _LARGEST = 1e200  # stands for 1 / 0: times a length it is larger than any range
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
-_inlined = numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+_kernel = compiled()
+_inlined = compiled(inline="always")
 
 
 @_inlined

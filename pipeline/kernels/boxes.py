@@ -24,8 +24,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
+
+from pipeline.kernels.compile_cache import compiled
 
 SHRINK_M = 1e-4 + 1e-9
 """An overlap up to this depth is no contact: 0.1 mm, and 1 nanometre for what lies on that bound.
@@ -37,7 +38,7 @@ TINY = 1e-100
 """A cross product shorter than this is 0 but for products that vanish; any longer one, however rough, is a sound
 axis."""
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
+_kernel = compiled()
 
 
 @_kernel

@@ -5,12 +5,12 @@ Frame: the grid's own, in voxel units, as in :mod:`pipeline.kernels.march`, whos
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from pipeline.kernels.compile_cache import compiled
 from pipeline.kernels.march import _scratch, _walk
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
+_kernel = compiled()
 
 
 @_kernel

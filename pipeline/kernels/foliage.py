@@ -18,9 +18,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
+from pipeline.kernels.compile_cache import compiled
 from pipeline.kernels.rays import EDGE_M, _inside, meet
 from pipeline.kernels.solids import crossing
 
@@ -30,7 +30,7 @@ LEAST = 2.0**-33
 _FINE = 2.0**32
 _NANO = 1e9
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
+_kernel = compiled()
 
 
 @_kernel

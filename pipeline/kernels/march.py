@@ -27,15 +27,16 @@ many steps, with :math:`4 u R` in place of 1e-8 m.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
+
+from pipeline.kernels.compile_cache import compiled
 
 CHORD_M = 1e-6
 """A shared chord up to this length is no contact."""
 
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
-_inlined = numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+_kernel = compiled()
+_inlined = compiled(inline="always")
 
 
 @_inlined

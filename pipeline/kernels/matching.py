@@ -13,14 +13,15 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
+
+from pipeline.kernels.compile_cache import compiled
 
 EXCEED = 1e-9
 """An overlap must be larger than a bound, or than another overlap, by more than this to count as larger: boxes on round
 coordinates overlap by exactly one half, and the last bit of a cosine must decide nothing."""
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
+_kernel = compiled()
 
 
 @_kernel

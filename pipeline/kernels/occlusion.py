@@ -24,13 +24,13 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
 from pipeline.kernels.boxes import SHRINK_M, axes_of
+from pipeline.kernels.compile_cache import compiled
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
-_inlined = numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+_kernel = compiled()
+_inlined = compiled(inline="always")
 
 TOGETHER_RAD = 1e-3
 """Beams whose azimuths differ by less are taken together."""

@@ -17,8 +17,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
+
+from pipeline.kernels.compile_cache import compiled
 
 EDGE_M = 1e-6
 """A ray that passes a triangle's edge no further outside than this meets the triangle."""
@@ -44,8 +45,8 @@ GROUP = 8
 
 _LARGEST = 1e200  # stands for 1 / 0: times a length it is larger than any range, times zero it is zero
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
-_inlined = numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+_kernel = compiled()
+_inlined = compiled(inline="always")
 
 
 @_kernel

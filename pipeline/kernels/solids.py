@@ -14,15 +14,15 @@ Frame: the grid's own, in metres. Two questions, because a triangle mesh is only
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
 from pipeline.kernels.boxes import SHRINK_M, TINY
+from pipeline.kernels.compile_cache import compiled
 
 SNAP_M = 2.0**-14
 """Lattice (61 micrometres) on which winding numbers are settled; solids up to 100 km across fit into int64."""
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
+_kernel = compiled()
 
 
 @_kernel

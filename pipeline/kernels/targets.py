@@ -13,15 +13,14 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
 from pipeline.kernels.boxes import SHRINK_M
-from pipeline.kernels.matching import shared_area
+from pipeline.kernels.compile_cache import compiled
 from pipeline.kernels.occlusion import face
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
-_inlined = numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+_kernel = compiled()
+_inlined = compiled(inline="always")
 
 _MARGIN_RAD = 1e-9
 """Spans are widened by this: rounding loses no beam."""
@@ -362,33 +361,3 @@ def gaps(starts, plan, asked, others, gap_m):  # type: ignore[no-untyped-def]
                 if away - reach - math.sqrt(plan[j, 4] ** 2 + plan[j, 5] ** 2) < nearest:
                     nearest = min(nearest, gap(plan[i], plan[j]))
             gap_m[i] = nearest
-
-
-@_kernel
-def shares_inside(plan, yaw_rad, low, high, size_m, share):  # type: ignore[no-untyped-def]
-    """Fill the share of each rectangle that lies in the grid, in plan.
-
-    Parameters
-    ----------
-    plan, yaw_rad
-        As :func:`footprints` fills it, (n, 6), and the yaw, (n,).
-    low, high
-        Corners of the upright box round each, (n, 3) float64.
-    size_m
-        The grid is the box from 0 to ``size_m`` (3,).
-    share
-        Filled, (n,) float64: exactly 1 for a rectangle that reaches out by less than ``SHRINK_M``.
-    """
-    corners = np.empty((4, 24))
-    for i in range(plan.shape[0]):
-        share[i] = 1.0
-        for a in range(2):
-            if low[i, a] < -SHRINK_M or high[i, a] > size_m[a] + SHRINK_M:
-                share[i] = 0.0
-        if share[i] == 0.0:
-            length, width = 2.0 * plan[i, 4], 2.0 * plan[i, 5]
-            x, y = 0.5 * size_m[0], 0.5 * size_m[1]
-            area = shared_area(
-                x, y, size_m[0], size_m[1], 0.0, plan[i, 0], plan[i, 1], length, width, yaw_rad[i], corners
-            )
-            share[i] = area / (length * width)

@@ -5,10 +5,11 @@ Frame: the grid's own, in voxel units. The range of a voxel is that of its centr
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
+from pipeline.kernels.compile_cache import compiled
+
+_kernel = compiled()
 
 
 @_kernel

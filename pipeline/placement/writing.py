@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.artefacts import schemas, tables
+from pipeline.artefacts import checksums, schemas, tables
+from pipeline.artefacts.readers import PLACEMENT_SUMS
 from pipeline.core import files
 from pipeline.scenario.models import Scenario
 
@@ -30,6 +31,7 @@ def write(folder: Path, scenario: Scenario, placed: Placement, stages: Mapping[s
         Keys of the stages that the plan was made from, by name.
     """
     about = _about(scenario, placed, stages)
+    (folder / PLACEMENT_SUMS).unlink(missing_ok=True)
     picks, points = placed.picks, placed.solution.curve
     bounds = {point.count: point.bound for point in points}
     columns: dict[str, Any] = {
@@ -53,7 +55,9 @@ def write(folder: Path, scenario: Scenario, placed: Placement, stages: Mapping[s
         "sites": [json.dumps(list(names), ensure_ascii=False) for names in placed.curve_sites],
     }
     tables.write(folder / CURVE, "curve", curve, about)
-    return folder / PLACEMENT, folder / CURVE
+    written = folder / PLACEMENT, folder / CURVE
+    checksums.write(folder / PLACEMENT_SUMS, written)
+    return written
 
 
 _POSE = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")

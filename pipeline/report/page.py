@@ -76,7 +76,7 @@ def inputs(work: Workspace) -> StageInputs:
     beside = (PERIOD_SCORES, BLINDSPOTS, *ACCURACY, *VALIDATION, *PLACEMENT)
     hashes |= work.digests(*(name for name in (*read, *beside) if work.path(name).is_file()))
     if (roads := network_file(work.folder)) is not None:
-        hashes[roads.relative_to(work.folder).as_posix()] = files.sha256_of(roads)
+        hashes |= work.digests(roads.relative_to(work.folder).as_posix())
     # what a stage sums up is the same in every run, but for the seconds of SUMO, which are not shown
     summaries = {
         name: {key: value for key, value in stages[name].summary.items() if key != "sumo_seconds"}

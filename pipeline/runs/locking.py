@@ -12,6 +12,8 @@ from pathlib import Path
 from pipeline.core.errors import InputError, RunError
 from pipeline.runs import store_settings
 
+_NO_LINK = os.O_CLOEXEC | os.O_NOFOLLOW
+
 
 @contextmanager
 def alone(folder: Path) -> Iterator[None]:
@@ -19,16 +21,15 @@ def alone(folder: Path) -> Iterator[None]:
     store_settings.keep_out(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        lock = os.fdopen(os.open(folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666))
+        descriptor = _open(folder / ".lock", shared=False)
     except OSError as error:
-        if error.errno == errno.ELOOP:
-            found = "is a symbolic link, and nothing is written through one"
-            raise InputError(folder / ".lock", found, "remove it") from None
         raise InputError(folder, f"cannot be written ({error.strerror})", "a folder of yours") from None
-    with lock:
-        if not _take(lock.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB):
+    try:
+        if not _take(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB):
             raise RunError(f"{folder}: another run is at work there")
         yield
+    finally:
+        os.close(descriptor)
 
 
 @contextmanager
@@ -61,13 +62,25 @@ def locked(path: Path, *, shared: bool = False, wait: bool = True, remove: bool 
             os.close(descriptor)
 
 
+def make(path: Path) -> None:
+    """Make a lock file where there is none; InputError where it is a symbolic link."""
+    os.close(_open(path, shared=False))
+
+
 def _open(path: Path, shared: bool) -> int:
+    """A lock file, made where there is none; InputError where it is a symbolic link."""
     try:
-        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-    except PermissionError:
-        if not shared:
-            raise
-    return os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            return os.open(path, os.O_RDWR | os.O_CREAT | _NO_LINK, 0o666)
+        except PermissionError:
+            if not shared:
+                raise
+        return os.open(path, os.O_RDONLY | _NO_LINK)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            found = "is a symbolic link, and nothing is written through one"
+            raise InputError(path, found, "remove it") from None
+        raise
 
 
 def _take(descriptor: int, kind: int) -> bool:

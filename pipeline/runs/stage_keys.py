@@ -33,7 +33,7 @@ class Inputs:
 
     def record(self, made: Made) -> StageRecord:
         """What ``run.json`` holds of the stage once it is made."""
-        return StageRecord(self.key, dict(self.read.files), made.artefacts, made.summary, made.cost)
+        return StageRecord(self.key, dict(self.read.files), made.artefacts, made.summary, made.cost, made.companions)
 
 
 def inputs(stage: str, work: Workspace) -> Inputs:

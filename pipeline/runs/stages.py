@@ -70,17 +70,24 @@ def artefacts_of(stage: str) -> tuple[str, ...]:
     return tuple(module_of(stage).ARTEFACTS)
 
 
+def written_by(stage: str) -> tuple[str, ...]:
+    """The files that a stage may write, and the folders that it writes beside them."""
+    return (*artefacts_of(stage), *getattr(module_of(stage), "COMPANIONS", ()))
+
+
 def recorded(record: RunRecord) -> dict[str, str]:
-    """The sha256 of every artefact as a run's record has it, "" where nothing is known of it."""
+    """The sha256 of every artefact as a run's record has it, "" where nothing is known of it; and of what the record
+    has beside them."""
     known = record.digests
-    return {name: known.get(name, "") for stage in STAGES for name in artefacts_of(stage)}
+    beside = {name: digest for stage in record.stages.values() for name, digest in stage.companions.items()}
+    return beside | {name: known.get(name, "") for stage in STAGES for name in artefacts_of(stage)}
 
 
 def make(stage: str, work: Workspace, inputs: StageInputs, **options: Any) -> Made:
     """Run a stage in a workspace, where the artefacts of the stages before lie."""
     module, out = module_of(stage), work.folder
     before = _companions(module, out)
-    work.forget(*module.ARTEFACTS)
+    work.forget(*written_by(stage))
     with measured() as cost:
         summary = seen_from(work.scenario.folder, module.run(work, inputs, **options))
     artefacts = work.digests(*(name for name in module.ARTEFACTS if (out / name).exists()))

@@ -29,7 +29,7 @@ from pipeline.core import files
 from pipeline.core.cost import Cost
 from pipeline.core.errors import InputError
 from pipeline.core.progress import Progress, silent
-from pipeline.runs import store_settings
+from pipeline.runs import locking, store_settings
 from pipeline.runs.locking import locked
 from pipeline.runs.stages import Made
 
@@ -150,7 +150,7 @@ class Store:
         lock = self.folder / ".locks" / self._place(stage, key).name
         try:
             lock.parent.mkdir(parents=True, exist_ok=True)
-            lock.touch()
+            locking.make(lock)
         except OSError as error:
             self._do_without(error)
             yield True
@@ -235,7 +235,13 @@ class Store:
             yield
 
     def _clear_work(self, folder: Path) -> None:
-        """Remove what killed processes left; who is still at work holds its lock."""
+        """Remove what killed processes left; who is still at work holds its lock.
+
+        InputError where a folder for work, or a lock, is a symbolic link.
+        """
+        for path in (folder / ".work", folder / ".locks"):
+            if path.is_symlink():
+                raise InputError(path, "is a symbolic link, and nothing is written through one", "remove it")
         places = [place for name in (".work", ".locks") if (place := folder / name).is_dir()]
         names = {path.name for place in places for path in place.iterdir()}
         for name in filter(_WORK_NAME.fullmatch, names):
@@ -289,7 +295,7 @@ def _to_json(stage: str, key: str, folder: Path, made: Made) -> str:
     sizes = {name: (folder / name).stat().st_size for name in made.files}
     about = {"stage": stage, "key": key, **asdict(made), "bytes": sizes, "created": time.time()}
     about[_HASH] = files.hash_of(about)
-    return json.dumps(about, indent=1, ensure_ascii=False) + "\n"
+    return files.json_text(about, indent=1) + "\n"
 
 
 def _read(folder: Path) -> Entry:

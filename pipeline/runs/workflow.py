@@ -12,12 +12,13 @@ from __future__ import annotations
 
 import os
 import shutil
-import tempfile
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from pipeline.artefacts import checksums
+from pipeline.artefacts.readers import ACCURACY_SUMS, PLACEMENT_SUMS, VALIDATION_SUMS
 from pipeline.artefacts.run_record import RECORD, STAGES, RunRecord, StageRecord
 from pipeline.core import files
 from pipeline.core.errors import InputError
@@ -32,6 +33,7 @@ from pipeline.runs.store import Store
 from pipeline.scenario.loading import from_values
 from pipeline.scenario.models import Scenario
 from pipeline.stages.base import Workspace
+from pipeline.traffic.sumo_folder import NETWORK
 
 StageListener = Callable[[str, str, StageRecord | None], None]
 """Called with (stage, state, its record) as a run goes on.
@@ -126,7 +128,7 @@ def refresh_report(out: Path) -> Path | None:
     scenario = from_values(record.scenario, source, str(out / RECORD))
     work = Workspace(scenario, out)
     before = {name: stage for name, stage in record.stages.items() if name != "report"}
-    if not all(_is_of(name, work, record) and _intact(work, stage.artefacts) for name, stage in before.items()):
+    if not all(_is_of(name, work, record) and _intact(work, stage) for name, stage in before.items()):
         return None
     _Run(work, unheard).bring("report", record)
     return out / "report.html"
@@ -145,7 +147,7 @@ def fetch_or_make(
     Of several processes that want the same, one makes it. Returns what came of it, and whether it came from the store.
     """
     out = work.folder
-    work.forget(*stages.artefacts_of(name))
+    work.forget(*stages.written_by(name))
     if (entry := store.take(name, key, out, link=link)) is None:
         with store.maker(name, key, progress=work.progress):
             if (entry := store.take(name, key, out, link=link)) is None:  # nor has another one made it meanwhile
@@ -185,7 +187,7 @@ class _Run:
         work, out = self.work, self.work.folder
         inputs = stage_keys.inputs(name, work)
         last = record.stages.get(name)
-        if last and not (again or options) and last.inputs == inputs.key and _intact(work, last.artefacts):
+        if last and not (again or options) and last.inputs == inputs.key and _intact(work, last):
             self.listener(name, "skipped", last)
             return record
         record = replace(record.having(name, None), scenario=work.scenario.model_dump(mode="json"))
@@ -229,8 +231,11 @@ def _is_of(name: str, work: Workspace, record: RunRecord) -> bool:
         return False
 
 
-def _intact(work: Workspace, artefacts: dict[str, str]) -> bool:
-    return all(work.path(name).is_file() and work.digest(name) == digest for name, digest in artefacts.items())
+def _intact(work: Workspace, stage: StageRecord) -> bool:
+    """Whether artefacts are what the stage wrote, and a network that the report draws, where it is still there."""
+    artefacts = stage.artefacts.items()
+    networks = [(n, digest) for n, digest in stage.companions.items() if n.endswith(NETWORK) and work.path(n).is_file()]
+    return all(work.path(name).is_file() and work.digest(name) == digest for name, digest in (*artefacts, *networks))
 
 
 def verify(
@@ -264,8 +269,8 @@ def verify(
     scenario = from_values(record.scenario, source, str(folder / RECORD))
     made_by_stages = {name: digest for stage in record.stages.values() for name, digest in stage.artefacts.items()}
     wrong = [f"{name} was altered after the run" for name in made_by_stages if not _holds(folder, name, made_by_stages)]
-    with tempfile.TemporaryDirectory(prefix="egvs-verify-") as temporary:
-        elsewhere = Path(temporary)
+    wrong += _altered_beside(folder, record)
+    with files.scratch() as elsewhere:
         work = Workspace(scenario, elsewhere, jobs=jobs, progress=progress)
         again = _record_so_far(scenario, elsewhere)
         for name, before in record.stages.items():
@@ -285,6 +290,17 @@ def verify(
             again.write(elsewhere)
             wrong += _differences(before, after)
     return wrong
+
+
+def _altered_beside(folder: Path, record: RunRecord) -> Iterator[str]:
+    """A line for each file beside the artefacts that is there, and is another one by now."""
+    for stage in record.stages.values():
+        for name in stage.companions:
+            if (folder / name).is_file() and not _holds(folder, name, stage.companions):
+                yield f"{name} was altered after the run"
+    for sums in (ACCURACY_SUMS, VALIDATION_SUMS, PLACEMENT_SUMS):
+        for name in checksums.altered(folder / sums, "remove it"):
+            yield f"{name} was altered after the study that made it"
 
 
 def _holds(folder: Path, name: str, digests: dict[str, str]) -> bool:

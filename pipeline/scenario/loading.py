@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import re
-import tomllib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from pydantic import ValidationError
 
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Grid
+from pipeline.core.reading import documents
 from pipeline.scenario.messages import explain
 from pipeline.scenario.models import FILE, SITE_DIRECTIONS, SITE_SOURCES, Scenario
 from pipeline.scenario.traffic import SOURCES, idle_beside
@@ -59,10 +59,7 @@ def _read(file: Path, heirs: tuple[Path, ...]) -> dict[str, Any]:
         raise InputError(place, f"no {FILE} there", f"a folder with a {FILE}, or the file itself")
     if file.resolve() in heirs:
         raise InputError(f"{file}: extends", "leads back to itself", "a scenario that does not extend this one")
-    try:
-        values = tomllib.loads(file.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(file, f"is not valid TOML: {error}") from None
+    values = documents.read_toml(file)
     if not isinstance(base := values.get("extends", ""), str):
         raise InputError(f"{file}: extends", f"{base!r}", "the path of a scenario's folder")
     if not base:
@@ -107,7 +104,7 @@ def _bases(folder: Path, extends: str, place: str) -> Iterator[Path]:
         if not (folder / FILE).is_file():
             raise InputError(f"{place}: extends", f"no {FILE} in {folder}", "the path of a scenario's folder")
         yield folder
-        extends = tomllib.loads((folder / FILE).read_text(encoding="utf-8")).get("extends", "")
+        extends = documents.read_toml(folder / FILE).get("extends", "")
 
 
 def from_values(values: dict[str, Any], folder: Path, place: str) -> Scenario:
@@ -139,8 +136,8 @@ def _lay_over(values: dict[str, Any], override: str) -> dict[str, Any]:
     if not equals or not key.strip():
         raise InputError(f"--set {override}", "no key=value", "for example --set traffic.frames=500")
     try:
-        value = tomllib.loads(f"v = {text}")["v"]
-    except tomllib.TOMLDecodeError:
+        value = documents.toml_value(text)
+    except (ValueError, RecursionError):
         value = text
     *parents, last = words = key.strip().split(".")
     if parents:

@@ -8,6 +8,7 @@ from these models; :mod:`pipeline.scenario.loading` reads the file.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
 from math import inf
 from pathlib import Path
@@ -320,11 +321,17 @@ class Scenario(StrictModel):
         return other
 
     def find(self, name: str, key: str) -> Path:
-        """The file that the scenario, or one that it extends, names under ``key``; InputError when it is not there."""
+        """The file that the scenario, or one that it extends, names under ``key``.
+
+        InputError when it is not there, or may not be read.
+        """
         folders = (sumo_home(),) if name.startswith(_SUMO) else self._folders
         for folder in folders:
             if (path := folder / name.removeprefix(_SUMO)).is_file():
-                return path
+                if os.access(path, os.R_OK):
+                    return path
+                found = f"cannot be read ({path}: Permission denied)"
+                raise InputError(f"{self.file}: {key} = {name!r}", found, "a file that may be read")
         shown = folders[0] / name.removeprefix(_SUMO)
         found = f"no such file ({shown})"
         raise InputError(f"{self.file}: {key} = {name!r}", found, "a path relative to the scenario's folder")

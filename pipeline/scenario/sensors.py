@@ -6,10 +6,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
+from pipeline.core.reading import limits
 from pipeline.core.strict_model import StrictModel
 from pipeline.scenario.types import NotNegative, Positive
 
-MOST_BEAMS = 10_000_000
+MOST_RINGS = 10_000
+"""No sensor has a tenth of them."""
 
 _OPTICS = ("wavelength_nm", "divergence_mrad", "rated_range_m", "rated_reflectivity", "range_sigma_m")
 _FIELD_OF_VIEW = ("azimuth_deg", "beams", "pattern")
@@ -21,19 +23,25 @@ Turns = Annotated[float, Field(ge=-1e6, le=1e6)]
 """Of more, no digit after the whole turns is left."""
 
 
+def _check_beams(beams: float, what: str) -> None:
+    if not beams <= limits.BEAMS.most:
+        raise ValueError(f"{what} are more than {limits.BEAMS.most:,} beams; {limits.BEAMS.right}")
+
+
 class PatternModel(StrictModel):
     """Beams from a formula, for sensors whose pattern does not repeat: what one frame of it may look like, a model."""
 
     kind: Literal["rosette", "even"] = Field(
         description="'rosette': two prisms of equal deflection that turn at different speeds; 'even': evenly spread"
     )
-    samples: int = Field(ge=1, le=MOST_BEAMS, description="Beams of one frame")
+    samples: int = Field(ge=1, description="Beams of one frame")
     azimuth_deg: tuple[Azimuth, Azimuth] = Field(description="From where to where")
     elevation_deg: tuple[Elevation, Elevation] = Field(description="From where to where")
     turns: tuple[Turns, Turns] | None = Field(None, description="Of the two prisms in one frame, for a rosette")
 
     @model_validator(mode="after")
     def _consistent(self) -> PatternModel:
+        _check_beams(self.samples, "samples")
         for key in ("azimuth_deg", "elevation_deg"):
             low, high = getattr(self, key)
             if not low < high:
@@ -50,7 +58,7 @@ class SensorModel(StrictModel):
     elevations_deg: tuple[Elevation, ...] = Field(
         (), description="One a ring; or the first and the last of `channels` uniform ones"
     )
-    channels: int | None = Field(None, ge=1, description="Rings, uniform between two elevations_deg")
+    channels: int | None = Field(None, ge=1, le=MOST_RINGS, description="Rings, uniform between two elevations_deg")
     azimuth_offsets_deg: tuple[Azimuth, ...] = Field((), description="One a ring, added to each azimuth; none: all 0")
     azimuth_step_deg: Positive | None = Field(
         None, description="Between two beams of a ring; divides 360, or the width of azimuth_deg"
@@ -89,11 +97,15 @@ class SensorModel(StrictModel):
     @property
     def azimuths(self) -> int:
         """Beams of a ring."""
+        return 0 if self.azimuth_step_deg is None else round(self._azimuths())
+
+    def _azimuths(self) -> float:
+        """Beams of a ring, not rounded; without end for a step that is next to nothing."""
         if self.azimuth_step_deg is None:
-            return 0
+            return 0.0
         if self.azimuth_deg is None:
-            return round(360.0 / self.azimuth_step_deg)
-        return round((self.azimuth_deg[1] - self.azimuth_deg[0]) / self.azimuth_step_deg) + 1
+            return 360.0 / self.azimuth_step_deg
+        return (self.azimuth_deg[1] - self.azimuth_deg[0]) / self.azimuth_step_deg + 1.0
 
     @model_serializer(mode="wrap")
     def _without_defaults(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -122,10 +134,8 @@ class SensorModel(StrictModel):
                 f"channels = {self.channels} needs elevations_deg with 2 values (uniform) or {self.channels},"
                 f" found {listed}"
             )
-        if rings * self.azimuths > MOST_BEAMS:
-            raise ValueError(
-                f"{rings} rings every {self.azimuth_step_deg:g} degrees are more than {MOST_BEAMS:,} beams"
-            )
+        if self.azimuth_step_deg is not None:
+            _check_beams(rings * self._azimuths(), f"{rings} rings every {self.azimuth_step_deg:g} degrees")
         if self.azimuth_offsets_deg and len(self.azimuth_offsets_deg) != rings:
             raise ValueError(
                 f"azimuth_offsets_deg has {len(self.azimuth_offsets_deg)} values,"

@@ -9,6 +9,15 @@ from pydantic import Field
 FARTHEST_M = 1e8
 """Coordinates beyond this are a mistake: the Earth is 4e7 m round."""
 
+
+def coordinate_m(text: str) -> float:
+    """A coordinate as a file writes it; ValueError where it is none, or no place on Earth has it."""
+    value = float(text)
+    if not abs(value) <= FARTHEST_M:
+        raise ValueError(f"the coordinate {text[:40]} is beyond {FARTHEST_M:g} m")
+    return value
+
+
 Positive = Annotated[float, Field(gt=0)]
 Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
 NotNegative = Annotated[float, Field(ge=0)]

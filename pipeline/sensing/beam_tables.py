@@ -25,7 +25,8 @@ from scipy.special import cosdg, sindg
 
 from pipeline.core import files
 from pipeline.core.errors import InputError
-from pipeline.scenario.sensors import MOST_BEAMS, PatternModel
+from pipeline.core.reading import limits
+from pipeline.scenario.sensors import PatternModel
 
 COLUMNS = ("elevation_deg", "azimuth_deg")
 _LARGEST_DEG = {"elevation_deg": 90.0, "azimuth_deg": 360.0}
@@ -97,6 +98,8 @@ def read(path: Path) -> BeamTable:
 def _read(path: Path, _content: str) -> BeamTable:
     """Read once for all who ask."""
     angles: list[tuple[float, float]] = []
+    most = limits.BEAMS.most
+    limits.size_of(path, limits.FILE)
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             rows = csv.DictReader(file, skipinitialspace=True)
@@ -111,8 +114,8 @@ def _read(path: Path, _content: str) -> BeamTable:
                     raise InputError(f"{path}: beam {number}", what, "one value a column, with decimal points")
                 elevation_deg, azimuth_deg = (_angle(path, number, name, row[name]) for name in COLUMNS)
                 angles.append((elevation_deg, azimuth_deg))
-                if len(angles) > MOST_BEAMS:
-                    raise InputError(path, f"has more than {MOST_BEAMS:,} beams", "fewer")
+                if len(angles) > most:
+                    raise InputError(path, f"has more than {most:,} beams", limits.BEAMS.right)
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(path, f"cannot be read as CSV ({error})", "UTF-8 text with a header row") from None
     if not angles:

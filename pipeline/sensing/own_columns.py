@@ -17,9 +17,8 @@ from pipeline.scenario.near_names import misspelt
 
 Value = str | int | float | bool | None
 
-_NAME = re.compile(r"[^\x00-\x1f\ud800-\udfff]{1,80}")
+_NAME = re.compile(r"[^\x00-\x1f]{1,80}")
 _NUMBER = re.compile(r"-?(0|[1-9][0-9]{0,17})(\.[0-9]+)?")  # "007" is a name
-_SURROGATES = re.compile(r"[\ud800-\udfff]")
 
 
 def own_columns(place: str, row: Mapping[str, Any], known: Collection[str]) -> dict[str, Value]:
@@ -61,7 +60,5 @@ def _plain(value: Any) -> Value:
     if isinstance(value, int) and not -(2**63) <= value < 2**63:
         return str(value)
     if isinstance(value, list | dict):
-        value = json.dumps(value, ensure_ascii=True)
-    if isinstance(value, str):
-        return _SURROGATES.sub("\ufffd", value)
-    return value if isinstance(value, int | float | bool) else None
+        return json.dumps(value, ensure_ascii=True)
+    return value if isinstance(value, str | int | float | bool) else None

@@ -194,7 +194,8 @@ class Scanner:
         """The returns of a measured scan, seen from the sensor; those that cannot meet the ROI are left out."""
         assert site.points is not None
         place, roi = f"site {site.name}: points", self.scene.roi
-        points = self._points(self.scene.scenario.find(site.points, place), place)
+        path = self.scene.scenario.find(site.points, place)
+        points = self._points(path, place)
         ends = points - np.asarray(site.pose.position_m)
         far = np.sqrt((ends**2).sum(axis=1))
         away = np.maximum(far, np.finfo(np.float64).tiny)[:, None]
@@ -204,7 +205,7 @@ class Scanner:
         beam = np.flatnonzero(reaches)
         if not len(beam):
             met_nothing = f"none of {len(points)} points lies on a beam that can meet the region of interest"
-            raise InputError(place, met_nothing, "points in the world frame")
+            raise InputError(f"{place}: {path}", met_nothing, "points in the world frame")
         weight = np.ones(len(beam)) if self.columns else None
         rows = EmptyScan(beam.astype(np.uint32), ends[beam], np.ones(len(beam), dtype=np.bool_), weight=weight)
         return Scan(site.pose, sensor, len(points), rows)
@@ -212,10 +213,10 @@ class Scanner:
     def _points(self, path: Path, place: str) -> NDArray[np.float64]:
         """The points of a measured scan (n, 3) in the world frame, from the system that the file declares, if any."""
         points, _ = point_clouds.read_points(path, place)
-        if (farthest_m := np.abs(points).max()) > FARTHEST_M:
-            raise InputError(place, f"a point lies {farthest_m:g} m from the world's zero", f"within {FARTHEST_M:g} m")
         world, declared = world_frame.of(self.scene.scenario), point_clouds.crs_of(path, place)
         place = f"{place}: {path}"
+        if (farthest_m := np.abs(points).max()) > FARTHEST_M:
+            raise InputError(place, f"a point lies {farthest_m:g} m from the world's zero", f"within {FARTHEST_M:g} m")
         if declared is None:
             world.metres(points[:, :2], place, "metres of the world frame, or a LAS file that names its system")
             return points

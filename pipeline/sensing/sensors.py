@@ -155,7 +155,8 @@ def rotation(yaw_deg: float, pitch_deg: float, roll_deg: float) -> NDArray[np.fl
 
 
 def _uniform(first: float, last: float, channels: int) -> tuple[float, ...]:
-    return tuple(float(np.round(e, 9)) for e in np.linspace(first, last, channels))
+    angles: list[float] = np.round(np.linspace(first, last, channels), 9).tolist()
+    return tuple(angles)
 
 
 class _Catalogue(Mapping[str, Sensor]):

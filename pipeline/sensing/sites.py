@@ -10,7 +10,6 @@ first place there.
 from __future__ import annotations
 
 import csv
-import json
 import math
 import re
 import reprlib
@@ -23,6 +22,7 @@ import numpy as np
 
 from pipeline.core.errors import InputError
 from pipeline.core.findings import Finding, FindingsError
+from pipeline.core.reading import documents, limits
 from pipeline.formats import located_rows
 from pipeline.formats.georeference import Georeference, Reading
 from pipeline.scenario.models import Scenario, SiteGrid, SiteLine
@@ -37,9 +37,6 @@ _ANGLES = ("yaw_deg", "pitch_deg", "roll_deg")
 _AIM = ("aim_x_m", "aim_y_m", "aim_z_m")
 _TEXTS = ("sensor", "points", "aim")
 _KNOWN = (*_NEEDED, *_ANGLES, *_AIM, *_TEXTS)
-MOST_CANDIDATES = 100_000
-"""More are a mistake in a spacing or a list: each is a scan of its own."""
-
 _NAME = re.compile(r"[^/\\\x00-\x1f\ud800-\udfff]{1,80}")  # becomes part of file names
 
 
@@ -163,12 +160,9 @@ def of(scenario: Scenario) -> tuple[Site, ...]:
 
 def _check_number(candidates: float, place: object, why: str) -> None:
     """InputError where there are too many."""
-    if not candidates <= MOST_CANDIDATES:
-        what, right = (
-            f"more than {MOST_CANDIDATES:,} candidates ({why})",
-            "a wider spacing, or fewer heights and pitches",
-        )
-        raise InputError(place, what, right)
+    if not candidates <= limits.SITES.most:
+        what = f"more than {limits.SITES.most:,} candidates ({why})"
+        raise InputError(place, what, f"a wider spacing, or fewer heights and pitches; {limits.SITES.right}")
 
 
 def _alike(refused: list[InputError]) -> Iterator[Finding]:
@@ -317,10 +311,7 @@ def _csv(path: Path, world: Georeference) -> Iterator[_Row]:
 
 def _geojson(path: Path, world: Georeference) -> Iterator[_Row]:
     right = "a FeatureCollection of Points"
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise InputError(path, f"cannot be read as GeoJSON ({error})", right) from None
+    document = documents.read_json(path, right)
     if not isinstance(document, dict) or not isinstance(document.get("features"), list):
         raise InputError(path, f"has no list of features: {reprlib.repr(document)[:120]}", right)
     reading = located_rows.reading_of(document, path, world)
@@ -362,13 +353,14 @@ def _lattice(rule: SiteGrid) -> Iterator[_Row]:
 
 
 def _lines(rules: tuple[SiteLine, ...]) -> Iterator[_Row]:
-    spots = []
+    spots: list[tuple[float, float, tuple[float, ...]]] = []
     for rule in rules:
         line = np.asarray(rule.line_m)
         along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
-        _check_number(along[-1] / rule.spacing_m, "sites.along", f"spacing_m = {rule.spacing_m:g}")
+        _check_number(float(along[-1]) / rule.spacing_m, "sites.along", f"spacing_m = {rule.spacing_m:g}")
         where = np.arange(math.floor(along[-1] / rule.spacing_m + 1e-9) + 1) * rule.spacing_m
         xs, ys = np.interp(where, along, line[:, 0]), np.interp(where, along, line[:, 1])
+        _check_number(len(spots) + len(where), "sites.along", f"spacing_m = {rule.spacing_m:g}")
         spots += [(float(x), float(y), rule.heights_m) for x, y in zip(xs, ys, strict=True)]
     yield from _named("a", spots, "sites.along")
 

@@ -124,11 +124,11 @@ class Workspace:
         """The sha256 of some artefacts, by name."""
         return {name: self.digest(name) for name in artefacts}
 
-    def forget(self, *artefacts: str) -> None:
-        """Some artefacts are about to be written anew."""
-        for name in artefacts:
-            self._digests.pop(name, None)
-            self._recorded.pop(name, None)
+    def forget(self, *names: str) -> None:
+        """Some artefacts, or folders with what lies in them, are about to be written anew."""
+        for known in (self._digests, self._recorded):
+            for name in [its for its in known if its in names or its.partition("/")[0] in names]:
+                del known[name]
 
     def remember(self, what: str, artefacts: tuple[str, ...], make: Callable[[], T]) -> T:
         """What ``make`` gives, made once for as long as the artefacts that it is made from stay what they are."""

@@ -169,6 +169,8 @@ def run(
     doubts = period_scores.disagreements(names, ranking, periods)
     doubts += targets.doubts(tpog, [period.tpog for period in periods]) if targets is not None else []
     doubts += [doubt for its in judged.values() for doubt in its.doubts()]
+    if not nothing:
+        doubts += [doubt for its in judged.values() if its is not ranking for doubt in its.idle()]
     if ranking.estimate is not None:
         records = [period.name for period in periods] or [""]
         summary |= uncertainty.in_words(ranking.estimate, records)

@@ -6,7 +6,7 @@ Steps: find what lays the ground where the network has relief; read, mend and bu
 
 from __future__ import annotations
 
-from pipeline.checks.mesh_parts import pulled_in
+from pipeline.checks.mesh_parts import digests
 from pipeline.core import files
 from pipeline.effects import on_traffic
 from pipeline.stages.base import StageInputs, Summary, Workspace
@@ -23,12 +23,10 @@ ARTEFACTS = (STATICS,)
 def inputs(work: Workspace) -> StageInputs:
     """The statics settings, the region of interest (for the ground's extent), and the files' hashes."""
     scenario, model, box = work.scenario, work.scenario.statics, work.scenario.roi.box
-    named = [*(("footprints", f) for f in model.footprints), *(("polygons", f) for f in model.polygons),
-             *(("meshes", m.file) for m in model.meshes)]  # fmt: skip
+    named = [*(("footprints", f) for f in model.footprints), *(("polygons", f) for f in model.polygons)]
     hashes = {name: files.sha256_of(scenario.find(name, f"statics.{key}")) for key, name in named}
     for mesh in model.meshes:
-        for part in pulled_in(scenario.find(mesh.file, "statics.meshes")):
-            hashes[f"{mesh.file}: {part.name}"] = files.sha256_of(part)
+        hashes |= digests(scenario.find(mesh.file, "statics.meshes"), mesh.file)
     ground = on_traffic.ground(scenario)
     if ground is not None and (path := sumo_folder.network_path(scenario)) is not None:
         hashes["surface"] = files.sha256_of(path)

@@ -16,17 +16,20 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from pipeline.artefacts import schemas, tables
+from pipeline.artefacts import checksums, schemas, tables
+from pipeline.artefacts.readers import ACCURACY_SUMS
 from pipeline.core import files
 from pipeline.core.errors import EgvsError, InputError
 from pipeline.core.progress import Progress, silent
 from pipeline.effects import registry
 from pipeline.effects.base import Expand
+from pipeline.runs.guarding import keep_inputs
 from pipeline.runs.locking import alone
 from pipeline.runs.stages import RANKING
 from pipeline.runs.workflow import refresh_report
+from pipeline.scenario.loading import load
 from pipeline.scenario.models import Scenario
-from pipeline.studies import comparison, lengths, pareto_figure
+from pipeline.studies import comparison, lengths, measuring, pareto_figure
 from pipeline.studies import variants as study_settings
 from pipeline.studies.comparison import Row
 from pipeline.studies.measuring import SettingListener, SettingRunner, SettingScores, inputs_of
@@ -110,6 +113,7 @@ def study(
     """
     if not 1e-6 <= tolerance <= 1:
         raise InputError("--tolerance", f"{tolerance:g}", "a share from 1e-6 to 1, for example 0.02")
+    keep_inputs(load(path, sets), out, (measuring.FOLDER,))
     with alone(out):
         runner = SettingRunner(path, sets, out, jobs, progress)
         scenario = runner.scenario(OWN)
@@ -176,9 +180,11 @@ class _Work:
         rows = comparison.judge(rows, tolerance)
         best = next((row for row in rows if row.recommended), None)
         written = (out / "accuracy.parquet", out / "accuracy.png")
+        (out / ACCURACY_SUMS).unlink(missing_ok=True)
         times = times if REFERENCE in scores else 1
         _write(written[0], scenario, rows, own, times, tolerance)
         pareto_figure.draw_figure(rows, tolerance, scenario.name, written[1])
+        checksums.write(out / ACCURACY_SUMS, written)
         neighbours = scores.get(REFERENCE, own).neighbours
         empty = not any(own.shares)
         return AccuracyStudy(rows, self.skipped, tolerance, best, times, neighbours, written, None, repeated, empty)

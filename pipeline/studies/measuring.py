@@ -31,6 +31,8 @@ from pipeline.core import files
 from pipeline.core.cost import Cost, let_go
 from pipeline.core.errors import InputError, RunError
 from pipeline.core.progress import Progress
+from pipeline.core.reading import documents
+from pipeline.core.reading.seals import SEAL, is_sealed, sealed
 from pipeline.runs import stage_keys, stages
 from pipeline.runs.stage_keys import Inputs
 from pipeline.runs.stages import RANKING, Made
@@ -52,6 +54,9 @@ from pipeline.stages.shared.scene import scene_of, site_digests
 from pipeline.stages.shared.target_scores import Targets
 from pipeline.studies.lengths import counted_frames
 from pipeline.studies.variants import Setting
+
+FOLDER = "accuracy"
+"""In the run's folder, where results are kept."""
 
 SettingListener = Callable[[str, str, dict[str, Any]], None]
 """Called with (setting, "done" | "kept" | "skipped", its seconds, or why it was skipped) as a study goes on."""
@@ -120,7 +125,7 @@ class SettingRunner:
 
     def __init__(self, path: Path, sets: Sequence[str], out: Path, jobs: int | None, progress: Progress) -> None:
         self._path, self._sets, self._jobs, self._progress = path, tuple(sets), jobs, progress
-        self._kept, self._store = out / "accuracy", Store.default()
+        self._kept, self._store = out / FOLDER, Store.default()
         try:
             (self._kept / "times").mkdir(parents=True, exist_ok=True)
             for left in self._kept.glob(".work-*"):  # of a study that was killed
@@ -158,7 +163,7 @@ class SettingRunner:
             keys = {name: self._bring(name, work, scored.append) for name in RANKING}
             scores = _scores(work, keys, setting.weight, scored)
         about = {"setting": setting.name, "overrides": setting.overrides, "scores": scores.__dict__}
-        files.write_text(self._result(setting), json.dumps(about, indent=1) + "\n")
+        _write(self._result(setting), about)
         return scores
 
     def again(self, name: str, setting: Setting, scores: SettingScores) -> None:
@@ -202,11 +207,11 @@ class SettingRunner:
         """Something else that the study keeps."""
         path = self._kept / f"{name}.json"
         with _as_kept(path):
-            return dict(_read(path)) if path.is_file() else {}
+            return _read(path) if path.is_file() else {}
 
     def keep_note(self, name: str, value: dict[str, Any]) -> None:
         """Keep it."""
-        files.write_text(self._kept / f"{name}.json", json.dumps(value, indent=1) + "\n")
+        _write(self._kept / f"{name}.json", value)
 
     def _bring(self, name: str, work: Workspace, observe: Callable[[ScoredSite], None] | None = None) -> str:
         """A stage's artefacts into a workshop that holds those before, from the store where it has them; its key.
@@ -239,7 +244,7 @@ class SettingRunner:
                 raise RunError(f"{name}: a repeat wrote other bytes than the first run; see {path}")
             if measured:
                 kept["measured"].append(cost)
-        files.write_text(path, json.dumps(kept) + "\n")
+        _write(path, kept)
 
     def _result(self, setting: Setting) -> Path:
         """Where a setting's result is kept; the scenario's files are read once for it."""
@@ -271,8 +276,16 @@ def _as_kept(path: Path) -> Iterator[None]:
         raise InputError(path, found, "remove it, and run the study again") from None
 
 
-def _read(path: Path) -> Any:
-    return json.loads(path.read_text(encoding="utf-8"))
+def _read(path: Path) -> dict[str, Any]:
+    """What :func:`_write` wrote; ValueError for anything else."""
+    value = documents.read_json(path, "remove it, and run the study again")
+    if not is_sealed(value):
+        raise ValueError("its own_sha256 is of other content")
+    return {key: part for key, part in value.items() if key != SEAL}
+
+
+def _write(path: Path, value: dict[str, Any]) -> None:
+    files.write_text(path, json.dumps(sealed(value), indent=1) + "\n")
 
 
 def _sound(scores: SettingScores) -> SettingScores:

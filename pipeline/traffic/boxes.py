@@ -19,6 +19,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from pipeline.artefacts.recorded_boxes import LARGEST_M, SMALLEST_M
 from pipeline.core.errors import InputError
 from pipeline.traffic.frames import FrameGroup
 
@@ -98,13 +99,18 @@ def from_bumpers(
 ) -> VehicleBoxes:
     """The boxes of a group of whole frames. Those of ``uncounted_types`` do not count as vehicles of the scenario.
 
-    InputError when a vehicle is of a type without a known size, or is twice in a frame.
+    InputError when a vehicle is of a type without a size that a vehicle has, or is twice in a frame.
     """
     names, code = _sorted_codes(group.rows["id"])
     types, type_code = _sorted_codes(group.rows["type"])
     for name in (name for name in types if name not in sizes):
         right = f"a kind of that name with length_m, width_m and height_m (known: {', '.join(sorted(sizes))})"
         raise InputError(place, f"vehicle type {name!r} has no known size", right)
+    for name in types:
+        for key in ("length_m", "width_m", "height_m"):
+            if not SMALLEST_M <= (size_m := getattr(sizes[name], key)) <= LARGEST_M:
+                what = f"vehicle type {name!r} has {key} = {size_m:g}"
+                raise InputError(place, what, f"at least {SMALLEST_M} m, at most {LARGEST_M:g} m")
     order = np.lexsort((code, group.frame))
     frame, code, type_code = group.frame[order], code[order], type_code[order]
     twice = np.flatnonzero((np.diff(frame) == 0) & (np.diff(code) == 0))

@@ -11,6 +11,8 @@ milliseconds, SUMO's own unit. Rows without a vehicle (SUMO writes one for an em
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 from collections.abc import Generator, Iterable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -22,6 +24,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from pipeline.core.errors import InputError
+from pipeline.core.reading import limits, refusing
 from pipeline.formats import safe_xml
 from pipeline.formats.georeference import Georeference, Reading
 from pipeline.scenario.types import FARTHEST_M
@@ -35,12 +38,18 @@ SCHEMA = pa.schema(
 _NEEDED = ("time", "id", "x", "y", "angle", "type")
 _OPTIONAL = {"z": 0.0, "slope": 0.0, "speed": float("nan")}
 _STRINGS = ("id", "type")
+_MAY_MISS = ("speed",)
+"""NaN, where a file has none."""
+
+_WHOLE = "a whole file; make it again"
 _OTHERS = {"vehicle": ("person_", "container_"), "person": ("vehicle_", "container_", "person_slope")}
 """Columns that belong to others, or (a person's slope) mean nothing."""
 _BLOCK_BYTES = 1 << 20
 """Arrow reads dozens of blocks ahead: with 4 MiB they take 150 MB, and reading is no faster."""
 
 _BATCH_ROWS = 1 << 16
+_MOST_ROWS_A_BYTE = 10
+"""Positions and angles that change take at least a bit a row."""
 RIGHT = "FCD with the attributes id, x, y, angle and type (--fcd-output.attributes id,x,y,z,angle,slope,type,speed)"
 """What a message asks for where a file is not right."""
 
@@ -93,7 +102,7 @@ def _csv(path: Path, who: str) -> Iterator[pa.RecordBatch]:
     from pyarrow import csv
 
     with safe_xml.opened(path) as file:
-        header = file.readline().decode("utf-8", "replace").lstrip("\ufeff").strip()
+        header = safe_xml.line_of(file, path).decode("utf-8", "replace").lstrip("\ufeff").strip()
     delimiter = ";" if ";" in header else ","
     columns = _columns([name.strip('"') for name in header.split(delimiter)], path, who)
     convert = csv.ConvertOptions(
@@ -102,39 +111,51 @@ def _csv(path: Path, who: str) -> Iterator[pa.RecordBatch]:
         null_values=[""],
         strings_can_be_null=True,
     )
-    reading = csv.ReadOptions(block_size=_BLOCK_BYTES, use_threads=False)
-    try:
-        with (
-            pa.input_stream(path, compression="gzip" if safe_xml.is_gzip(path) else None) as stream,
-            csv.open_csv(stream, reading, csv.ParseOptions(delimiter=delimiter), convert) as batches,
-        ):
-            for batch in batches:
-                yield batch.rename_columns(list(columns))
-    except (pa.ArrowInvalid, OSError) as error:
-        raise _damaged(path, "CSV", error) from None
+    options = csv.ReadOptions(block_size=_BLOCK_BYTES, use_threads=False)
+    with (
+        refusing.reading(path, _WHOLE, "cannot be read as CSV"),
+        safe_xml.opened(path) as stream,
+        csv.open_csv(stream, options, csv.ParseOptions(delimiter=delimiter), convert) as batches,
+    ):
+        for batch in batches:
+            yield batch.rename_columns(list(columns))
 
 
 def _parquet(path: Path, who: str) -> Iterator[pa.RecordBatch]:
     import pyarrow.parquet as pq
 
-    with _seekable(path) as source:
-        try:
-            with pq.ParquetFile(source) as file:
-                columns = _columns(file.schema_arrow.names, path, who)
-                for batch in file.iter_batches(_BATCH_ROWS, columns=list(columns.values())):
-                    yield batch.select(list(columns.values())).rename_columns(list(columns))
-        except (pa.ArrowInvalid, OSError) as error:
-            raise _damaged(path, "Parquet", error) from None
+    with (
+        refusing.reading(path, _WHOLE, "cannot be read as Parquet"),
+        _seekable(path) as source,
+        pq.ParquetFile(source) as file,
+    ):
+        columns = _columns(file.schema_arrow.names, path, who)
+        _check_rows(file.metadata, path)
+        for batch in file.iter_batches(_BATCH_ROWS, columns=list(columns.values())):
+            batch.validate(full=True)  # its texts are UTF-8
+            yield batch.select(list(columns.values())).rename_columns(list(columns))
 
 
 @contextmanager
 def _seekable(path: Path) -> Iterator[Any]:
-    """Parquet is read from its end, so a gzipped one is unzipped into memory first."""
+    """Parquet is read from its end, so a gzipped one is unzipped first."""
     if safe_xml.is_gzip(path):
-        with safe_xml.opened(path) as file:
-            yield pa.BufferReader(file.read())
+        with safe_xml.opened(path) as file, tempfile.TemporaryFile() as plain:
+            shutil.copyfileobj(file, plain)
+            plain.seek(0)
+            yield plain
     else:
         yield path
+
+
+def _check_rows(about: Any, path: Path) -> None:
+    """InputError where a Parquet file says that it holds more than it can."""
+    groups = [about.row_group(number) for number in range(about.num_row_groups)]
+    largest = max((group.total_byte_size for group in groups), default=0)
+    limits.UNPACKED.check_bytes(path, largest, f"has a row group of {largest / limits.MB:,.0f} MB, unpacked")
+    packed = sum(group.column(i).total_compressed_size for group in groups for i in range(group.num_columns))
+    if about.num_rows > _MOST_ROWS_A_BYTE * packed:
+        raise InputError(path, f"says that it holds {about.num_rows:,} rows in {packed:,} bytes", _WHOLE)
 
 
 def _xml(path: Path, who: str) -> Iterator[pa.RecordBatch]:
@@ -184,7 +205,7 @@ def _checked(batches: Iterable[pa.RecordBatch], path: Path, unit: str) -> Iterat
         piece = _Piece(batch, done, path, unit)
         done += batch.num_rows
         piece.check_types()
-        for name in ("time", "x", "y", "angle", *(n for n in _OPTIONAL if n in piece.values and n != "speed")):
+        for name in ("time", "x", "y", "angle", *(n for n in _OPTIONAL if n in piece.values)):
             piece.check_finite(name)
         time_ms = piece.milliseconds()
         if time_ms.size:
@@ -209,7 +230,8 @@ class _Piece:
             raise self._wrong(i, f"{self._vehicle(i)} has no type", "the vehicle's type, which its size comes from")
 
     def check_finite(self, name: str) -> None:
-        for i in np.flatnonzero(~(np.abs(_floats(self.values[name])) <= FARTHEST_M)):
+        values = np.abs(_floats(self.values[name]))
+        for i in np.flatnonzero(~((values <= FARTHEST_M) | (np.isnan(values) & (name in _MAY_MISS)))):
             value = self.values[name][int(i)].as_py()
             what = f"{name} of {self._vehicle(i)} is {'empty' if value is None else value}"
             raise self._wrong(i, what, f"a finite number, at most {FARTHEST_M:g}")
@@ -249,7 +271,3 @@ def _floats(column: Any) -> NDArray[np.float64]:
 
 def _rows_of(mask: Any) -> NDArray[np.int64]:
     return np.flatnonzero(mask.to_numpy(zero_copy_only=False))
-
-
-def _damaged(path: Path, what: str, error: Exception) -> InputError:
-    return InputError(path, f"cannot be read as {what} ({str(error).splitlines()[0]})", "a whole file; make it again")

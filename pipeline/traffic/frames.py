@@ -14,6 +14,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from pipeline.core.errors import InputError
+from pipeline.core.reading import limits
 from pipeline.traffic.fcd import RIGHT, SCHEMA
 
 
@@ -74,6 +75,8 @@ class _Cutter:
             self.frames.append(frame[kept])
             is_run = kept[-1] - kept[0] + 1 == kept.size
             self.tables.append(table.slice(int(kept[0]), kept.size) if is_run else table.take(kept))
+            held = sum(table.num_rows for table in self.tables)
+            limits.ROWS.check(self.place, held, f"has more than {limits.ROWS.most:,} vehicles in frames side by side")
         return int(np.clip(-((self.first_ms - self.last_ms) // window.period_ms), 0, window.count))
 
     def take(self, frames: int) -> FrameGroup:

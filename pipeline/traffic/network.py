@@ -24,12 +24,13 @@ from numpy.typing import NDArray
 from pipeline.core import files
 from pipeline.core.errors import InputError
 from pipeline.formats import safe_xml
+from pipeline.scenario.types import coordinate_m
 
 LANE_WIDTH_M, DEFAULT_SPEED_M_S = 3.2, 13.89
 """A lane's width and speed limit where the network names none: SUMO's defaults."""
 
 _TURNAROUNDS = ("t", "T")
-_HEIGHT = re.compile(rb'[" ][^", ]+,[^", ]+,[^", ]+[" ]')
+_HEIGHT = re.compile(rb"(?:^|\s)[^,\s]+,[^,\s]+,[^,\s]+(?:\s|$)")
 """A point with a third coordinate. (SUMO writes none where a height is 0.)"""
 
 _PEDESTRIAN = "pedestrian"
@@ -68,7 +69,7 @@ class Shape:
     def shape_m(self) -> NDArray[np.float64]:
         """(n, 3) float64, metres; z is 0 where the file names none. InputError when the text holds no coordinates."""
         try:
-            points = [[float(v) for v in point.split(",")] for point in self.text.split()]
+            points = [[coordinate_m(v) for v in point.split(",")] for point in self.text.split()]
             return np.array([[*point, 0.0][:3] for point in points], dtype=np.float64).reshape(-1, 3)
         except ValueError as error:
             raise InputError(self.place, f"a shape holds no coordinates ({error})", _RIGHT) from None
@@ -324,7 +325,8 @@ def location_of(path: Path, root: str = "net") -> Location | None:
 
 
 def _location(element: Element) -> Location:
-    return Location(element.get("projParameter", ""), _point(element.attrib["netOffset"]))
+    x, y = map(float, element.attrib["netOffset"].split(",")[:2])  # -1e10 in a network of no road
+    return Location(element.get("projParameter", ""), (x, y))
 
 
 def _edge(element: Element, path: Path) -> Edge:
@@ -346,7 +348,7 @@ def _lane(lane: Element, path: Path) -> Lane:
 
 
 def _junction(junction: dict[str, str], path: Path) -> Junction:
-    name, at_m = junction["id"], (float(junction["x"]), float(junction["y"]))
+    name, at_m = junction["id"], (coordinate_m(junction["x"]), coordinate_m(junction["y"]))
     incoming = tuple(junction.get("incLanes", "").split())
     shape, place = junction.get("shape", ""), f"{path}: junction {name}"
     return Junction(shape, place, name, junction.get("type", ""), at_m, incoming)
@@ -371,7 +373,7 @@ def _road_connections(connections: Iterable[dict[str, str]], roads: Sequence[Edg
 
 def _point(text: str) -> tuple[float, float]:
     x, y = text.split(",")[:2]
-    return float(x), float(y)
+    return coordinate_m(x), coordinate_m(y)
 
 
 def is_osm(path: Path) -> bool:
@@ -383,8 +385,7 @@ def may_have_heights(path: Path) -> bool:
     """Whether any shape has a third coordinate: a quick look, so that a flat network need not be read."""
     if is_osm(path) or not path.is_file():
         return False
-    with safe_xml.opened(path) as file:
-        return any(_HEIGHT.search(line, line.find(b"shape=")) is not None for line in file if b"shape=" in line)
+    return any(_HEIGHT.search(shape) is not None for shape in safe_xml.values_of(path, "shape"))
 
 
 def _parts(lanes: Sequence[str], links: Sequence[tuple[str, str]]) -> list[int]:

@@ -7,8 +7,6 @@ running; a finished file, of which nothing is promised.
 from __future__ import annotations
 
 import math
-import re
-import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import AbstractContextManager, contextmanager
@@ -18,7 +16,7 @@ from time import perf_counter
 
 import pyarrow as pa
 
-from pipeline.core.errors import InputError, RunError
+from pipeline.core.errors import InputError
 from pipeline.core.findings import Finding
 from pipeline.core.progress import Progress
 from pipeline.formats import safe_xml
@@ -33,6 +31,7 @@ from pipeline.traffic.finished import sizes as finished_sizes
 from pipeline.traffic.finished import survey
 from pipeline.traffic.finished.sizes import kind_sizes
 from pipeline.traffic.frames import Window
+from pipeline.traffic.guarded import endings
 from pipeline.traffic.sumo_folder import (
     COLLISIONS,
     CONFIG,
@@ -84,6 +83,8 @@ class Recording:
         Vehicles that may stand longer; of a running SUMO filled as rows come.
     summary
         To be asked for when the rows are through; None of a finished file.
+    source
+        For messages about rows: the finished file, or the files that SUMO ran; empty of a running SUMO.
     """
 
     rows: Iterable[pa.Table]
@@ -95,6 +96,7 @@ class Recording:
     stopped_on_purpose: Set[str] = frozenset()
     persons: Iterable[pa.Table] | None = None
     summary: Callable[[], RecordingSummary | None] = lambda: None
+    source: str = ""
 
 
 def record(
@@ -128,7 +130,8 @@ def _finished(scenario: Scenario, world: Georeference) -> Iterator[Recording]:
     assert name is not None
     when, held = survey.window(scenario)
     path, sizes = scenario.find(name, "traffic.fcd"), finished_sizes.of_types(scenario, held.types)
-    yield Recording(fcd.located(fcd.read(path), world, path), when, sizes, place)
+    rows = fcd.located(fcd.read(path), world, path)
+    yield Recording(rows, when, sizes, place, source=f"{place}.fcd = {name!r}")
 
 
 @contextmanager
@@ -137,12 +140,14 @@ def _simulated(
 ) -> Iterator[Recording]:
     """From SUMO as a subprocess; its FCD file is removed once it is read."""
     prepared = sumo_folder.prepare(scenario, folder, extensions)
-    sizes = kind_sizes(scenario.traffic.kinds) if prepared.drawn else type_sizes(prepared)
+    with _sumo_runs(prepared, scenario):
+        sizes = kind_sizes(scenario.traffic.kinds) if prepared.drawn else type_sizes(prepared)
     for extension in extensions:
         sizes |= extension.sizes()
     path, persons = folder / FCD, folder / PERSONS
     try:
-        seconds, flags = round(simulate(prepared, progress), 3), as_flags(prepared.options | prepared.outputs)
+        with _sumo_runs(prepared, scenario):
+            seconds, flags = round(simulate(prepared, progress), 3), as_flags(prepared.options | prepared.outputs)
         crashes = _collisions(prepared)
         met, warnings = _met(scenario, prepared)
         warnings += [*_crashed(crashes, scenario), *_waiting(prepared, scenario)]
@@ -157,10 +162,27 @@ def _simulated(
             _stopped_on_purpose(prepared),
             None if not prepared.adds_traffic else (fcd.read(persons, "person") if _has_rows(persons) else ()),
             lambda: summary,
+            f"{sumo_folder.place_of(scenario)} ({_names(prepared)})",
         )
     finally:
         for written in (path, persons, folder / DRIVEN, folder / STATISTICS):
             written.unlink(missing_ok=True)
+
+
+@contextmanager
+def _sumo_runs(prepared: Prepared, scenario: Scenario) -> Iterator[None]:
+    """What SUMO refuses came from the scenario: an InputError that names the files."""
+    try:
+        yield
+    except sumo.RefusedError as error:
+        right = "what SUMO runs without an error; it read copies of these files"
+        raise InputError(
+            sumo_folder.place_of(scenario), f"SUMO cannot run {_names(prepared)}: {error}", right
+        ) from None
+
+
+def _names(prepared: Prepared) -> str:
+    return ", ".join(path.name for path in prepared.given)
 
 
 @contextmanager
@@ -211,37 +233,24 @@ def check_whole(prepared: Prepared) -> None:
     """RunError where SUMO did not write a file to its end: on a full disk it ends without a word or an error."""
     folder, outputs = prepared.folder, prepared.outputs.values()
     for name in (name for name in (FCD, PERSONS, COLLISIONS, STOPS, STATISTICS, DRIVEN) if name in outputs):
-        end = rb"\n" if name not in _ROOTS else rf"(</{_ROOTS[name]}>|<{_ROOTS[name]}[^<>]*/>)\s*\n".encode()
-        if re.search(end + rb"\Z", _tail(folder / name)) is None:
-            raise _cut(folder / name)
+        if name in _ROOTS:
+            endings.check_xml(folder / name, _ROOTS[name])
+        else:
+            endings.check_table(folder / name)
     last_ms = prepared.timing.end_ms - prepared.timing.step_ms
     if STATISTICS in outputs and _vehicles(prepared)["running"] and (_last_time_ms(folder / FCD) or 0) < last_ms:
-        raise _cut(folder / FCD)
-
-
-def _cut(path: Path) -> RunError:
-    free_mb = shutil.disk_usage(path.parent).free / 1e6
-    return RunError(f"{path}: SUMO did not write it to its end; is the disk full? ({free_mb:,.0f} MB are free there)")
+        raise endings.cut(folder / FCD)
 
 
 def _last_time_ms(path: Path) -> int | None:
     """The time of the last whole row of a CSV that is being written."""
     if not path.is_file():
         return None
-    lines = _tail(path).split(b"\n")
+    lines = endings.tail(path).split(b"\n")
     try:
         return round(float(lines[-2].split(b";")[0]) * 1000) if len(lines) > 2 else None
     except ValueError:
         return None
-
-
-def _tail(path: Path) -> bytes:
-    """The file's last bytes; none where there is no such file."""
-    if not path.is_file():
-        return b""
-    with path.open("rb") as file:
-        file.seek(max(0, path.stat().st_size - 512))
-        return file.read()
 
 
 def type_sizes(prepared: Prepared) -> dict[str, Size]:

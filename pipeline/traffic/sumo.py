@@ -11,6 +11,9 @@ from __future__ import annotations
 
 import os
 import re
+import signal
+import socket
+import struct
 import subprocess
 import sys
 import tempfile
@@ -25,7 +28,7 @@ from typing import IO, Any
 
 from pipeline.core.errors import InputError, MissingBackendError, RunError
 from pipeline.core.sumo_home import sumo_home
-from pipeline.traffic.guarded import confined
+from pipeline.traffic.guarded import confined, endings
 
 APT_LINE = "apt-get install libatomic1 libx11-6 libxext6 libxrender1 libgl1"
 """What SUMO's binaries need on a minimal Debian."""
@@ -34,11 +37,20 @@ _POLL_S = 0.1
 _LISTENS_S = 0.02
 _OPENS_WITHIN_S = 60.0
 _ENDS_WITHIN_S = 10.0
-_SHOWN_ERRORS = 12
+_SHOWN_ERRORS, _SHOWN_SIGNS = 12, 300
+
+_CRASHES = frozenset({signal.SIGSEGV, signal.SIGABRT, signal.SIGFPE, signal.SIGILL, getattr(signal, "SIGBUS", 0)})
+"""Signals by which a program ends itself."""
+
+_ANSWERS_WITHIN_S, _STEPS_WITHIN_S = 30.0, 600.0
+"""How long somebody else's SUMO may take to answer first, and then each time: it may be paused by hand."""
+
+_NO_TRACI = (struct.error, UnicodeDecodeError)
+"""What reading an answer raises that is none of SUMO's."""
 
 
 class RefusedError(RunError):
-    """A program of SUMO refused what it was given: it ended by itself, with an error."""
+    """A program of SUMO refused what it was given: it ended by itself, with an error, or crashed."""
 
 
 def binary(name: str) -> Path:
@@ -113,14 +125,36 @@ def run(
     Raises
     ------
     RefusedError
-        When it ends with an error: its own error text and exit code. RunError when it is killed.
+        When it ends with an error, or crashes: its own error text and exit code. RunError when it is killed.
     MissingBackendError
         When it, or a system library that it needs, is not installed.
     """
-    log = log or Path(os.devnull)
+    return _run(name, [str(binary(name)), *arguments], folder, log or Path(os.devnull), watch)
+
+
+def netconvert(arguments: Sequence[str], folder: Path, name: str) -> None:
+    """Have netconvert make the network ``name`` in a folder; raises what :func:`run` does, and RunError where it did
+    not write the network to its end."""
+    run("netconvert", [*arguments, "-o", name], folder)
+    endings.check_xml(folder / name, "net")
+
+
+def run_tool(name: str, arguments: Sequence[str], folder: Path) -> str:
+    """Run one of SUMO's Python tools, e.g. ``"routeSampler.py"``, to its end and return what it printed; as :func:`run`
+    does, it may write in its folder only.
+
+    RunError when it ends with an error; MissingBackendError when it is not installed.
+    """
+    tool = sumo_home() / "tools" / name
+    if not tool.is_file():
+        raise MissingBackendError(f"SUMO's tool {name} is not in {tool.parent}: pip install eclipse-sumo")
+    return _run(name, [sys.executable, "-B", str(tool), *arguments], folder, Path(os.devnull), None)
+
+
+def _run(name: str, command: Sequence[str], folder: Path, log: Path, watch: Callable[[], None] | None) -> str:
     with log.open("wb") as errors:
         capture = subprocess.PIPE if str(log) == os.devnull else errors
-        with _started(name, arguments, folder, subprocess.PIPE, capture) as process:
+        with _started(command, folder, subprocess.PIPE, capture) as process:
             printed, complaint = _wait(process, watch)
     if process.returncode:
         text = complaint if capture == subprocess.PIPE else log.read_bytes()
@@ -128,31 +162,14 @@ def run(
     return printed.decode("utf-8", "replace")
 
 
-def run_tool(name: str, arguments: Sequence[str], folder: Path) -> str:
-    """Run one of SUMO's Python tools, e.g. ``"routeSampler.py"``, to its end and return what it printed.
-
-    RunError when it ends with an error; MissingBackendError when it is not installed.
-    """
-    tool = sumo_home() / "tools" / name
-    if not tool.is_file():
-        raise MissingBackendError(f"SUMO's tool {name} is not in {tool.parent}: pip install eclipse-sumo")
-    command = [sys.executable, str(tool), *arguments]
-    done = subprocess.run(command, cwd=folder, env=environment(), stdin=subprocess.DEVNULL, capture_output=True)
-    if done.returncode:
-        raise failure(name, done.returncode, done.stderr.decode("utf-8", "replace"))
-    return done.stdout.decode("utf-8", "replace")
-
-
 @contextmanager
-def _started(
-    name: str, arguments: Sequence[str], folder: Path, printed: Any, complaints: Any
-) -> Iterator[subprocess.Popen[bytes]]:
+def _started(command: Sequence[str], folder: Path, printed: Any, complaints: Any) -> Iterator[subprocess.Popen[bytes]]:
     """A program that ends with the block, and with this process. It may write in its folder only."""
     launcher = [sys.executable, "-I", "-S", confined.__file__, os.curdir, str(os.getpid())]
     reading, holding = os.pipe()
     try:
         process = subprocess.Popen(
-            [*launcher, str(binary(name)), *arguments], cwd=folder, env=environment(), stdin=reading, stdout=printed,
+            [*launcher, *command], cwd=folder, env=environment(), stdin=reading, stdout=printed,
             stderr=complaints,
         )  # fmt: skip
     except BaseException:
@@ -190,26 +207,39 @@ def failure(name: str, code: int, text: str) -> RunError:
     if code == confined.CANNOT_START:
         return MissingBackendError(f"{name} cannot be started: {(lines or ['this process has ended'])[-1]}")
     errors = [line for line in lines if not line.startswith(("Warning", "Quitting", "pj_obj_create"))] or lines[-1:]
-    how = f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
-    kind = RunError if code < 0 else RefusedError
-    return kind("\n".join([f"{name} {how}:", *(f"  {line}" for line in errors[:_SHOWN_ERRORS])]))
+    how = f"ended with exit code {code}"
+    if code < 0:
+        how = f"{'crashed with' if -code in _CRASHES else 'was killed by'} signal {-code}"
+    kind = RefusedError if code > 0 or -code in _CRASHES else RunError
+    return kind("\n".join([f"{name} {how}:", *(f"  {line[:_SHOWN_SIGNS]}" for line in errors[:_SHOWN_ERRORS])]))
 
 
 @contextmanager
 def connected(host: str, port: int) -> Iterator[Any]:
     """A TraCI connection to a SUMO that is already running.
 
-    InputError when nothing answers there; RunError when SUMO ends the connection early.
+    InputError when nothing answers there, or not as SUMO does; RunError when SUMO ends the connection early, or falls
+    silent.
     """
     import traci
 
+    place = f"--traci {host}:{port}"
     connection = _connect(host, port)
     if connection is None:
-        raise InputError(f"--traci {host}:{port}", "no SUMO answers there", "start one with --remote-port first")
+        raise InputError(place, "no SUMO answers there", "start one with --remote-port first")
     try:
+        try:
+            connection.getVersion()
+        except (*_NO_TRACI, traci.exceptions.TraCIException, traci.exceptions.FatalTraCIError):
+            found = f"who listens there does not answer as SUMO does within {_ANSWERS_WITHIN_S:g} s"
+            raise InputError(place, found, "the port that SUMO was given with --remote-port") from None
+        connection._socket.settimeout(_STEPS_WITHIN_S)
         yield connection
     except traci.exceptions.FatalTraCIError as error:
-        raise RunError(f"SUMO at {host}:{port} ended the connection: {error}") from None
+        what = f"ended the connection, or did not answer for {_STEPS_WITHIN_S:g} s"
+        raise RunError(f"SUMO at {host}:{port} {what}: {error}") from None
+    except (*_NO_TRACI, traci.exceptions.TraCIException) as error:
+        raise RunError(f"SUMO at {host}:{port} gave an answer that cannot be understood: {error}") from None
     finally:
         _close(connection)
 
@@ -218,11 +248,11 @@ def _close(connection: Any) -> None:
     """Close without a word when SUMO has hung up first."""
     import traci
 
-    socket = connection._socket
-    with suppress(traci.exceptions.FatalTraCIError, OSError):
+    its = connection._socket
+    with suppress(*_NO_TRACI, traci.exceptions.TraCIException, traci.exceptions.FatalTraCIError, OSError):
         connection.close(False)
-    if socket is not None:
-        socket.close()
+    if its is not None:
+        its.close()
 
 
 @contextmanager
@@ -234,8 +264,8 @@ def served(arguments: Sequence[str], folder: Path) -> Iterator[Any]:
     port = getFreeSocketPort()
     # a file, because SUMO would wait for ever on a full pipe that nobody reads
     with tempfile.TemporaryFile() as complaints:
-        flags = [*arguments, "--remote-port", str(port)]
-        with _started("sumo", flags, folder, subprocess.DEVNULL, complaints) as process:
+        command = [str(binary("sumo")), *arguments, "--remote-port", str(port)]
+        with _started(command, folder, subprocess.DEVNULL, complaints) as process:
             try:
                 connection = _attach(process, port)
                 try:
@@ -267,6 +297,7 @@ def _attach(process: subprocess.Popen[bytes], port: int) -> Any:
         if time.monotonic() > deadline:
             raise RunError(f"sumo did not open its TraCI port within {_OPENS_WITHIN_S:g} s")
         time.sleep(_LISTENS_S)
+    connection._socket.settimeout(None)  # one of our own, which may think as long as it likes
     return connection
 
 
@@ -274,14 +305,18 @@ def _connect(host: str, port: int) -> Any:
     """A connection, or None where nobody listens (traci forgets to close the socket then: Python would warn of it)."""
     import traci
 
+    patience_s = socket.getdefaulttimeout()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ResourceWarning)
         try:
+            socket.setdefaulttimeout(_ANSWERS_WITHIN_S)
             connection = traci.connect(port=port, host=host, numRetries=0)
         except (traci.exceptions.FatalTraCIError, OSError):
             return None
-    socket = connection._socket
-    if socket.getsockname() == socket.getpeername():  # TCP may connect a free local port to itself, and wait for ever
-        socket.close()
+        finally:
+            socket.setdefaulttimeout(patience_s)
+    ends = connection._socket.getsockname(), connection._socket.getpeername()
+    if ends[0] == ends[1]:  # TCP may connect a free local port to itself, and wait for ever
+        connection._socket.close()
         return None
     return connection

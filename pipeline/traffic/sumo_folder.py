@@ -11,7 +11,6 @@ compared exactly.
 from __future__ import annotations
 
 import shutil
-import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -143,9 +142,9 @@ def roads(scenario: Scenario) -> network.Network | None:
     path = network_path(scenario)
     if path is None or not network.is_osm(path):
         return None if path is None else network.read(path)
-    with tempfile.TemporaryDirectory(prefix="egvs-roads-") as folder:
-        convert_osm(path, Path(folder) / NETWORK)
-        return network.read(Path(folder) / NETWORK, path)
+    with files.scratch() as folder:
+        convert_osm(path, folder / NETWORK)
+        return network.read(folder / NETWORK, path)
 
 
 def may_have_heights(scenario: Scenario) -> bool:
@@ -159,6 +158,8 @@ class Prepared:
     """A folder that SUMO can run in."""
 
     folder: Path
+    given: tuple[Path, ...]
+    """The user's files of which it holds copies."""
     options: dict[str, str]
     timing: Timing
     roads: network.Network
@@ -168,6 +169,8 @@ class Prepared:
     """Whether the traffic is made here, of drawn trips or counts, and is not a user's."""
     counted: bool
     """Whether it follows counts."""
+    exactly: bool
+    """Whether each recorded frame must have that many, so that one that is missing is noticed."""
     adds_traffic: bool
     """Whether extensions added traffic to it."""
     notes: list[str]
@@ -186,7 +189,7 @@ class Prepared:
         }
         if self.adds_traffic or not self.drawn:  # else SUMO writes a user's persons among the vehicles
             wanted |= {"person-fcd-output": PERSONS}
-        if self.vehicles is None:
+        if not self.exactly:  # else nothing would tell a file that ends too early from roads that got empty
             wanted |= {"statistic-output": STATISTICS}
         if self.counted:
             wanted |= {"vehroute-output": DRIVEN, "vehroute-output.exit-times": "true",
@@ -229,7 +232,11 @@ def prepare(scenario: Scenario, folder: Path, extensions: Iterable[TrafficExtens
     if delay_s := traffic.max_depart_delay_s or (_DRAWN_DEPART_DELAY_S if drawn and not traffic.counts else None):
         options["max-depart-delay"] = f"{delay_s:g}"
     files.write_text(folder / CONFIG, _config_xml(options))
-    return Prepared(folder, options, when, roads, vehicles, drawn, bool(traffic.counts), bool(adding), left_out + notes)
+    exactly, notes = vehicles is not None and traffic.hold == "exactly", left_out + notes
+    return Prepared(
+        folder, tuple(given.all()), options, when, roads, vehicles, drawn, bool(traffic.counts), exactly, bool(adding),
+        notes,
+    )  # fmt: skip
 
 
 def _make_fresh(folder: Path, given: Sources) -> None:
@@ -313,20 +320,21 @@ def _copies(given: Sources, folder: Path, others: Iterable[str]) -> tuple[dict[s
 
 def convert_osm(path: Path, network_path: Path) -> None:
     """Turn a map of OpenStreetMap into a network; its world frame starts at the network's south-west corner."""
-    network_path.write_bytes(_converted(path, files.sha256_of(path)))
+    content = _converted(path, files.sha256_of(path))
+    with files.naming(network_path):
+        network_path.write_bytes(content)
 
 
 @lru_cache(maxsize=1)
 def _converted(path: Path, _content: str) -> bytes:
     """The network of a map, converted once for the check and the traffic."""
-    with tempfile.TemporaryDirectory(prefix="egvs-map-") as temporary:
-        folder = Path(temporary)
+    with files.scratch() as folder:
         if osm.is_pbf(path):  # netconvert reads XML only
             osm.write_xml(path, folder / MAP)
         else:
             copies.copy(path, folder / MAP)
         try:
-            sumo.run("netconvert", ["--osm-files", MAP, *_OSM_FLAGS, "-o", NETWORK], folder)
+            sumo.netconvert(["--osm-files", MAP, *_OSM_FLAGS], folder, NETWORK)
         except sumo.RefusedError as error:
             raise InputError(
                 path, f"is no map that streets can be made of: {error}", "a whole map; fetch it again"

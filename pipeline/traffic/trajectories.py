@@ -54,7 +54,8 @@ def write(
         if changes is None:  # a running SUMO tells sizes with its first rows
             own = {name: size for name, size in recording.sizes.items() if name not in uncounted}
             changes = [c for extension in extensions if (c := extension.box_change(scenario, own)) is not None]
-        made = boxes.from_bumpers(group, recording.sizes, period_s, recording.place, uncounted)
+        place = recording.source or recording.place
+        made = boxes.from_bumpers(group, recording.sizes, period_s, place, uncounted)
         for change in changes:
             made = change.change(made)
         if made.frame.size:

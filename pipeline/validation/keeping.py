@@ -25,13 +25,15 @@ from pipeline.validation.site_findings import Found, FoundBoxes
 from pipeline.validation.unseen_record import UnseenRecord
 
 FOLDER = "validation_kitti"
+ASIDE = f".{FOLDER}.partial"
+"""Where it is written first."""
 
 
 def write(
     folder: Path, record: UnseenRecord, frames: Sequence[TrafficFrame], found: Mapping[str, Mapping[str, Found]]
 ) -> None:
     """Write all sites into ``folder``, in place of what an earlier call has written there."""
-    aside = folder.with_name(f".{folder.name}.partial")
+    aside = folder.with_name(ASIDE)
     shutil.rmtree(aside, ignore_errors=True)
     for site, its in found.items():
         level = LevelFrame(record.scene.site(site).pose)

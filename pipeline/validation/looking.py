@@ -9,7 +9,6 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-import tempfile
 import threading
 from collections.abc import Generator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
@@ -17,7 +16,6 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 from pipeline.artefacts import schemas
 from pipeline.core import code_digest, files, parallel
@@ -224,19 +222,19 @@ def _kind_of(name: str) -> type[Found]:
 
 def _taken(kind: type[Found], key: str) -> Found | None:
     """From the store; None where it is not there."""
-    with tempfile.TemporaryDirectory(prefix="egvs-findings-") as folder:
-        if Store.default().take(_KIND[kind], key, Path(folder), link=True) is None:
+    with files.scratch() as folder:
+        if Store.default().take(_KIND[kind], key, folder, link=True) is None:
             return None
-        return kind.read(Path(folder) / f"{_KIND[kind]}.parquet")
+        return kind.read(folder / f"{_KIND[kind]}.parquet")
 
 
 def _put(kind: type[Found], key: str, found: Found, cost: Cost) -> None:
     """Into the store."""
     name = f"{_KIND[kind]}.parquet"
-    with tempfile.TemporaryDirectory(prefix="egvs-findings-") as folder:
-        path = Path(folder) / name
+    with files.scratch() as folder:
+        path = folder / name
         found.write(path, {"inputs": key})
         store = Store.default()
         with store.maker(_KIND[kind], key, wait=False) as mine:
             if mine:  # else another process is putting the same
-                store.put(_KIND[kind], key, Path(folder), Made({name: files.sha256_of(path)}, {}, {}, cost))
+                store.put(_KIND[kind], key, folder, Made({name: files.sha256_of(path)}, {}, {}, cost))

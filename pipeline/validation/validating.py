@@ -18,13 +18,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.artefacts import schemas, tables
+from pipeline.artefacts import checksums, schemas, tables
+from pipeline.artefacts.readers import VALIDATION_SUMS
 from pipeline.artefacts.traffic_frames import TrafficFrame
 from pipeline.core import files
 from pipeline.core.errors import InputError
 from pipeline.core.findings import WARNINGS, Finding, seen_from, warnings_of
 from pipeline.core.progress import Progress, silent
 from pipeline.runs import stage_keys, stages
+from pipeline.runs.guarding import keep_inputs
 from pipeline.runs.locking import alone
 from pipeline.runs.stages import RANKING
 from pipeline.runs.workflow import bring, refresh_report
@@ -86,6 +88,7 @@ def validate(
         results that are not of these sites and frames.
     """
     chosen = {name: registry.make(name) for name in dict.fromkeys(detectors) if name != POINTS}
+    _keep_inputs(scenario, out, detections, keep=keep)
     with alone(out), _workshop(out) as folder:
         doubts = _checked(scenario, folder / "check", progress)
         record = prepare(scenario, folder / "unseen", frames, jobs=jobs, progress=progress)
@@ -104,6 +107,14 @@ def validate(
         if keep:
             keeping.write(out / keeping.FOLDER, record, watched, found)
         return replace(done, report=refresh_report(out))
+
+
+def _keep_inputs(scenario: Scenario, out: Path, detections: Path | None, *, keep: bool) -> None:
+    """InputError where something that is read lies where something is written."""
+    keep_inputs(scenario, out, (keeping.FOLDER, keeping.ASIDE) if keep else ())
+    if keep and detections is not None and detections.resolve().is_relative_to((out / keeping.FOLDER).resolve()):
+        found = "lies where --keep writes anew"
+        raise InputError(f"--detections {detections}", found, "a copy of it elsewhere, or no --keep")
 
 
 def _given(
@@ -210,6 +221,7 @@ def _write(
     done.surrogates.write(aside / gathering.ARTEFACT, scenario)
     _write_correlation(aside / CORRELATION, done, about)
     figure.draw(aside / figure.ARTEFACT, scenario, done)
+    checksums.write(aside / VALIDATION_SUMS, sorted(aside.iterdir()))
     for made in sorted(aside.iterdir()):
         made.replace(out / made.name)
 

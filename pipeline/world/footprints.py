@@ -10,7 +10,6 @@ are strips of that half width.
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -21,6 +20,7 @@ import numpy as np
 
 from pipeline.core.errors import InputError
 from pipeline.core.findings import Finding, FindingsError
+from pipeline.core.reading import documents
 from pipeline.formats.georeference import IN_WORLD, Georeference, Reading, coordinates_of, declared_by
 from pipeline.scenario.near_names import misspelt
 from pipeline.scenario.types import FARTHEST_M
@@ -69,10 +69,7 @@ def read_geojson(path: Path, world: Georeference) -> FootprintFile:
     InputError names the features that cannot be understood, have no height, or are no sound polygons, all at once.
     """
     file = FootprintFile()
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(path, f"is not valid JSON: {error}", "a GeoJSON FeatureCollection") from None
+    document = documents.read_json(path, "a GeoJSON FeatureCollection")
     if not isinstance(document, dict) or not isinstance(document.get("features"), list):
         raise InputError(path, "has no list of features", "a GeoJSON FeatureCollection in world-frame metres")
     declared = declared_by(document, str(path))
@@ -171,11 +168,9 @@ def polygons_of(
         shape = shape.buffer(radius, quad_segs=_QUARTER_SIDES, cap_style=cap)
     elif "Polygon" not in shape.geom_type:
         raise InputError(shape_place, f"is a {shape.geom_type}", "a Polygon, LineString or Point, or their Multi forms")
-    parts = [
-        p
-        for p in shapely.get_parts(_sound(shape, shape_place, mended, reading.convert is not None, mends_crossings))
-        if "Polygon" in p.geom_type
-    ]
+    sound = _sound(shape, shape_place, mended, reading.convert is not None, mends_crossings)
+    areas = [part for part in shapely.get_parts(sound) if "Polygon" in part.geom_type]
+    parts = [polygon for area in areas for polygon in shapely.get_parts(area)]  # mended ones lie deeper
     if not parts:
         raise InputError(shape_place, "encloses no area", "a polygon with three corners that are not in line")
     return parts

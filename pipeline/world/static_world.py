@@ -21,7 +21,10 @@ from numpy.typing import NDArray
 from pipeline.core.errors import InputError
 from pipeline.core.findings import WARNINGS, Finding
 from pipeline.core.progress import Progress, silent
+from pipeline.core.reading.refusing import reading
 from pipeline.formats.georeference import Georeference
+from pipeline.formats.meshes import loading as meshes
+from pipeline.formats.meshes.pieces import are_closed, pieces_of
 from pipeline.scenario.models import MeshModel, Scenario
 from pipeline.scenario.types import FARTHEST_M
 from pipeline.world import world_frame
@@ -122,39 +125,31 @@ def _extrude(footprint: Footprint) -> tuple[Floats, NDArray[np.int64]]:
 
 def _add_mesh(builder: _Builder, path: Path, model: MeshModel, world: Georeference) -> None:
     """Each closed piece of a mesh becomes a solid, so that sites inside can be told; the rest stays one surface."""
-    import trimesh
-
-    try:
-        mesh = trimesh.load(path, force="mesh", process=False)
-    except (ValueError, LookupError, OSError, NotImplementedError, AttributeError, TypeError, ImportError) as error:
-        raise InputError(path, f"cannot be loaded ({error})", "a mesh that trimesh reads: PLY, OBJ, STL, GLB") from None
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise InputError(path, "holds no triangles", "a triangle mesh")
+    mesh = meshes.load(path, str(path))
     near = (np.abs(mesh.vertices) <= FARTHEST_M).all(axis=1)
     if not near.all():
         bad, right = int(np.flatnonzero(~near)[0]), f"finite coordinates, at most {FARTHEST_M:g} m"
         raise InputError(f"{path}: vertex {bad}", f"{mesh.vertices[bad].tolist()}", right)
-    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
-        raise InputError(path, f"a triangle names vertex {mesh.faces.max()} of {len(mesh.vertices)}", "a whole mesh")
     faces = len(mesh.faces)
-    mesh.merge_vertices(merge_tex=True, merge_norm=True)
-    mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
+    with reading(path, meshes.A_MESH, "cannot be taken apart"):
+        mesh.merge_vertices(merge_tex=True, merge_norm=True)
+        mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
     if len(mesh.faces) == 0:
         raise InputError(path, f"none of its {faces} triangles has an area", "a triangle mesh")
     if dropped := faces - len(mesh.faces):
         builder.counts.mended["degenerate or doubled triangles dropped"] += dropped
-    pieces = trimesh.graph.connected_components(mesh.face_adjacency, nodes=np.arange(len(mesh.faces)), min_len=1)
-    vertices_m, surface = _in_world(mesh.vertices, model, path, world), [np.empty(0, dtype=np.int64)]
-    for number, piece in enumerate(sorted((np.sort(p) for p in pieces), key=lambda p: int(p[0]))):
-        part = trimesh.Trimesh(vertices_m, mesh.faces[piece], process=False)
-        if part.is_watertight and part.is_winding_consistent:
-            part.remove_unreferenced_vertices()
-            builder.add(part.vertices, part.faces, f"{path.stem}_{number}", model.kind)
-        else:
-            surface.append(piece)
-    if len(rest := np.concatenate(surface)):
+    triangles, vertices_m = np.asarray(mesh.faces, dtype=np.int64), _in_world(mesh.vertices, model, path, world)
+    piece = pieces_of(mesh.face_adjacency, len(triangles))
+    closed = are_closed(triangles, piece)
+    order = np.argsort(piece, kind="stable")
+    ends = np.cumsum(np.bincount(piece))
+    for number in np.flatnonzero(closed).tolist():
+        its = order[ends[number - 1] if number else 0 : ends[number]]
+        used, corners = np.unique(triangles[its], return_inverse=True)
+        builder.add(vertices_m[used], corners.reshape(-1, 3), f"{path.stem}_{number}", model.kind)
+    if len(rest := order[~closed[piece[order]]]):
         name, form = f"{path.stem}_surface", " (open surface)"
-        builder.add(vertices_m, mesh.faces[rest], name, model.kind, form)
+        builder.add(vertices_m, triangles[rest], name, model.kind, form)
 
 
 def _in_world(vertices_m: Floats, model: MeshModel, path: Path, world: Georeference) -> Floats:

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.core.reading.limits import GROUND
 from pipeline.traffic.network import LANE_WIDTH_M, Edge, Lane, Network
 
 Floats = NDArray[np.float64]
@@ -106,8 +107,14 @@ def relief_m(roads: Network) -> tuple[float, float]:
     return float(np.ptp(heights)), float(heights[np.abs(heights).argmax()])
 
 
-def ground(roads: Network, low_m: Floats | None = None, high_m: Floats | None = None) -> Surface:
-    """The surface through a network's lanes, from ``low_m`` to ``high_m``; around the network when None."""
+def ground(
+    roads: Network, low_m: Floats | None = None, high_m: Floats | None = None, place: object = "the network"
+) -> Surface:
+    """The surface through a network's lanes, from ``low_m`` to ``high_m``; around the network when None.
+
+    InputError at ``place`` where it would have too many points.
+    """
+    _check_amount(roads, low_m, high_m, place)
     lanes = [_strewn(lane, _width_m(edge, lane)) for edge in roads.all_edges for lane in edge.lanes]
     points = _thinned(np.concatenate(lanes))
     low = points[:, :2].min(axis=0) - _MARGIN_M if low_m is None else low_m
@@ -116,6 +123,17 @@ def ground(roads: Network, low_m: Floats | None = None, high_m: Floats | None = 
     rim = _rim(low, high)
     rim = np.column_stack([rim, points[_nearest(points[:, :2], rim), 2]])
     return _triangulated(np.concatenate([points[inside], rim]), low, high)
+
+
+def _check_amount(roads: Network, low_m: Floats | None, high_m: Floats | None, place: object) -> None:
+    """InputError where lanes are so long, or the rectangle so wide, that there would be too many points."""
+    shapes = [lane.shape_m for edge in roads.all_edges for lane in edge.lanes]
+    lengths = sum(float(np.hypot(*np.diff(shape[:, :2], axis=0).T).sum()) for shape in shapes)
+    every = np.concatenate(shapes)[:, :2]
+    low = every.min(axis=0) if low_m is None else low_m
+    high = every.max(axis=0) if high_m is None else high_m
+    points = 3 * (lengths / _STEP_M + 2 * len(every)) + 2 * float((high - low).sum()) / _RING_M
+    GROUND.check(place, points, f"reaches so far that its ground takes {points:,.0f} points")
 
 
 def _width_m(edge: Edge, lane: Lane) -> float:

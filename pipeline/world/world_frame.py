@@ -6,7 +6,6 @@ there what it did to longitude and latitude); where both are given, hold them ag
 
 from __future__ import annotations
 
-import tempfile
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -101,8 +100,8 @@ def _of_network(scenario: Scenario) -> WorldFrame | None:
 def _converted(path: Path, changed_ns: int, size: int) -> Location | None:
     """Where netconvert puts a map; the file's time and size tell one map from another under the same name."""
     del changed_ns, size
-    with tempfile.TemporaryDirectory() as folder:
-        made = Path(folder) / sumo_folder.NETWORK
+    with files.scratch() as folder:
+        made = folder / sumo_folder.NETWORK
         sumo_folder.convert_osm(path, made)
         return network.location_of(made)
 

@@ -41,8 +41,6 @@ def simulated(street: Path, source: str) -> None:
         (DEMAND, "", False),
         ('<routes><flow id="f" begin="0"/></routes>', "", False),
         ("<routes/>", '<additional><calibrator><flow begin="0"/></calibrator></additional>', False),
-        ("<routes/>", '<additional><include href="more.xml"/></additional>', False),
-        ("<routes", "", False),  # what SUMO tells better
     ],
 )
 def test_a_configuration_without_vehicles_is_told_before_it_is_simulated(
@@ -54,6 +52,31 @@ def test_a_configuration_without_vehicles_is_told_before_it_is_simulated(
     files = "own.rou.xml, more.add.xml" if additional else "own.rou.xml"
     right = f"scenario.toml: traffic.sumocfg = 'own.sumocfg': no vehicle, trip or flow in its files ({files})"
     assert found(street).get("traffic", []) == ([right] if is_found else [])
+
+
+@pytest.mark.parametrize(
+    ("routes", "additional", "told"),
+    [
+        (
+            "<routes/>",
+            '<additional><include href="more.xml"/></additional>',
+            "more.add.xml: <include href='more.xml'> has SUMO read a further file",
+        ),
+        ("<routes", "", "own.rou.xml: is not well-formed XML: unclosed token: line 1, column 0"),
+        (
+            '<!DOCTYPE routes [<!ENTITY a "b">]><routes><vehicle id="&a;" depart="0"/></routes>',
+            "",
+            "own.rou.xml: declares XML entities or a document type, which are refused",
+        ),
+    ],
+)
+def test_what_sumo_may_not_read_is_told_before_it_is_simulated(
+    street: Path, routes: str, additional: str, told: str
+) -> None:
+    (street / "more.add.xml").write_text(additional)
+    configured(street, routes, additional="more.add.xml" if additional else "")
+    simulated(street, 'sumocfg = "own.sumocfg"\n')
+    assert found(street).get("traffic", []) == [told]
 
 
 def test_routes_of_a_period_without_vehicles_are_told_with_its_name(street: Path, egvs) -> None:

@@ -6,7 +6,7 @@ import pytest
 import trimesh
 
 import pipeline
-from pipeline.checks.mesh_parts import pulled_in
+from pipeline.checks.mesh_parts import digests, pulled_in
 from pipeline.core import files
 from pipeline.runs import workflow
 
@@ -51,3 +51,31 @@ def test_parts_of_glb_and_obj(tmp_path: Path) -> None:
     (tmp_path / "a.obj").write_text("mtllib b.bin\nv 0 0 0\n")
     assert [part.name for part in pulled_in(tmp_path / "a.glb")] == ["b.bin"]
     assert [part.name for part in pulled_in(tmp_path / "a.obj")] == ["b.bin"]
+
+
+def test_textures_and_percent_encoded_names(tmp_path: Path) -> None:
+    for name in ("skin of car.png", "b.png", "c.png", "not.png", "a b.bin"):
+        (tmp_path / name).write_bytes(b"")
+    (tmp_path / "m.mtl").write_text(
+        "newmtl x\nKd 1 1 1\nmap_Kd -s 1 1 1 b.png\n  map_Bump skin of car.png\nbump none.png\n"
+    )
+    (tmp_path / "a.obj").write_text("mtllib m.mtl\n# mtllib not.png\nv 0 0 0\n")
+    assert [part.name for part in pulled_in(tmp_path / "a.obj")] == ["m.mtl", "b.png", "skin of car.png"]
+    (tmp_path / "a.gltf").write_text('{"buffers": [{"uri": "a%20b.bin"}], "images": [{"uri": "sub/c.png"}]}')
+    assert [part.name for part in pulled_in(tmp_path / "a.gltf")] == ["a b.bin", "c.png"]
+    (tmp_path / "a.ply").write_bytes(b"ply\ncomment TextureFile c.png\nend_header\ncomment TextureFile b.png\n")
+    assert [part.name for part in pulled_in(tmp_path / "a.ply")] == ["c.png"]
+
+
+def test_a_name_that_no_file_can_have_is_none(tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_bytes(b"mtllib " + b"x" * 5000 + b"\nmtllib \0\n")
+    assert pulled_in(tmp_path / "a.obj") == []
+
+
+def test_digests_tell_parts_of_one_name_apart(tmp_path: Path) -> None:
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "t.bin").write_text(folder)
+    (tmp_path / "m.gltf").write_text('{"buffers": [{"uri": "a/t.bin"}, {"uri": "b/t.bin"}]}')
+    assert list(digests(tmp_path / "m.gltf", "mesh")) == ["mesh", "mesh: a/t.bin", "mesh: b/t.bin"]
+    assert len(set(digests(tmp_path / "m.gltf", "mesh").values())) == 3

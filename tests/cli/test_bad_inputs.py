@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.core.reading.seals import sealed
 from tests.conftest import BUILDING, collection, fcd, feature
 
 Change = Callable[[Path], object]
@@ -238,11 +239,11 @@ BAD: dict[str, tuple[Change, str]] = {
     # measured scans
     "points beyond the Earth": (
         put("cloud.csv", "x_m,y_m,z_m\n10,1e200,3\n", POINTS, ONE_SITE),
-        r"a point lies 1e\+200 m from the world's zero",
+        r"points: .*cloud.csv: a point lies 1e\+200 m from the world's zero",
     ),
     "points from elsewhere": (
         put("cloud.csv", "x_m,y_m,z_m\n10,500,3\n", POINTS, ONE_SITE),
-        r"none of 1 points lies on a beam",
+        r"points: .*cloud.csv: none of 1 points lies on a beam",
     ),
     "points missing": (
         put("sites.csv", "site,x_m,y_m,z_m\na,10,12,3\n", POINTS),
@@ -302,6 +303,33 @@ COMMANDS = {
         ["run", "{mini}", "--set", "traffic.kinds.tram.share=1"],
         r"--set traffic.kinds.tram.share=1: no row 'tram'; one of car, or a number from 0",
     ),
+    "a size without end": (
+        ["run", "{mini}", "--set", "roi.size_m=[1e308,20,5]"],
+        r"roi.voxel_m: 0.5 m gives more than 1e\+300 x 40 x 10 = more than 1e\+300 voxels; .* EGVS_MAX_VOXELS=...",
+    ),
+    "three sizes without end": (["run", "{mini}", "--set", "roi.size_m=[1e308,1e308,1e308]"], r"more than 1e\+300 vox"),
+    "voxels of next to nothing": (["run", "{mini}", "--set", "roi.voxel_m=1e-300"], r"1e-300 m gives .*1e\+300 voxels"),
+    "a size of next to nothing": (
+        ["run", "{mini}", "--set", "roi.size_m=[1e-300,20,5]"],
+        r"roi.size_m: 1e-300 m along x is no whole number of voxels of 0.5 m; the nearest sizes that fit are 0.5 m",
+    ),
+    "voxels without end": (["run", "{mini}", "--set", "roi.voxel_m=1e308"], r"no whole number of voxels of 1e\+308 m"),
+    "ten million channels": (
+        ["check", "{mini}", "--set", "sensors.small.channels=10000000"],
+        r"channels: 10000000; input should be less than or equal to 10000",
+    ),
+    "beams without end": (
+        ["check", "{mini}", "--set", "sensors.small.azimuth_step_deg=1e-300"],
+        r"8 rings every 1e-300 degrees are more than 3,000,000 beams; .* EGVS_MAX_BEAMS=... raises that",
+    ),
+    "a number of thousands of digits": (
+        ["check", "{mini}", "--set", f"seed={'9' * 5000}"],
+        r"seed: '9+ ... \(.* chara",
+    ),
+    "a list thousands deep": (
+        ["check", "{mini}", "--set", f"seed={'[' * 5000}{']' * 5000}"],
+        r"seed: '\[+ ... \(.* cha",
+    ),
     "--set of a whole row": (["run", "{mini}", "--set", "traffic.kinds.car=1"], r"traffic.kinds.car.KEY=VALUE"),
     "--set through a value": (["run", "{mini}", "--set", "seed.x=1"], r"'seed' is not a table"),
     "--traci without port": (["traffic", "{mini}", "--traci", "here"], r"--traci: 'here'; HOST:PORT"),
@@ -322,6 +350,16 @@ COMMANDS = {
 def test_wrong_command_is_answered(mini: Path, tmp_path: Path, egvs, arguments: list[str], message: str) -> None:
     _, error = refused(egvs, *(a.format(mini=mini, out=tmp_path / "out") for a in arguments))
     assert re.search(message, error), error
+
+
+@pytest.mark.parametrize("spacing", ["1e-06", "1e-300", "9.99989e-321"])
+@pytest.mark.parametrize("rule", ["grid={low_m=[0,0],high_m=[9,9],%s}", "along=[{line_m=[[0,0],[9,9]],%s}]"])
+def test_sites_without_end_are_refused(mini: Path, egvs, spacing: str, rule: str) -> None:
+    asked = f"sites.{rule % f'spacing_m={spacing},heights_m=[3]'}"
+    said = " ".join("".join(refused(egvs, "check", mini, "--set", asked)).split())
+    told = f"more than 100,000 candidates (spacing_m = {spacing}); a wider spacing, or fewer heights and pitches"
+    assert told in said
+    assert "EGVS_MAX_SITES=... raises that" in said
 
 
 def spoil_parquet(path: Path) -> None:
@@ -370,7 +408,7 @@ def record_what_lies_there(out: Path, stage: str) -> None:
     record = json.loads((out / "run.json").read_text())
     made = record["stages"][stage]["artefacts"]
     record["stages"][stage]["artefacts"] = {name: files.sha256_of(out / name) for name in made}
-    (out / "run.json").write_text(json.dumps(record))
+    (out / "run.json").write_text(json.dumps(sealed(record)))
 
 
 @pytest.mark.parametrize(

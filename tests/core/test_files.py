@@ -1,6 +1,8 @@
-"""Room for a file that is written after long work."""
+"""Room for a file that is written after long work; folders for work."""
 
 import errno
+import signal
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -31,3 +33,40 @@ def test_where_there_is_no_room_is_told(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(files.tempfile, "TemporaryFile", refused)  # whoever runs this may write everywhere
     with pytest.raises(InputError, match=r"m\.onnx: cannot be written \(Permission denied\)"):
         files.make_room(tmp_path / "m.onnx")
+
+
+def test_a_full_disk_is_told_with_the_file_that_is_written(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="left on device") as caught, files.aside(tmp_path / "a"):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert caught.value.filename == str(tmp_path / "a")
+    with pytest.raises(OSError, match="other") as caught, files.aside(tmp_path / "a"):
+        raise OSError(errno.EIO, "another error")  # may be of what is read
+    assert caught.value.filename is None
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.system
+def test_folders_for_work_of_killed_programs_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from tests.processes import python
+
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    killed = """
+import os, signal
+from pipeline.core import files
+with files.scratch() as folder:
+    (folder / "sub").mkdir()
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+    assert python(killed).returncode == -signal.SIGKILL
+    (left,) = tmp_path.glob("egvs-work-*")
+    (tmp_path / "egvs-work-link").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    files._clear.cache_clear()
+    with files.scratch() as mine:
+        assert mine.is_dir() and not left.exists()
+        files._clear.cache_clear()
+        with files.scratch() as other:
+            assert mine.is_dir() and other.is_dir(), "one that is held stays"
+    assert {path.name for path in tmp_path.iterdir()} == {"egvs-work-link", "elsewhere"}
+    files._clear.cache_clear()

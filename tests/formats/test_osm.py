@@ -176,3 +176,21 @@ def test_a_pbf_file_with_a_node_beyond_the_pole_is_refused(tmp_path: Path) -> No
 )
 def test_lengths(text: str, metres: float | None) -> None:
     assert osm.length_m(text) == (None if metres is None else pytest.approx(metres))
+
+
+@pytest.mark.parametrize(("declared", "codec"), [("Shift_JIS", "cp932"), ("EUC-JP", "euc_jp"), ("UTF-16", "utf-16")])
+@pytest.mark.parametrize("packed", [False, True])
+def test_a_map_in_another_encoding_is_read(tmp_path: Path, declared: str, codec: str, packed: bool) -> None:
+    tag = '<way id="3"><nd ref="1"/><nd ref="1"/><tag k="name" v="青梅街道"/></way>'
+    data = osm_xml(NODE + tag).replace("UTF-8", declared).encode(codec)
+    (tmp_path / "a.osm").write_bytes(gzip.compress(data, mtime=0) if packed else data)
+    assert osm.read(tmp_path / "a.osm").ways[3].tags == {"name": "青梅街道"}
+
+
+def test_a_map_of_too_many_objects_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("EGVS_MAX_MAP_OBJECTS", "10")
+    pbf = pbf_of(SMALL, tmp_path / "a.osm.pbf")
+    for path in (SMALL, pbf):
+        told = rf"{path.name}: holds more than 10 objects; a part of the map; at most 10 objects; EGVS_MAX_MAP_OBJECTS="
+        with pytest.raises(InputError, match=told):
+            osm.read(path)

@@ -251,6 +251,7 @@ def las(folder: Path, name: str, n: int = 300) -> tuple[Path, Any]:
     return folder / name, whole * header.scales + header.offsets
 
 
+@pytest.mark.system
 @needs_laspy
 @pytest.mark.parametrize("name", ["a.las", "a.laz"])
 def test_las_gives_scaled_coordinates_in_float64(tmp_path: Path, name: str) -> None:
@@ -260,6 +261,7 @@ def test_las_gives_scaled_coordinates_in_float64(tmp_path: Path, name: str) -> N
     assert dropped == 0
 
 
+@pytest.mark.system
 @needs_laspy
 @pytest.mark.parametrize("name", ["a.las", "a.laz"])
 def test_las_cut_anywhere_is_refused(tmp_path: Path, name: str) -> None:
@@ -291,6 +293,7 @@ def test_las_with_a_damaged_header_is_refused(tmp_path: Path, at: int, value: by
         read_points(path, "")
 
 
+@pytest.mark.system
 @needs_laspy
 def test_laz_that_would_end_the_process_is_refused(tmp_path: Path) -> None:
     """By memory for 4e9 chunks, wherever the table's place stands, or by a panic for a point of no items."""
@@ -310,6 +313,31 @@ def test_laz_that_would_end_the_process_is_refused(tmp_path: Path) -> None:
     overwrite(path, 375 + 54 + 32, b"\0\0")  # how many items: after the header and the record's own
     with pytest.raises(InputError, match=r"cannot be read as LAS \(.*LazItem"):
         read_points(path, "")
+
+
+@needs_laspy
+@pytest.mark.system
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="where memory can be bounded")
+def test_laz_that_asks_for_more_memory_than_the_bound_is_refused(tmp_path: Path) -> None:
+    """A layer of its first chunk says that it has 4 GB, after the first point (30 bytes), a count and eight layers."""
+    path, _ = las(tmp_path, "a.laz")
+    points_at = struct.unpack_from("<I", path.read_bytes(), 96)[0]
+    overwrite(path, points_at + 8 + 30 + 4 + 7 * 4, b"\xff\xff\xff\xf0")
+    told = (
+        r"what unpacks it ended, by signal 6: .*too much memory\); .* at most 2,000 MB; EGVS_MAX_READER_MB=... raises"
+    )
+    with pytest.raises(InputError, match=told):
+        read_points(path, "")
+
+
+@needs_laspy
+def test_more_points_than_the_bound_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("EGVS_MAX_POINTS", "299")
+    for name in ("a.las", "a.laz"):
+        with pytest.raises(
+            InputError, match=rf"{name}: takes 300 points; at most 299 points; EGVS_MAX_POINTS=... raise"
+        ):
+            read_points(las(tmp_path, name)[0], "")
 
 
 def overwrite(path: Path, at: int, value: bytes) -> None:

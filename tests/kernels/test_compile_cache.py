@@ -15,10 +15,10 @@ import pipeline
 pytestmark = pytest.mark.system
 
 PACKAGE = Path(pipeline.__file__).parent
-INNER = "import numba\n\n\n@numba.njit(cache=True)\ndef inner(x):\n    return x + {}\n"
+INNER = "from pipeline.kernels.compile_cache import compiled\n\n\n@compiled()\ndef inner(x):\n    return x + {}\n"
 OUTER = (
-    "import numba\n\nfrom pipeline.kernels.inner import inner\n\n\n"
-    "@numba.njit(cache=True)\ndef outer(x):\n    return inner(x)\n"
+    "from pipeline.kernels.compile_cache import compiled\nfrom pipeline.kernels.inner import inner\n\n\n"
+    "@compiled()\ndef outer(x):\n    return inner(x)\n"
 )
 CALL = """
 from pipeline.kernels.outer import outer
@@ -40,10 +40,10 @@ def package(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def call(package: Path, **environment: str) -> str:
+def call(package: Path, code: str = CALL, **environment: str) -> str:
     clean = {key: value for key, value in os.environ.items() if key not in ("NUMBA_CACHE_DIR", "PYTHONPATH")}
     done = subprocess.run(
-        [sys.executable, "-c", CALL], cwd=package, env=clean | environment, check=True, capture_output=True, text=True
+        [sys.executable, "-c", code], cwd=package, env=clean | environment, check=True, capture_output=True, text=True
     )
     return done.stdout.strip()
 
@@ -82,3 +82,39 @@ def test_where_the_package_cannot_be_written_the_users_cache_is_used(package: Pa
     assert call(package, **home) == "2 compiled"
     assert call(package, **home) == "2 kept"
     assert kept(tmp_path / "cache" / "egvs") == 1
+
+
+DAMAGES = """
+import hashlib, importlib, pathlib, pickle
+from pipeline.kernels import outer
+assert outer.outer(1) == 2
+kept, = pathlib.Path("pipeline/kernels/__pycache__").rglob("outer.outer-*.kernel")
+whole, other = kept.read_bytes(), pickle.dumps((0, 1))
+for data in (
+    whole, whole[:len(whole) // 2], whole[:32], whole[:1], b"", whole[:-9] + bytes([whole[-9] ^ 4]) + whole[-8:],
+    hashlib.sha256(other).digest() + other, whole,
+):
+    kept.write_bytes(data)
+    importlib.reload(outer)
+    assert outer.outer(1) == 2
+    print("compiled" if outer.outer.stats.cache_misses else "kept")
+"""
+
+
+def test_what_is_damaged_is_compiled_again(package: Path) -> None:
+    assert call(package, DAMAGES).split() == ["kept", *["compiled"] * 6, "kept"]
+
+
+def test_where_nothing_can_be_written_the_temporary_directory_is_used(package: Path, tmp_path: Path) -> None:
+    (package / "pipeline" / "kernels" / "__pycache__").write_text("a file where the folder would be")
+    (tmp_path / "cache").write_text("and here")
+    (tmp_path / "tmp").mkdir()
+    none = {"XDG_CACHE_HOME": str(tmp_path / "cache"), "PYTHONDONTWRITEBYTECODE": "1"}
+    temporary = none | {"TMPDIR": str(tmp_path / "tmp")}
+    assert call(package, **temporary) == "2 compiled"
+    assert call(package, **temporary) == "2 kept"
+    (own,) = (tmp_path / "tmp").iterdir()
+    assert (own.name, kept(own), own.stat().st_mode & 0o777) == (f"egvs-{os.geteuid()}", 1, 0o700)
+    own.chmod(0o777)  # anybody could lay a kernel there
+    assert call(package, **temporary) == "2 compiled"
+    assert call(package, **none | {"NUMBA_CACHE_DIR": str(tmp_path / "cache" / "x"), **temporary}) == "2 compiled"

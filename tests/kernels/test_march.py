@@ -426,7 +426,7 @@ def with_fault(*replacements):
         assert old in source, f"the fault does not fit the source any more: {old}"
         source = source.replace(old, new)
     source = re.sub(
-        r"^(_kernel|_inlined) = numba\.njit\(.*\)$", r"\1 = lambda function: function", source, flags=re.MULTILINE
+        r"^(_kernel|_inlined) = compiled\(.*\)$", r"\1 = lambda function: function", source, flags=re.MULTILINE
     )
     namespace = {"__name__": "faulty"}
     exec(compile(source, "faulty march", "exec"), namespace)

@@ -20,6 +20,7 @@ import pytest
 from pipeline.artefacts import tables
 from pipeline.artefacts.readers import read_scores, read_tpog
 from pipeline.core.grid import Grid
+from pipeline.core.reading.seals import sealed
 from pipeline.report import page as report
 from pipeline.report import site_views
 from pipeline.report.drawing import map_frame, maps, raster
@@ -121,7 +122,7 @@ def finished(folder, sites=SITES, counts=lane, record=True, **keys):
     run_stage(scan, about, out, jobs=1)
     run_stage(score, about, out, jobs=1)
     if record:
-        (out / "run.json").write_text(json.dumps(a_record()), encoding="utf-8")
+        (out / "run.json").write_text(json.dumps(sealed(a_record())), encoding="utf-8")
     return about, out
 
 
@@ -211,7 +212,7 @@ def test_counts_stand_beside_what_was_simulated(tmp_path):
         {"place": "<a> to b", "kind": "", "counted_per_h": 320.0, "simulated_per_h": 311.5, "geh": 0.48},
         {"place": "c", "kind": "truck", "counted_per_h": 60.0, "simulated_per_h": 20.0, "geh": 6.32},
     ]
-    (out / "run.json").write_text(json.dumps(record), encoding="utf-8")
+    (out / "run.json").write_text(json.dumps(sealed(record)), encoding="utf-8")
     read = Reader(page(about, out))
     assert "<a> to b|all|320|311.5|0.5|" in read.rows
     assert "c|truck|60|20|6.3|!|" in [row.replace("||", "|") for row in read.rows]
@@ -276,7 +277,7 @@ def test_it_depends_on_no_path_and_no_moment(made, tmp_path):
 def test_costs_are_shown_and_are_inputs(made, tmp_path):
     about, out, text = made
     shutil.copytree(out, tmp_path / "out")
-    (tmp_path / "out" / "run.json").write_text(json.dumps(a_record(seconds=98.76)))
+    (tmp_path / "out" / "run.json").write_text(json.dumps(sealed(a_record(seconds=98.76))))
     assert "98.76" in page(about, tmp_path / "out") and "98.76" not in text
     assert "77.77" not in text, "SUMO's own seconds differ from run to run"
     assert inputs_of(report, about, tmp_path / "out") != inputs_of(report, about, out)
@@ -290,7 +291,7 @@ def test_whatever_is_shown_is_an_input(made, tmp_path):
     (tmp_path / "out").mkdir()
     for name in ("tpog.parquet", "scores.parquet", "scans.parquet", "statics.ply"):
         shutil.copy(out / name, tmp_path / "out")
-    (tmp_path / "out" / "run.json").write_text(json.dumps(changed))
+    (tmp_path / "out" / "run.json").write_text(json.dumps(sealed(changed)))
     assert inputs_of(report, about, tmp_path / "out") != before
     assert inputs_of(report, scenario(tmp_path, SITES, seed=3), out) != before
     json.dumps(before.to_json(), allow_nan=False)
@@ -302,7 +303,7 @@ def test_what_is_not_shown_is_no_input(made, tmp_path):
     shutil.copytree(out, tmp_path / "out")
     audited = a_record()
     audited["stages"]["score"] = audited["stages"]["tpog"] | {"summary": {"audit": {"misplaced_chords": 0}}}
-    (tmp_path / "out" / "run.json").write_text(json.dumps(audited))
+    (tmp_path / "out" / "run.json").write_text(json.dumps(sealed(audited)))
     other, own = inputs_of(report, about, tmp_path / "out"), inputs_of(report, about, out)
     assert other.more["costs"]["score"] == [1.25, 512.0]
     assert (other.files, other.settings, other.more["summaries"]) == (own.files, own.settings, own.more["summaries"])
@@ -432,7 +433,9 @@ def test_no_record_no_costs(tmp_path):
     about, out = finished(tmp_path, record=False)
     read = Reader(page(about, out))
     assert any(row.strip("|").startswith("traffic|–|") for row in read.rows)
-    (out / "run.json").write_text(json.dumps(a_record() | {"stages": {"scan": {"artefacts": {}, "summary": {}}}}))
+    (out / "run.json").write_text(
+        json.dumps(sealed(a_record() | {"stages": {"scan": {"artefacts": {}, "summary": {}}}}))
+    )
     assert Reader(page(about, out)).text == read.text
 
 

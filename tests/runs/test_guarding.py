@@ -45,15 +45,28 @@ def a_measured_scan(mini: Path) -> None:
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m,points\npole_a,10,12,3,scan_pole_a.ply\n")
 
 
+def a_buffer_of_a_mesh(mini: Path) -> None:
+    (mini / "tpog.parquet").write_bytes(b"")
+    (mini / "m.gltf").write_text('{"buffers": [{"uri": "tpog.parquet"}]}')
+    named(mini, "[tpog]", '[[statics.meshes]]\nfile = "m.gltf"\nkind = "wall"\n[tpog]')
+
+
+def a_body(mini: Path) -> None:
+    (mini / "statics.ply").write_text("ply")
+    named(mini, "[tpog]", '[validation.bodies]\nsedan = "statics.ply"\n[tpog]')
+
+
 INPUTS = {
     "a mesh": (a_mesh, "statics.ply, which the scenario names (statics.meshes)"),
     "an FCD file": (an_fcd_file, "trajectories.parquet, which the scenario names (traffic.fcd)"),
     "in the folder of SUMO": (a_file_for_sumo, "sumo/f.geojson, which the scenario names (statics.footprints)"),
+    "a buffer of a mesh": (a_buffer_of_a_mesh, "tpog.parquet, which the scenario names (statics.meshes)"),
+    "a body": (a_body, "statics.ply, which the scenario names (validation.bodies.sedan)"),
     "a measured scan": (a_measured_scan, "scan_pole_a.ply, which the scenario names (site pole_a: points)"),
 }
 
 
-@pytest.mark.parametrize("verb", ["run", "statics", "traffic", "scan", "report"])
+@pytest.mark.parametrize("verb", ["run", "statics", "report", "accuracy", "validate"])
 @pytest.mark.parametrize(("put", "message"), INPUTS.values(), ids=INPUTS.keys())
 def test_an_input_is_not_written_over(mini: Path, egvs, put, message: str, verb: str) -> None:
     put(mini)
@@ -62,6 +75,33 @@ def test_an_input_is_not_written_over(mini: Path, egvs, put, message: str, verb:
     told = f"egvs: --out {mini}: holds {message} and a run writes over; a folder of its own, for example runs/mine\n"
     assert (code, error) == (2, told)
     assert tree(mini) == before
+
+
+STUDIES = {
+    "accuracy, its results": (("accuracy",), "accuracy/f.csv"),
+    "accuracy, its table": (("accuracy",), "accuracy.parquet"),
+    "validate, what it keeps": (("validate", "--keep"), "validation_kitti/f.csv"),
+    "validate, its scores": (("validate",), "surrogates.parquet"),
+}
+
+
+@pytest.mark.parametrize(("words", "name"), STUDIES.values(), ids=STUDIES.keys())
+def test_a_study_writes_over_no_input(mini: Path, egvs, words: tuple[str, ...], name: str) -> None:
+    (mini / name).parent.mkdir(exist_ok=True)
+    (mini / name).write_text(fcd())
+    named(mini, "fcd.csv", name)
+    before = tree(mini)
+    code, _, error = egvs(words[0], mini, "--out", mini, *words[1:])
+    assert (code, f"holds {name}, which the scenario names (traffic.fcd)" in error) == (2, True)
+    assert tree(mini) == before
+
+
+def test_results_are_not_read_where_they_are_written_anew(mini: Path, tmp_path: Path, egvs) -> None:
+    theirs = tmp_path / "out" / "validation_kitti"
+    theirs.mkdir(parents=True)
+    code, _, error = egvs("validate", mini, "--out", tmp_path / "out", "--keep", "--detections", theirs)
+    told = f"egvs: --detections {theirs}: lies where --keep writes anew; a copy of it elsewhere, or no --keep\n"
+    assert (code, error) == (2, told)
 
 
 def test_an_input_is_known_through_another_path(mini: Path, tmp_path: Path, egvs) -> None:
@@ -99,6 +139,17 @@ def test_a_link_where_sumo_writes_is_refused(mini: Path, tmp_path: Path, egvs, p
     link.parent.mkdir(parents=True)
     link.symlink_to(tmp_path / "elsewhere")
     code, _, error = egvs("run", mini, "--out", tmp_path / "out")
+    what = "is a symbolic link, and nothing is written through one; remove it"
+    assert (code, error) == (2, f"egvs: {link}: {what}\n")
+
+
+@pytest.mark.parametrize("place", ["validation_kitti", ".validation_kitti.partial", "validation_kitti/pole_a"])
+def test_a_link_where_detections_are_kept_is_refused(mini: Path, tmp_path: Path, egvs, place: str) -> None:
+    link = tmp_path / "out" / place
+    link.parent.mkdir(parents=True)
+    (tmp_path / "elsewhere").mkdir()
+    link.symlink_to(tmp_path / "elsewhere")
+    code, _, error = egvs("validate", mini, "--out", tmp_path / "out", "--keep")
     what = "is a symbolic link, and nothing is written through one; remove it"
     assert (code, error) == (2, f"egvs: {link}: {what}\n")
 
@@ -172,3 +223,15 @@ def test_names_are_no_markup(mini: Path, tmp_path: Path, egvs) -> None:
     assert code == 0, error
     assert "[red]S1" in printed
     assert "best [x] :car:; worst [red]S1" in error
+
+
+def test_another_score_that_is_0_everywhere_is_told(mini: Path, tmp_path: Path, egvs) -> None:
+    settings = ("--set", "score.rank_by='seen_well'", "--set", "score.gamma=0")
+    code, printed, error = egvs("run", mini, "--out", tmp_path / "out", *settings)
+    assert code == 0, error
+    told = "egvs is 0 at every site, so it tells none from another; sites, sensors and settings by which it is above 0"
+    assert [line for line in error.splitlines() if "is 0 at" in line] == [
+        f"warning: scenario.toml: score: {told} somewhere"
+    ]
+    assert "   1  pole_" in printed, "the other score ranks all the same"
+    assert "is 0 at every site" not in egvs("run", mini, "--out", tmp_path / "two")[2]

@@ -12,6 +12,7 @@ import pytest
 import pipeline
 from pipeline.core import files
 from pipeline.core.errors import InputError
+from pipeline.core.reading.seals import sealed
 from pipeline.effects import scene_resolving
 from pipeline.runs import workflow
 from pipeline.stages.base import Workspace
@@ -48,7 +49,7 @@ def out(runs: tuple[pipeline.Scenario, Path, Path], tmp_path: Path) -> Path:
     copy = Path(shutil.copytree(runs[1], tmp_path / "out"))
     record = json.loads((copy / "run.json").read_text())
     record["scenario_folder"] = str(runs[0].folder)
-    (copy / "run.json").write_text(json.dumps(record))
+    (copy / "run.json").write_text(json.dumps(sealed(record)))
     return copy
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import json
+import math
 import os
 import random
 import shutil
@@ -20,9 +21,10 @@ import pytest
 import pipeline
 from pipeline.artefacts import schemas
 from pipeline.core import code_digest, files
+from pipeline.core.cost import Cost
 from pipeline.core.errors import InputError
 from pipeline.runs import stages, workflow
-from pipeline.runs.stages import STAGES
+from pipeline.runs.stages import STAGES, Made
 from pipeline.runs.store import Entry, Store
 from tests.runs import children
 from tests.runs.children import Child, Job
@@ -109,6 +111,27 @@ def test_a_second_folder_makes_nothing(
     assert workflow.verify(other) == []
     (other / "tpog.parquet").write_bytes(b"of the user's own")  # which harms the store not
     assert_whole(store)
+
+
+def test_what_sumo_read_and_the_report_draws_is_held_against_its_digest(junction: Path, tmp_path: Path, egvs) -> None:
+    out, scenario = tmp_path / "out", pipeline.load(junction)
+    states(scenario, out)
+    network, routes = out / "sumo" / "network.net.xml", out / "sumo" / "trips.rou.xml"
+    whole = network.read_bytes()
+    kept = json.loads((out / "run.json").read_text())["stages"]["traffic"]["companions"]
+    assert kept["sumo/network.net.xml"] == files.sha256_of(network)
+    network.write_bytes(whole.replace(b"speed", b"sqeed", 1))
+    routes.write_text("<routes/>")
+    (out / "sumo" / "vtypes.add.xml").unlink()
+    code, _, error = egvs("report", junction, "--out", out)
+    assert (code, error.split(" (")[0]) == (2, f"egvs: {network}: was altered or replaced")
+    assert sorted(workflow.verify(out))[:2] == [
+        f"sumo/{path.name} was altered after the run" for path in (network, routes)
+    ]
+    again = {name: "skipped" for name in STAGES} | {"traffic": "fetched"}
+    assert states(scenario, out) == again
+    assert network.read_bytes() == whole
+    assert workflow.verify(out) == []
 
 
 def test_a_changed_and_a_former_setting(done: tuple[pipeline.Scenario, Path]) -> None:
@@ -466,3 +489,25 @@ def test_one_changed_line_makes_what_depends_on_it_again(
         path.write_text(path.read_text(encoding="utf-8") + "\n", encoding="utf-8")
         assert made() - {"report"} == again - {"report"}, name
     forget()
+
+
+@pytest.mark.parametrize("name", [".lock", ".locks", ".work", ".locks/statics-" + "0" * 32])
+def test_locks_and_folders_for_work_are_no_links(mini: Path, tmp_path: Path, store: Path, egvs, name: str) -> None:
+    (tmp_path / "mine").write_text("kept")
+    (store / name).parent.mkdir(parents=True, exist_ok=True)
+    (store / name).symlink_to(tmp_path / "mine")
+    code, _, error = egvs("run", mini, "--out", tmp_path / "out")
+    what = "is a symbolic link, and nothing is written through one; remove it"
+    assert (code, error.splitlines()[-1]) == (2, f"egvs: {store / name}: {what}")
+    assert (tmp_path / "mine").read_text() == "kept"
+
+
+def test_what_an_entry_says_is_json(tmp_path: Path, store: Path) -> None:
+    kept, out = Store(store), tmp_path / "out"
+    out.mkdir()
+    (out / "a").write_text("a")
+    made = Made({"a": files.sha256_of(out / "a")}, {}, {"longest": math.inf}, Cost())
+    kept.put("tpog", "0" * 64, out, made)
+    (entry,) = kept.entries()
+    assert "Infinity" not in (entry.folder / "entry.json").read_text()
+    assert entry.made.summary == {"longest": "inf"}

@@ -17,6 +17,7 @@ import pipeline
 from pipeline.artefacts import tables
 from pipeline.core import files
 from pipeline.core.errors import InputError, RunError
+from pipeline.core.reading.seals import sealed
 from pipeline.report.ranking import ScoredSite
 from pipeline.runs import workflow
 from pipeline.runs.locking import alone
@@ -164,7 +165,7 @@ def test_verify_of_an_unfinished_run_says_what_is_missing(done: tuple[Path, Path
     _, out = done
     record = json.loads((out / "run.json").read_text())
     del record["stages"]["score"]
-    (out / "run.json").write_text(json.dumps(record))
+    (out / "run.json").write_text(json.dumps(sealed(record)))
     with pytest.raises(InputError, match="the stage score is not done"):
         workflow.verify(out)
 
@@ -186,10 +187,22 @@ def test_a_record_that_is_none_is_refused(done: tuple[Path, Path]) -> None:
 def test_a_record_with_an_odd_value_is_refused(done: tuple[Path, Path], key: str, egvs) -> None:
     mini, out = done
     record = json.loads((out / "run.json").read_text())
-    (out / "run.json").write_text(json.dumps(record | {key: [None]}))
+    (out / "run.json").write_text(json.dumps(sealed(record | {key: [None]})))
     for arguments in (("run", mini, "--out", out), ("verify", out)):
         code, _, said = egvs(*arguments)
         assert (code, f"'{key}' is" in said) == (2, True), said
+
+
+def test_a_record_that_was_damaged_at_any_depth_is_refused(done: tuple[Path, Path], egvs) -> None:
+    mini, out = done
+    text = (out / "run.json").read_text()
+    for old, new in (('"peak_mb": ', '"peak_mb": 1'), ('"triangles"', '"triangle"'), ("4", '"4"'), ("9", "9" * 5000)):
+        assert old in text
+        (out / "run.json").write_text(text.replace(old, new, 1))
+        for arguments in (("run", mini, "--out", out), ("verify", out)):
+            code, _, said = egvs(*arguments)
+            assert (code, said.startswith(f"egvs: {out / 'run.json'}: ")) == (2, True), said
+            assert "remove it and run again" in said
 
 
 def test_a_single_stage_with_other_settings_leaves_no_mixed_record(done: tuple[Path, Path], egvs) -> None:
@@ -283,6 +296,7 @@ def test_a_record_of_an_earlier_version_is_one_of_nothing(done: tuple[Path, Path
     for stage in record["stages"].values():
         stage["said"] = stage.pop("summary")
         del stage["files"]
+    del record["own_sha256"]
     (out / "run.json").write_text(json.dumps(record | {"effects": []}))
     with pytest.raises(InputError, match="the stage check is not done"):
         workflow.verify(out)

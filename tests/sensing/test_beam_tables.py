@@ -242,8 +242,8 @@ def test_a_table_that_is_not_there_or_no_text_is_told(mini: Path) -> None:
 
 
 def test_too_many_beams_are_refused(mini: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(beam_tables, "MOST_BEAMS", 3)
-    with pytest.raises(InputError, match="has more than 3 beams"):
+    monkeypatch.setenv("EGVS_MAX_BEAMS", "3")
+    with pytest.raises(InputError, match=r"has more than 3 beams; at most 3 beams; EGVS_MAX_BEAMS=... raises"):
         of_scenario("small", pipeline.load(with_table(mini)), "here")
 
 

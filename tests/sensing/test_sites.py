@@ -89,10 +89,10 @@ def test_a_run_from_geojson_scores_what_a_run_from_csv_does(mini: Path, tmp_path
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "cannot be read as GeoJSON"),
+        ("", "is not valid JSON"),
         *((text, r"sites\.geojson: has no list of features: .*; a FeatureCollection of Points$")
           for text in ("[1, 2]", '{"type": "Point"}', "[]", "null", "5", '{"features": null}', '{"features": {}}')),
-        pytest.param("[" * 100_000, "cannot be read as GeoJSON", id="deep"),
+        pytest.param("[" * 100_000, "is not valid JSON", id="deep"),
         (collection(), "holds no site"),
         *((collection(point(0, 0, 3, name="a"), wrong), "feature 1: is .*; a Feature with properties, its")
           for wrong in (None, 5, [], {"type": "Feature", "geometry": None}, feature({"type": "Point"}, name="b"),
@@ -108,7 +108,7 @@ def test_a_run_from_geojson_scores_what_a_run_from_csv_does(mini: Path, tmp_path
         *((collection(point(0, 0, 3, **{"name": "a", key: value})), f"feature 0: {found}: .*; a text")
           for key, found in (("name", "site"), ("sensor", "sensor"), ("points", "points"))
           for value in ([], ["b"], {}, True)),
-        (collection(point(0, 0, 3, name="\ud800")), r"feature 0: site: '\\ud800'; a name of up to 80"),
+        (collection(point(0, 0, 3, name="\ud800")), r"is not valid JSON: it is no sound text"),
         *((json.dumps({"crs": crs, "features": [point(0, 0, 3, name="a")]}),
            r"sites\.geojson: crs: .*; .*or null$") for crs in (5, "EPSG:25832", {}, {"properties": {"name": 5}})),
         (json.dumps({"crs": named("local"), "features": [point(0, 0, 3, name="a")]}),
@@ -144,7 +144,7 @@ def test_what_is_wrong_with_geojson_is_said(mini: Path, text: str, message: str)
 
 def test_geojson_that_is_no_utf8_is_refused(mini: Path) -> None:
     (mini / "sites.geojson").write_bytes(b'{"features": "\xff"}')
-    with pytest.raises(InputError, match="cannot be read as GeoJSON"):
+    with pytest.raises(InputError, match="is not valid JSON"):
         sites.of(pipeline.load(mini, ['sites.file="sites.geojson"']))
 
 
@@ -239,7 +239,7 @@ def test_a_rule_of_too_many_places_is_refused_at_once(mini: Path, setting: str, 
 
 
 def test_too_many_combinations_are_refused(mini: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sites, "MOST_CANDIDATES", 5)
+    monkeypatch.setenv("EGVS_MAX_SITES", "5")
     rule = "sites.grid={low_m=[0,0],high_m=[1,0],spacing_m=1,heights_m=[3,4,5]}"
     with pytest.raises(
         InputError, match=r"more than 5 candidates \(each combination of place, height and pitch is one\)"

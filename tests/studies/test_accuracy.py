@@ -21,7 +21,8 @@ from rich.console import Console
 
 import pipeline
 from pipeline.artefacts import tables
-from pipeline.cli import study_tables
+from pipeline.artefacts.readers import read_accuracy
+from pipeline.cli.studies import accuracy_tables
 from pipeline.core.errors import InputError, RunError
 from pipeline.runs import stages
 from pipeline.runs.locking import alone
@@ -123,6 +124,14 @@ def test_study_of_a_finished_file(mini: Path, tmp_path: Path, few: None) -> None
     assert (own.error, own.tau, own.regret, own.best_kept, own.best_three_kept) == (0.0, 1.0, 0.0, True, True)
     recommended = [row for row in study.rows if row.recommended]
     assert recommended == [study.best]
+    path = tmp_path / "out" / "accuracy.parquet"
+    assert read_accuracy(path) is not None
+    data = path.read_bytes()
+    path.write_bytes(data[:99] + bytes([data[99] ^ 1]) + data[100:])
+    with pytest.raises(
+        InputError, match=r"accuracy\.parquet: is not the file of which accuracy\.sha256 has the checksum"
+    ):
+        read_accuracy(path)
     again = shares(mini, words(recommended[0]), tmp_path / "again")
     against = shares(mini, [], tmp_path / "plain")
     assert np.abs(again / against - 1).max() == pytest.approx(recommended[0].error, abs=1e-12)
@@ -432,7 +441,7 @@ def test_what_was_kept_and_damaged_is_named(
         path.write_text(content)
     code, printed, said = egvs(*words)
     assert code == 2
-    assert re.search(pattern.replace("*", ".*") + ": is not as the study wrote it", said), said
+    assert re.search(pattern.replace("*", ".*") + ": is not (as the study wrote it|valid JSON)", said), said
     assert "Traceback" not in said + printed
 
 
@@ -443,6 +452,7 @@ def shares_are(text: str) -> Callable[[str], str]:
 SHARED = {
     "too few shares": ("[0-9a-f]*.json", shares_are("[0.5]")),
     "words for shares": ("[0-9a-f]*.json", shares_are('["a", null]')),
+    "another share": ("[0-9a-f]*.json", lambda kept: re.sub(r'("shares": \[\s*)0', r"\g<1>1", kept, count=1)),
 }
 
 
@@ -492,8 +502,8 @@ def test_tables_fit_the_terminal(mini: Path, tmp_path: Path, few: None, capsys, 
     study = replace(study, rows=rows)  # the same marks whatever the seconds
     for width in (190, 120, 80):
         if width < 190:
-            monkeypatch.setattr(study_tables, "console", lambda _, width=width: Console(width=width, highlight=False))
-        study_tables.print_study(study, "egvs run mini")
+            monkeypatch.setattr(accuracy_tables, "console", lambda _, width=width: Console(width=width, highlight=False))
+        accuracy_tables.print_study(study, "egvs run mini")
         table = capsys.readouterr().out.partition("reference: ")[0]
         assert "…" not in table
         assert all(len(line) <= width for line in table.splitlines()), width

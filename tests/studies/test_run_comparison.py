@@ -13,8 +13,9 @@ from rich.console import Console
 from scipy.stats import kendalltau
 
 import pipeline
-from pipeline.cli import comparison_tables
+from pipeline.cli.studies import comparison_tables
 from pipeline.core.errors import InputError
+from pipeline.core.reading.seals import sealed
 from pipeline.studies import run_comparison
 from pipeline.studies.run_comparison import SiteResult, compare
 
@@ -191,6 +192,6 @@ def test_what_is_no_finished_run_is_refused(two: tuple[Path, Path], tmp_path: Pa
     with pytest.raises(InputError, match="is not what the run in its folder made"):
         compare(two)
     del record["stages"]["score"]
-    (two[1] / "run.json").write_text(json.dumps(record))
+    (two[1] / "run.json").write_text(json.dumps(sealed(record)))
     with pytest.raises(InputError, match="the stage score is not done; a finished run"):
         compare(two)

@@ -1,5 +1,6 @@
 """Does every box lie where SUMO's vehicle is, with its type's size?"""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -64,6 +65,15 @@ def test_boxes_are_sorted_by_frame_and_vehicle_and_carry_their_types_size():
 def test_a_type_without_a_size_is_named():
     with pytest.raises(InputError, match=r"vehicle type 'tram' has no known size; .*known: bus, car"):
         boxes.from_bumpers(group_of([(0, "v", "tram", 0, 0, 0, 1)]), SIZES, 1.0, "place")
+
+
+@pytest.mark.parametrize("width_m", [1e-300, 1e6, float("inf"), float("nan")])
+def test_a_size_that_no_vehicle_has_is_named(width_m):
+    sizes = {"car": dataclasses.replace(SIZES["car"], width_m=width_m)}
+    with pytest.raises(
+        InputError, match=r"place: vehicle type 'car' has width_m = .*; at least 0.001 m, at most 2000 m"
+    ):
+        boxes.from_bumpers(group_of([(0, "v", "car", 0, 0, 0, 1)]), sizes, 1.0, "place")
 
 
 def test_a_vehicle_twice_in_a_frame_is_named():

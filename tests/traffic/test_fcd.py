@@ -46,12 +46,13 @@ ROWS = {
 }
 
 
-def parquet_bytes():
+def parquet_bytes(name=b"b"):
     nan = float("nan")
+    names = pa.array([b"", name, b"a", name]).view(pa.string())
     table = pa.table(
         {
             "timestep_time": [0.0, 0.5, 0.5, 1.0],
-            "vehicle_id": ["", "b", "a", "b"],
+            "vehicle_id": names,
             "vehicle_x": [nan, 1.0, -1.25, 2.5],
             "vehicle_y": [nan, 2.0, 1000.0, 2.0],
             "vehicle_angle": pa.array([nan, 90.0, 360.0, 90.0], pa.float32()),
@@ -126,6 +127,15 @@ BAD = {
     "XML with NaN": (XML.replace('"360.00"', '"nan"').encode(), r"vehicle element 2: angle of vehicle 'a' is nan"),
     "XML with entities": (b'<!DOCTYPE f [<!ENTITY a "b">]><fcd-export>&a;</fcd-export>', r"declares XML entities"),
     "truncated Parquet": (parquet_bytes()[:-30], r"cannot be read as Parquet"),
+    "Parquet with a name that is no text": (
+        parquet_bytes().replace(b"vehicle_angle", b"vehicle\xffangle"),
+        r"cannot be read as Parquet \(it is no text in utf-8: byte 7 is 0xff\)",
+    ),
+    "Parquet with an id that is no text": (parquet_bytes(b"\xff"), r"cannot be read as Parquet \(.*UTF8"),
+    "infinite speed": (
+        f"{HEADER}\n{row(speed='inf')}\n".encode(),
+        r"row 1: speed of vehicle 'v' is inf; a finite number",
+    ),
 }
 
 
@@ -217,3 +227,37 @@ def test_the_message_names_the_file_only_once(tmp_path):
     with pytest.raises(InputError) as caught:
         list(fcd.read(path))
     assert len(re.findall("x.csv", str(caught.value))) == 1
+
+
+def test_frames_of_too_many_vehicles_are_refused(monkeypatch):
+    monkeypatch.setenv("EGVS_MAX_ROWS", "5")
+    tables = [steps(*[0.0] * 4), steps(*[0.0] * 4)]
+    with pytest.raises(
+        InputError, match=r"has more than 5 vehicles in frames side by side; at most 5 rows; EGVS_MAX_RO"
+    ):
+        list(groups(tables, Window(1, 1000), 1, "here"))
+
+
+def test_a_parquet_file_of_more_rows_than_it_can_hold_is_refused(tmp_path):
+    """Three million rows that are all the same, in a few kilobytes."""
+    n = 3_000_000
+    columns = {"timestep_time": pa.array(np.zeros(n)), "vehicle_id": pa.array(["v"] * n).dictionary_encode()}
+    columns |= {f"vehicle_{key}": pa.array(np.zeros(n)) for key in ("x", "y", "angle")}
+    columns["vehicle_type"] = columns["vehicle_id"]
+    pq.write_table(pa.table(columns), tmp_path / "f.parquet", compression="zstd")
+    (tmp_path / "f.parquet.gz").write_bytes(gzip.compress((tmp_path / "f.parquet").read_bytes()))
+    for name in ("f.parquet", "f.parquet.gz"):
+        with pytest.raises(InputError, match=rf"{name}: says that it holds 3,000,000 rows in [0-9,]+ bytes; a whole"):
+            read_all(tmp_path / name)
+
+
+def test_a_row_group_of_more_than_the_bound_is_not_unpacked(tmp_path, monkeypatch):
+    monkeypatch.setenv("EGVS_MAX_UNPACKED_MB", "1")
+    n = 30_000
+    columns = {f"vehicle_{key}": np.random.default_rng(1).random(n) for key in ("x", "y", "angle", "z", "speed")}
+    columns |= {"timestep_time": np.zeros(n), "vehicle_id": ["v"] * n, "vehicle_type": ["car"] * n}
+    pq.write_table(pa.table(columns), tmp_path / "f.parquet")
+    with pytest.raises(
+        InputError, match=r"f.parquet: has a row group of 1 MB, unpacked; at most 1 MB; EGVS_MAX_UNPACKED"
+    ):
+        read_all(tmp_path / "f.parquet")

@@ -183,8 +183,8 @@ def test_all_missing_kinds_are_asked_for_at_once(mini: Path, tmp_path: Path, egv
         ([f"<a>{LORRY}{LORRY}</a>"], "a second <vType> 'lorry'"),
         ([f"<a>{LORRY}</a>"] * 2, r"types1\.xml: a second <vType> 'lorry'"),
         (["<a><vType id='x' vClass='lorry'/></a>"], "vType x: vClass: 'lorry'; a vClass of SUMO"),
-        *(([f"<a><vType id='x' height='{height}'/></a>"], f"vType x: height: '{height}'; a length above 0 m")
-          for height in ("tall", "0", "-1", "nan", "inf")),
+        *(([f"<a><vType id='x' height='{height}'/></a>"], f"vType x: height: '{height}'; a length of at least 0.001 m")
+          for height in ("tall", "0", "-1", "nan", "inf", "1e-300", "2001", "1_0", "٣")),
         (["<a><vType id='x'></a>"], "is not well-formed XML"),
     ],
 )  # fmt: skip

@@ -10,6 +10,7 @@ import pytest
 from pipeline.core.errors import InputError
 from pipeline.traffic import network, sumo
 from pipeline.traffic.demand import trips as demand
+from pipeline.world import terrain
 from tests.traffic.helpers import car, drawn
 
 NET = """<net version="1.20">
@@ -149,3 +150,24 @@ def test_a_wrong_kind_is_refused(kind, message):
 def test_a_kinds_attributes_go_before_ours():
     text = demand.vtypes_xml([car(attributes={"maxSpeedLat": 2, "color": "1,0,0"})])
     assert 'maxSpeedLat="2.0"' in text and 'color="1,0,0"' in text and 'lcMaxSpeedLatFactor="0.2"' in text
+
+
+@pytest.mark.parametrize("far", ["2147483648", "-1e300", "nan", "inf"])
+def test_a_coordinate_of_no_place_on_earth_is_refused(tmp_path: Path, far: str) -> None:
+    """Of a road; of a lane that is not a road's, when somebody asks for it."""
+    text = '<net><edge id="e" from="a" to="b"><lane id="e_0" shape="0,0,1 {},9,2"/></edge></net>'
+    (tmp_path / "n.net.xml").write_text(text.format(far))
+    with pytest.raises(InputError, match=rf"n.net.xml: <edge id='e'> is not as .*coordinate {far} is beyond 1e\+08 m"):
+        network.read(tmp_path / "n.net.xml")
+    shape = network.Shape(f"0,0 {far},1", "n.net.xml: lane x")
+    with pytest.raises(InputError, match=rf"n.net.xml: lane x: a shape holds no coordinates \(the coordinate {far}"):
+        _ = shape.shape_m
+
+
+def test_a_ground_of_too_many_points_is_refused(tmp_path: Path) -> None:
+    """A road of 90,000 km on a hill."""
+    text = '<net><edge id="e" from="a" to="b"><lane id="e_0" shape="0,0,1 9e7,9,200"/></edge></net>'
+    (tmp_path / "n.net.xml").write_text(text)
+    told = r"n.net.xml: reaches so far that its ground takes [0-9,]+ points; at most 2,000,000 points; EGVS_MAX_GROUND"
+    with pytest.raises(InputError, match=told):
+        terrain.ground(network.read(tmp_path / "n.net.xml"), place="n.net.xml")

@@ -26,6 +26,14 @@ def test_sumo_killed_from_outside_is_told(tmp_path, monkeypatch):
         sumo.run("sumo", [], tmp_path)
 
 
+@pytest.mark.parametrize("signal", [6, 8, 11])
+def test_a_crash_is_what_it_was_given(tmp_path, monkeypatch, signal):
+    """By damaged networks, some of which SUMO does not survive."""
+    fake_sumo(tmp_path, monkeypatch, f"echo {'x' * 1000} >&2; kill -{signal} $$")
+    with pytest.raises(sumo.RefusedError, match=f"sumo crashed with signal {signal}:\n  x{{300}}$"):
+        sumo.run("sumo", [], tmp_path)
+
+
 def test_a_binary_that_is_none_is_told(tmp_path, monkeypatch):
     fake_sumo(tmp_path, monkeypatch, "")
     (tmp_path / "sumo").write_bytes(b"\x00not a program")

@@ -7,9 +7,12 @@ import json
 import math
 import re
 import shutil
+import signal
+import socket
 import subprocess
 import sys
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -143,6 +146,39 @@ def test_traci_to_nobody_is_refused(town, tmp_path):
         run_stage(
             traffic, scenario(town, network="net.xml", **SMALL), tmp_path, traci=("localhost", getFreeSocketPort())
         )
+
+
+@pytest.mark.parametrize(
+    "answer", [b"", b"HTTP/1.1 400 Bad Request\r\n", b"\0\0\0\5\0", b"\0\0\0\x0b\7\0\0\0\0\0\0", b"\0\0\0\4"]
+)
+def test_who_does_not_answer_as_sumo_does_is_refused(town, tmp_path, monkeypatch, answer):
+    """One that listens and is silent, and some that say something else, and wait."""
+    monkeypatch.setattr(sumo, "_ANSWERS_WITHIN_S", 0.2)
+    with socket.create_server(("localhost", 0)) as server, ThreadPoolExecutor(1) as threads:
+        taken = threads.submit(server.accept)
+        port = server.getsockname()[1]
+        answered = threads.submit(lambda: taken.result()[0].sendall(answer))
+        with pytest.raises(InputError, match=r"who listens there does not answer as SUMO does within 0\.2 s"):
+            run_stage(traffic, scenario(town, network="net.xml", **SMALL), tmp_path, traci=("localhost", port))
+        answered.result()
+        taken.result()[0].close()
+    assert not (tmp_path / "trajectories.parquet").exists()
+
+
+@pytest.mark.usefixtures("patient")
+def test_a_sumo_that_falls_silent_is_told(town, recorded, tmp_path, monkeypatch):
+    monkeypatch.setattr(sumo, "_STEPS_WITHIN_S", 0.2)
+    process, port = serve(recorded[3] / "sumo")
+    with process:
+        try:
+            with (
+                pytest.raises(RunError, match=rf"SUMO at localhost:{port} ended .*, or did not answer for 0\.2 s"),
+                sumo.connected("localhost", port) as connection,
+            ):
+                process.send_signal(signal.SIGSTOP)
+                connection.simulationStep()
+        finally:
+            process.kill()
 
 
 ROUTES = """<routes>

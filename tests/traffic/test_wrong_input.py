@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 
-from pipeline.core.errors import InputError, RunError
+from pipeline.core.errors import InputError
 from pipeline.stages import traffic
 from tests.stages import run_stage
 from tests.traffic.helpers import car, scenario
@@ -88,8 +88,8 @@ BAD = {
     "routes off the network": (
         write("r.xml", CAR_ROUTE),
         {"network": "net.xml", "routes": ["r.xml"]},
-        RunError,
-        r"sumo ended with exit code 1:\n.*nowh",
+        InputError,
+        r"scenario\.toml: traffic: SUMO cannot run net\.xml, r\.xml: sumo ended with exit code 1:\n.*nowh",
     ),
     "configuration names no network": (
         write("c.sumocfg", "<configuration/>"),

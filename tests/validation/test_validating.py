@@ -9,6 +9,7 @@ import pytest
 
 from pipeline import load
 from pipeline.artefacts import tables
+from pipeline.artefacts.readers import read_validation
 from pipeline.core.errors import InputError
 from pipeline.sensing.sites import Pose, Site
 from pipeline.validation import validating
@@ -22,7 +23,7 @@ from pipeline.validation.surrogates.gathering import SurrogateRow, Surrogates
 from pipeline.validation.validating import correlated, validate
 from tests.validation.detecting import Middle
 
-ARTEFACTS = ("correlation.parquet", "detection.parquet", "surrogates.parquet", "validation.png")
+ARTEFACTS = ("correlation.parquet", "detection.parquet", "surrogates.parquet", "validation.png", "validation.sha256")
 WANTED = ("validate", "--frames", "10", "--detector", "points", "--jobs", "1")
 
 
@@ -60,6 +61,19 @@ def test_what_comes_out(whole):
     (own,) = (row for row in rows if about["own_score"].items() <= row.items() and row["measure"] == COUNTED[0])
     assert own["n"] == 6 and own["kendall_low"] <= own["kendall"] <= own["kendall_high"]
     assert json.loads(own["parameters"]) == {"gamma": 4, "voxel_m": 0.5, "moving_occlusion": False}
+
+
+def test_a_flipped_bit_of_a_validation_is_told(whole, tmp_path):
+    out = shutil.copytree(whole[1], tmp_path / "out")
+    paths = out / "detection.parquet", out / "correlation.parquet"
+    assert read_validation(*paths) is not None
+    data = paths[0].read_bytes()
+    paths[0].write_bytes(data[:99] + bytes([data[99] ^ 1]) + data[100:])
+    told = (
+        r"detection\.parquet: is not the file of which validation\.sha256 has the checksum; remove it, or run egvs val"
+    )
+    with pytest.raises(InputError, match=told):
+        read_validation(*paths)
 
 
 def test_traffic_that_was_seen_is_told(whole):

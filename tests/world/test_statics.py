@@ -111,6 +111,12 @@ def test_points_are_discs_and_lines_are_strips(tmp_path):
             {"rings that touched themselves": 1},
             [4, 4],
         ),
+        # the same, with a line to one side of it: what is mended is a collection, in which several polygons are one
+        (
+            [polygon([[0, 0], [4, 0], [2, 2], [4, 4], [0, 4], [2, 2], [0, 0], [0, -3], [0, 0]])],
+            {"rings that touched themselves": 1},
+            [4, 4],
+        ),
         # a ring that runs round its own hole and back through a point
         (
             [polygon([[0, 0], [9, 0], [9, 9], [0, 9], [0, 0], [2, 3], [3, 6], [6, 3], [0, 0]])],

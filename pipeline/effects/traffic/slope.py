@@ -80,7 +80,7 @@ class Slope(Traffic[SlopeParameters]):
         """The ground through the network's lanes."""
         path = sumo_folder.network_path(scenario)
         assert path is not None, "a scenario in which the slope acts has a network"
-        return terrain.ground(network.read(path), low_m, high_m)
+        return terrain.ground(network.read(path), low_m, high_m, path)
 
 
 @dataclass(frozen=True)

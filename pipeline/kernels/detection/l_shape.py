@@ -12,10 +12,11 @@ The heading with the largest :math:`\beta` is taken; of equal ones the first.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
+from pipeline.kernels.compile_cache import compiled
+
+_kernel = compiled()
 
 
 @_kernel

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
+from pipeline.kernels.compile_cache import compiled
+
+_kernel = compiled()
 
 _ROWS = 1024
 """Rows that go down a tree together: what is known of them stays near the processor."""

@@ -90,8 +90,6 @@ class TargetRecord:
         Smallest distance in plan from the box's rectangle to that of any other vehicle of the frame, in the region or
         not, (n,) float64; 0 where they overlap, infinity where there is none. The parts of an articulated vehicle are
         one another's neighbours, as they are boxes of their own; people are none.
-    share_in_roi
-        Share of the box's rectangle in plan that lies in the region, (n,) float64; 1 where it does not reach out.
     all_boxes, row
         Every box of the frames, and which of them each row is, (n,) int64.
     """
@@ -107,7 +105,6 @@ class TargetRecord:
     boxes: Floats
     pitch_rad: Floats
     gap_m: Floats
-    share_in_roi: Floats
     all_boxes: AllBoxes
     row: Ints
 
@@ -132,14 +129,12 @@ class TargetRecord:
         )
         kinds, kind = _distinct([[its.kinds[i] for i in rows] for its, rows in zip(frames, wanted, strict=True)])
         motor = np.concatenate([np.empty(0, dtype=np.bool_), *(its.are_vehicles() for its in frames)])
-        gap_m, share = _in_plan(boxes, row, motor, grid)
+        gap_m = _gaps(boxes, row, motor)
         world = np.concatenate([np.empty((0, 7)), *(its.boxes for its in frames)])[row]
         part = np.concatenate([np.empty(0, dtype=np.int64), *(its.part for its in frames)])[row]
         numbers = np.array([its.number for its in frames], dtype=np.int64)
         pitch = boxes.values[row, 4]
-        return cls(
-            grid, numbers, frame, vehicles, vehicle, kinds, kind, part, world, pitch, gap_m, share, boxes, row
-        )  # fmt: skip
+        return cls(grid, numbers, frame, vehicles, vehicle, kinds, kind, part, world, pitch, gap_m, boxes, row)
 
     @classmethod
     def read(cls, path: Path, grid: Grid, frames: int = FRAMES, people: Collection[str] = ()) -> TargetRecord:
@@ -163,13 +158,11 @@ def _distinct(names: Sequence[Sequence[str]]) -> tuple[tuple[str, ...], Ints]:
     return tuple(known), np.array([place[name] for name in flat], dtype=np.int64)
 
 
-def _in_plan(boxes: AllBoxes, row: Ints, motor: NDArray[np.bool_], grid: Grid) -> tuple[Floats, Floats]:
-    """Gap to the nearest neighbour, and share in the region, of the boxes in ``row``."""
-    plan, gap_m, share = np.empty((len(boxes.values), 6)), np.empty(len(boxes.values)), np.empty(len(row))
+def _gaps(boxes: AllBoxes, row: Ints, motor: NDArray[np.bool_]) -> Floats:
+    """Gap to the nearest neighbour in plan, of the boxes in ``row``."""
+    plan, gap_m = np.empty((len(boxes.values), 6)), np.empty(len(boxes.values))
     kernels.footprints(boxes.values, plan)
     asked = np.zeros(len(boxes.values), dtype=np.bool_)
     asked[row] = True
     kernels.gaps(boxes.starts, plan, asked, motor, gap_m)
-    size_m = np.asarray(grid.roi.size_m)
-    kernels.shares_inside(plan[row], boxes.values[row, 3], boxes.low[row], boxes.high[row], size_m, share)
-    return gap_m[row], share
+    return gap_m[row]

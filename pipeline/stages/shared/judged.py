@@ -79,6 +79,14 @@ class Judged:
             cure = "sites and sensors that look at the traffic in the region"
         return [Finding("no ranking", place, f"{self.name} is 0 at every site, so none is best: {why}", cure)]
 
+    def idle(self) -> list[Finding]:
+        """A warning where the score, which does not rank, is 0 at every site."""
+        if not len(self.values) or np.any(self.values != 0):
+            return []
+        found = f"{self.name} is 0 at every site, so it tells none from another"
+        cure = "sites, sensors and settings by which it is above 0 somewhere"
+        return [Finding("no other score", f"{FILE}: score", found, cure)]
+
     @property
     def rank(self) -> np.ndarray[Any, np.dtype[np.uint32]]:
         """1 for the best, (n,)."""

@@ -8,12 +8,14 @@ Metres.
 from __future__ import annotations
 
 import math
-import tempfile
+import re
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement, tostring
 
+from pipeline.artefacts.recorded_boxes import LARGEST_M, SMALLEST_M
 from pipeline.core.errors import InputError
+from pipeline.core.files import scratch
 from pipeline.formats import safe_xml
 from pipeline.scenario.models import Scenario
 from pipeline.scenario.traffic import VehicleKind
@@ -21,6 +23,9 @@ from pipeline.traffic import live, sumo, sumo_folder
 from pipeline.traffic.boxes import Size
 
 _SIZES = ("length", "width", "height")
+_NUMBER = re.compile(r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
+"""As SUMO reads it, which knows no digits but these, and no underscores."""
+
 _SUMO_OWN = frozenset(f"DEFAULT_{what}TYPE" for what in ("VEH", "TAXI", "BIKE", "RAIL", "PED", "CONTAINER"))
 """Types that SUMO has without being told."""
 
@@ -99,12 +104,11 @@ def _checked(vtype: Element, place: str) -> Element:
     if (vclass := kept.get("vClass", "passenger")) not in sumo.vehicle_classes():
         raise InputError(f"{place}: vClass", repr(vclass), "a vClass of SUMO, e.g. passenger, truck, bus or bicycle")
     for key in _SIZES:
-        try:
-            size_m = float(kept.get(key, "1"))
-        except ValueError:
-            size_m = math.nan
-        if not 0 < size_m < math.inf:
-            raise InputError(f"{place}: {key}", repr(kept.get(key)), "a length above 0 m")
+        text = kept.get(key, "1")
+        size_m = float(text) if _NUMBER.fullmatch(text) else math.nan
+        if not SMALLEST_M <= size_m <= LARGEST_M:
+            right = f"a length of at least {SMALLEST_M} m and at most {LARGEST_M:g} m"
+            raise InputError(f"{place}: {key}", repr(text[:80]), right)
     return kept
 
 
@@ -113,8 +117,7 @@ def _asked(vtypes: Collection[Element]) -> dict[str, Size]:
     document = Element("additional")
     for vtype in vtypes:
         SubElement(document, vtype.tag, vtype.attrib)
-    with tempfile.TemporaryDirectory(prefix="egvs-vtypes-") as temporary:
-        folder = Path(temporary)
+    with scratch() as folder:
         (folder / "least.net.xml").write_text(_NETWORK, encoding="utf-8")
         (folder / "types.add.xml").write_bytes(tostring(document, encoding="utf-8"))
         named = ["-n", "least.net.xml", "-a", "types.add.xml", "--route-steps", "0"]

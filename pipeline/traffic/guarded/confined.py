@@ -16,9 +16,7 @@ import ctypes
 import os
 import signal
 import struct
-import subprocess
 import sys
-import threading
 
 CANNOT_START = 126
 """Exit code where the program could not be started; what is wrong stands in the last line of standard error."""
@@ -78,6 +76,9 @@ def may_write_in(folder: str, libc: ctypes.CDLL) -> bool:
 
 def watched(command: list[str]) -> int:
     """Run the program to its end, or to the end of standard input; its exit code."""
+    import subprocess  # costs a third of the start, which other systems need not pay
+    import threading
+
     try:
         program = subprocess.Popen(command, stdin=subprocess.DEVNULL)
     except OSError as error:

@@ -12,10 +12,10 @@ routes may depend on them.
 
 from __future__ import annotations
 
-import re
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import lru_cache
 from pathlib import Path
 from typing import IO
 from xml.etree.ElementTree import Element, tostring
@@ -36,9 +36,6 @@ _READS = frozenset({"href", "edgesFile"})
 _READERS = frozenset({"rerouter", "variableSpeedSign"})
 """Elements whose ``file`` is read."""
 
-_ENCODING = re.compile(rb"""(?:\xef\xbb\xbf)?<\?xml[^>]*?\bencoding\s*=\s*["']([^"']*)["']""")
-_DECLARATION_BYTES = 512
-
 
 def safe_name(name: str) -> str:
     """A file's name without what SUMO reads as more than a name: lists, variables of the environment."""
@@ -50,19 +47,31 @@ def copy(path: Path, to: Path) -> list[str]:
 
     InputError when it is not well-formed, declares entities, or names a further file that SUMO would read.
     """
-    unwritten: Counter[str] = Counter()
-    for child in _guarded(path):
-        unwritten.update(element.tag for element in child.iter() if _output_keys(element))
+    unwritten = _outputs_of(path, files.sha256_of(path))
     with files.aside(to) as partial, partial.open("wb") as file:
-        if unwritten or not _is_utf8(path):
+        if unwritten or safe_xml.encoding_of_file(path) not in ("utf-8", "ascii"):
             _rewrite(path, file)
         else:
             with safe_xml.opened(path) as source:
                 shutil.copyfileobj(source, file)
     if not unwritten:
         return []
-    told = ", ".join(f"{count} of <{tag}>" for tag, count in sorted(unwritten.items()))
+    told = ", ".join(f"{count} of <{tag}>" for tag, count in unwritten)
     return [f"{path.name}: SUMO's outputs that it asks for are not written: {told}"]
+
+
+def check(path: Path) -> None:
+    """InputError where :func:`copy` would refuse a file."""
+    _outputs_of(path, files.sha256_of(path))
+
+
+@lru_cache(maxsize=32)
+def _outputs_of(path: Path, _content: str) -> tuple[tuple[str, int], ...]:
+    """The elements of a file that ask for an output, and how many; read once for the check and the copy."""
+    found: Counter[str] = Counter()
+    for child in _guarded(path):
+        found.update(element.tag for element in child.iter() if _output_keys(element))
+    return tuple(sorted(found.items()))
 
 
 def _guarded(path: Path, on_root: Callable[[Element], None] = lambda root: None) -> Iterator[Element]:
@@ -80,15 +89,6 @@ def _guarded(path: Path, on_root: Callable[[Element], None] = lambda root: None)
         for element in child.iter():
             _refuse(element, path)
         yield child
-
-
-def _is_utf8(path: Path) -> bool:
-    """Whether a well-formed file is in UTF-8, as most are: it says so, or says nothing."""
-    with safe_xml.opened(path) as file:
-        declared = _ENCODING.match(start := file.read(_DECLARATION_BYTES))
-    if start.startswith((b"\xff\xfe", b"\xfe\xff", b"\x00", b"<\x00")):
-        return False
-    return declared is None or declared[1].lower() in (b"utf-8", b"us-ascii", b"ascii")
 
 
 def _rewrite(path: Path, file: IO[bytes]) -> None:

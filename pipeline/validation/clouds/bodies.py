@@ -28,8 +28,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.artefacts.traffic_frames import TrafficFrame
+from pipeline.checks import mesh_parts
 from pipeline.core import files
 from pipeline.core.errors import InputError
+from pipeline.formats.meshes import loading as meshes
 from pipeline.scenario.models import Scenario
 from pipeline.validation.clouds.surfaces import REFLECTIVITY
 
@@ -151,9 +153,10 @@ def of_scenario(scenario: Scenario) -> Bodies:
 
 def digests(scenario: Scenario) -> dict[str, str]:
     """The files that bodies come from, by sha256: what clouds depend on beside the program's source."""
-    named = scenario.validation.bodies.items()
-    theirs = {name: files.sha256_of(scenario.find(name, f"validation.bodies.{kind}")) for kind, name in named}
-    return {FILE.name: files.sha256_of(FILE), **theirs}
+    hashes = {FILE.name: files.sha256_of(FILE)}
+    for kind, name in scenario.validation.bodies.items():
+        hashes |= mesh_parts.digests(scenario.find(name, f"validation.bodies.{kind}"), name)
+    return hashes
 
 
 def read(path: Path, place: str) -> tuple[Part, ...]:
@@ -164,17 +167,8 @@ def read(path: Path, place: str) -> tuple[Part, ...]:
     InputError
         When it cannot be read, holds no triangles or too many, is flat, or has corners that are no numbers.
     """
-    import trimesh
-
     place = f"{place}: {path}"
-    try:
-        mesh = trimesh.load(path, force="mesh", process=False)
-    except (ValueError, KeyError, IndexError, TypeError, AttributeError, OSError, NotImplementedError) as error:
-        raise InputError(
-            place, f"cannot be loaded ({error})", "a mesh that trimesh reads: PLY, OBJ, STL, GLB"
-        ) from None
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise InputError(place, "holds no triangles", "a closed mesh of a vehicle")
+    mesh = meshes.load(path, place)
     if len(mesh.faces) > MOST_TRIANGLES:
         raise InputError(place, f"has {len(mesh.faces):,} triangles", f"at most {MOST_TRIANGLES:,}; simplify it")
     triangles = np.asarray(mesh.vertices, dtype=np.float64)[mesh.faces]

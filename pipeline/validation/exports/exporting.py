@@ -162,7 +162,7 @@ def _aside(folder: Path) -> Iterator[Path]:
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         lock = target.with_name(f".{target.name}.lock")
-        lock.touch()
+        locking.make(lock)
     except OSError as error:
         raise InputError(f"--out {folder}", f"cannot be written ({error.strerror})", "a folder of yours") from None
     with locking.locked(lock, wait=False, remove=True) as held:
@@ -171,7 +171,8 @@ def _aside(folder: Path) -> Iterator[Path]:
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir()
         try:
-            yield partial
+            with files.naming(target):
+                yield partial
             partial.replace(target)
         except BaseException:
             shutil.rmtree(partial, ignore_errors=True)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from pipeline.core import files
 from pipeline.validation.clouds.point_clouds import CloudMaker
 from pipeline.validation.detectors.pointpillars.detector import PointPillars
 from pipeline.validation.metrics.average_precision import evaluate
@@ -38,8 +37,8 @@ class HeldOut:
         """Average precision of a model over all held-out sweeps."""
         truth: list[Objects] = []
         found: list[Detections] = []
-        with tempfile.TemporaryDirectory(prefix="egvs-model-") as folder:
-            path = Path(folder) / "model.onnx"
+        with files.scratch() as folder:
+            path = folder / "model.onnx"
             path.write_bytes(model)
             for number, junction in enumerate(self._junctions):
                 for pose in range(self.POSES):

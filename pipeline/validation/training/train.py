@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -86,9 +85,9 @@ def train(
     names = [scenario.name for scenario in scenarios]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise InputError("SCENARIO", f"{twice[0]!r} twice", "junctions of different names")
-    with tempfile.TemporaryDirectory(prefix="egvs-train-") as folder:
-        learn = [_record(s, _LEARN, recipe, recipe.frames, Path(folder), jobs, progress) for s in scenarios]
-        hold = [_record(s, _HOLD_OUT, recipe, HeldOut.FRAMES, Path(folder), jobs, progress) for s in scenarios]
+    with files.scratch() as folder:
+        learn = [_record(s, _LEARN, recipe, recipe.frames, folder, jobs, progress) for s in scenarios]
+        hold = [_record(s, _HOLD_OUT, recipe, HeldOut.FRAMES, folder, jobs, progress) for s in scenarios]
         samples = Samples(
             [Junction(record, recipe.heights_m) for record in learn], recipe.sensors, recipe.convention, recipe.seed
         )

@@ -52,7 +52,7 @@ def test_rows_are_vehicles_in_the_region_frame_after_frame():
 def test_a_record_may_be_empty():
     for frames in ([], [frame([])], [frame([at(-9, 5)])]):
         record = TargetRecord.of(frames, GRID)
-        assert len(record) == 0 and record.vehicles == () and record.gap_m.shape == record.share_in_roi.shape == (0,)
+        assert len(record) == 0 and record.vehicles == () and record.gap_m.shape == (0,)
 
 
 @pytest.mark.parametrize(
@@ -85,7 +85,7 @@ def test_neighbours_are_all_vehicles_of_the_frame_and_parts_but_no_people():
 
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=30)
-def test_gaps_and_shares_are_shapelys(seed):
+def test_gaps_are_shapelys(seed):
     rng = np.random.default_rng(seed)
     frames = []
     for number in range(2):
@@ -93,24 +93,13 @@ def test_gaps_and_shares_are_shapelys(seed):
         pitch = rng.uniform(-0.3, 0.3, len(boxes)) * rng.integers(0, 2, len(boxes))
         frames.append(frame(boxes, rng.choice(["bus", "pedestrian"], len(boxes), p=[0.8, 0.2]), pitch, number))
     record = TargetRecord.of(frames, GRID)
-    gaps, shares = [], []
-    region = shapely.box(100.0, 200.0, 140.0, 220.0)
+    gaps = []
     for one in frames:
         prints = [footprint(box, pitch) for box, pitch in zip(one.boxes, one.pitch_rad, strict=True)]
         for row in one.wanted(GRID.roi):
             others = [p for i, p in enumerate(prints) if i != row and one.kinds[i] == "bus"]
             gaps.append(min((prints[row].distance(p) for p in others), default=math.inf))
-            shares.append(prints[row].intersection(region).area / prints[row].area)
     np.testing.assert_allclose(record.gap_m, gaps, atol=1e-9)
-    np.testing.assert_allclose(record.share_in_roi, shares, atol=1e-9)
-
-
-def test_share_in_the_region():
-    rows = [at(10, 10), at(1, 10), at(0, 10), at(2, 1), at(0, 0), at(0.5, 10, 0.0, (40.0, 2.0, 3.0))]
-    record = TargetRecord.of([frame(rows)], GRID)
-    assert record.share_in_roi[:5] == pytest.approx([1.0, 0.75, 0.5, 1.0, 0.25])
-    assert record.share_in_roi[[0, 3]].tolist() == [1.0, 1.0]  # exactly: the last lies along two sides of the region
-    assert record.share_in_roi[5] == pytest.approx(20.5 / 40.0)
 
 
 def test_frames_are_spread_over_the_record(tmp_path):

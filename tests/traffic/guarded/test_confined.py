@@ -41,6 +41,19 @@ def test_sumo_cannot_write_outside_its_folder(tmp_path, monkeypatch):
         assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.skipif(not has_landlock(), reason="this kernel has no Landlock")
+def test_a_tool_of_sumos_cannot_write_outside_its_folder_either(tmp_path, monkeypatch):
+    (tmp_path / "tools").mkdir()
+    (tmp_path / "own").mkdir()
+    text = "import pathlib, sys\npathlib.Path('mine').write_text('x')\npathlib.Path(sys.argv[1]).write_text('x')\n"
+    (tmp_path / "tools" / "tool.py").write_text(text)
+    monkeypatch.setattr(sumo, "sumo_home", lambda: tmp_path)
+    assert sumo.run_tool("tool.py", ["here"], tmp_path / "own") == ""
+    with pytest.raises(RunError, match=r"tool\.py ended with exit code 1:(.|\n)*PermissionError"):
+        sumo.run_tool("tool.py", [str(tmp_path / "foreign")], tmp_path / "own")
+    assert sorted(path.name for path in tmp_path.rglob("*") if path.is_file()) == ["here", "mine", "tool.py"]
+
+
 PARENT = """
 import sys
 from pathlib import Path

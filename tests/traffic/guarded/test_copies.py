@@ -5,6 +5,7 @@ from xml.etree.ElementTree import parse
 
 import pytest
 
+from pipeline.core.errors import InputError
 from pipeline.formats import safe_xml
 from pipeline.traffic.guarded import copies
 
@@ -51,3 +52,36 @@ def test_a_rewritten_file_says_the_same_but_for_its_outputs(tmp_path):
 
 def test_names_that_sumo_would_read_as_more_are_changed():
     assert copies.safe_name("a,b;${HOME}.rou.xml") == "a_b__{HOME}.rou.xml"
+
+
+FURTHER = {
+    "signs": '<variableSpeedSign id="v" lanes="a_0" file="speeds.xml"/>',
+    "rerouters": '<rerouter id="r" edges="a" file="r.xml"/>',
+    "inclusions": '<include href="more.xml"/>',
+    "zones": '<taz id="t"/><tazRelation edgesFile="e.txt"/>',
+    "signs within": '<parkingArea id="p"><variableSpeedSign id="v" file="speeds.xml"/></parkingArea>',
+}
+
+
+@pytest.mark.parametrize("text", FURTHER.values(), ids=FURTHER.keys())
+def test_what_would_have_sumo_read_a_further_file_is_refused(tmp_path, text):
+    (tmp_path / "a.xml").write_text(f"<additional>{text}</additional>")
+    with pytest.raises(InputError, match=r"has SUMO read a further file; its content in this file itself"):
+        copies.copy(tmp_path / "a.xml", tmp_path / "copy.xml")
+    assert not (tmp_path / "copy.xml").exists()
+    (tmp_path / "a.xml").write_text(
+        '<additional><variableSpeedSign id="v"><step time="0" speed="9"/></variableSpeedSign></additional>'
+    )
+    assert copies.copy(tmp_path / "a.xml", tmp_path / "copy.xml") == []
+
+
+def test_what_was_checked_is_not_parsed_again_unless_it_is_another(tmp_path, monkeypatch):
+    path = tmp_path / "a.xml"
+    path.write_text('<routes><a x="1"/></routes>')
+    copies.check(path)
+    with monkeypatch.context() as patch:
+        patch.setattr(copies, "_guarded", None)
+        assert copies.copy(path, tmp_path / "copy.xml") == []
+    path.write_text('<routes><include href="f"/></routes>')
+    with pytest.raises(InputError, match="has SUMO read a further file"):
+        copies.check(path)

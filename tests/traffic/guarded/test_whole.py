@@ -42,6 +42,26 @@ def empty(path):
     ],
 )  # fmt: skip
 def test_a_file_that_is_cut_is_told(place, tmp_path, monkeypatch, name, damage):
+    damaged(monkeypatch, name, damage)
+    with pytest.raises(RunError, match=f"{name}: SUMO did not write it to its end"):
+        run_stage(traffic, configured(place), tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("hold", "message"),
+    [
+        ("at_most", r"fcd\.csv: SUMO did not write it to its end"),
+        ("exactly", r"12 vehicles are in 1\d\d of 240 frames"),
+    ],
+)
+def test_frames_that_are_missing_at_the_end_are_told(town, tmp_path, monkeypatch, hold, message):
+    damaged(monkeypatch, "fcd.csv", cut_to_rows)
+    with pytest.raises(RunError, match=message):
+        run_stage(traffic, scenario(town, network="net.xml", hold=hold, **SMALL), tmp_path / "out")
+
+
+def damaged(monkeypatch, name, damage):
+    """Have a file of SUMO's damaged as soon as SUMO has ended."""
     run = sumo.run
 
     def cut(program, arguments, folder, *more):
@@ -50,5 +70,11 @@ def test_a_file_that_is_cut_is_told(place, tmp_path, monkeypatch, name, damage):
         return printed
 
     monkeypatch.setattr(sumo, "run", cut)
-    with pytest.raises(RunError, match=f"{name}: SUMO did not write it to its end"):
-        run_stage(traffic, configured(place), tmp_path / "out")
+
+
+def test_a_network_that_netconvert_did_not_write_to_its_end_is_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(sumo, "run", lambda *_: (tmp_path / "a.net.xml").write_text("<net>\n <edge"))
+    with pytest.raises(RunError, match=r"a\.net\.xml: SUMO did not write it to its end; is the disk full\?"):
+        sumo.netconvert([], tmp_path, "a.net.xml")
+    monkeypatch.setattr(sumo, "run", lambda *_: (tmp_path / "a.net.xml").write_text("<net>\n</net>\n"))
+    sumo.netconvert([], tmp_path, "a.net.xml")

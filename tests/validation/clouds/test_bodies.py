@@ -104,7 +104,7 @@ def test_a_mesh_of_the_users_is_stretched_to_the_unit_box(mini):
         (
             "points.ply",
             lambda p: trimesh.PointCloud([[0, 0, 0], [1, 1, 1]]).export(p),
-            r"points\.ply: holds no triangles; a closed mesh",
+            r"points\.ply: holds no triangles; a triangle mesh",
         ),
         (
             "flat.ply",

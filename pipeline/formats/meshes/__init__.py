@@ -1,0 +1,1 @@
+"""Triangle meshes: how their files are held against bounds, and loaded."""

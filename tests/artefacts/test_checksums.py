@@ -1,0 +1,45 @@
+"""A file that is not the one that was written is told by its checksum."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from pipeline.artefacts import checksums
+from pipeline.core.errors import InputError
+
+
+@pytest.fixture
+def sums(tmp_path: Path) -> Path:
+    for name in ("a.parquet", "b.png"):
+        (tmp_path / name).write_bytes(name.encode())
+    checksums.write(tmp_path / "study.sha256", [tmp_path / "a.parquet", tmp_path / "b.png"])
+    return tmp_path / "study.sha256"
+
+
+def test_what_is_as_it_was_and_what_is_gone_are_right(sums: Path) -> None:
+    checksums.check(sums, "again")
+    sums.with_name("b.png").unlink()
+    checksums.check(sums, "again")
+    checksums.check(sums.with_name("none.sha256"), "again")
+
+
+def test_a_flipped_bit_is_told(sums: Path) -> None:
+    sums.with_name("b.png").write_bytes(b"b.pnf")
+    with pytest.raises(InputError, match=r"b\.png: is not the file of which study\.sha256 has the checksum; again"):
+        checksums.check(sums, "again")
+    assert checksums.altered(sums, "again") == ["b.png"]
+
+
+@pytest.mark.parametrize("text", [b"x", b"\xff\n", b"0" * 64 + b"  ../a\n", b"0" * 64 + b" a\n", b"\n"])
+def test_a_damaged_list_is_told(sums: Path, text: bytes) -> None:
+    sums.write_bytes(text)
+    with pytest.raises(InputError, match=r"study\.sha256: is no list of checksums; again"):
+        checksums.check(sums, "again")
+
+
+@pytest.mark.system
+@pytest.mark.skipif(shutil.which("sha256sum") is None, reason="sha256sum is not installed")
+def test_it_is_what_sha256sum_reads(sums: Path) -> None:
+    assert subprocess.run(["sha256sum", "--check", "--status", sums.name], cwd=sums.parent).returncode == 0

@@ -1,0 +1,50 @@
+"""A record that says its own hash notices any change of what it says, and none of how it is written."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.core.reading.seals import is_sealed, sealed
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers(-(10**20), 10**20) | st.floats() | st.text(st.characters(codec="utf-8")),
+    lambda inner: (
+        st.lists(inner, max_size=4) | st.dictionaries(st.text(st.characters(codec="utf-8")), inner, max_size=4)
+    ),
+    max_leaves=12,
+)
+
+
+@given(st.dictionaries(st.text(st.characters(codec="utf-8"), min_size=1), VALUES, max_size=5))
+def test_what_is_written_is_found_again(value: dict[str, Any]) -> None:
+    assert is_sealed(json.loads(json.dumps(sealed(value))))
+
+
+def test_any_change_is_noticed() -> None:
+    record = {
+        "stages": {"scan": {"files": {"a": "0"}, "n": 3, "nothing": None}},
+        "x": [1.5, math.inf],
+        10: "ten",
+        9: (),
+    }
+    text = json.dumps(sealed(record), indent=2)
+    assert is_sealed(json.loads(text))
+    assert is_sealed(json.loads(json.dumps(json.loads(text), sort_keys=True)))
+    for old, new in (
+        ("3", "4"),
+        ("1.5", "1.50001"),
+        ("null", "0"),
+        ('"0"', "0"),
+        ('"a"', '"b"'),
+        ("ten", "nine"),
+        ("n", "m"),
+    ):
+        assert old in text
+        assert not is_sealed(json.loads(text.replace(old, new, 1)))
+    for odd in ([], None, "x", {}, {"own_sha256": None}, {"own_sha256": "0", "a": 1}):
+        assert not is_sealed(odd)

@@ -1,0 +1,110 @@
+"""``python -m tests.fuzz [--cases N] [--seed S] [--kinds A,B]``: mutants of every kind of file, judged one by one.
+
+``python -m tests.fuzz --kills N``: runs that are killed at random moments, and run again.
+
+Every verdict is a line of ``results.jsonl`` in the folder ``--keep``; mutants that fare badly lie beside it. A fuzzer
+that was interrupted goes on where it was when it is called again with the same folder. Ends with 1 where anything fared
+badly.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import random
+import sys
+import tempfile
+from collections import Counter
+from pathlib import Path
+
+from tests.fuzz import cases, kills
+from tests.fuzz.cases import Bench, Verdict
+from tests.fuzz.kinds import KINDS
+from tests.fuzz.mutating import mutant
+
+_RESULTS = "results.jsonl"
+Results = Counter[tuple[str, str]]
+
+
+def fuzz(kinds: list[str], number: int, seed: int, keep: Path) -> Results:
+    """``number`` mutants, shared out evenly; how many of each kind got each verdict."""
+    keep.mkdir(parents=True, exist_ok=True)
+    done = _done(keep / _RESULTS, seed)
+    counts: Results = Counter((kind, verdict) for (kind, _), verdict in done.items())
+    with tempfile.TemporaryDirectory(prefix="egvs-fuzz-") as temporary, (keep / _RESULTS).open("a") as results:
+        cases.warm_up(Path(temporary))
+        for index, kind in enumerate(kinds):
+            share = range(number // len(kinds) + (index < number % len(kinds)))
+            if not (left := [case for case in share if (kind, case) not in done]):
+                continue
+            bench = Bench(KINDS[kind], Path(temporary) / f"kind{index}")
+            for case in left:
+                verdict = _judge(bench, seed, case, keep)
+                counts[kind, verdict.name] += 1
+                line = {"seed": seed, "kind": kind, "case": case, "verdict": verdict.name, "told": verdict.told}
+                results.write(json.dumps(line) + "\n")
+                results.flush()
+            print(f"{kind}: {_told(counts, kind)}", flush=True)
+    return counts
+
+
+def _done(path: Path, seed: int) -> dict[tuple[str, int], str]:
+    """The verdicts of an earlier call."""
+    if not path.is_file():
+        return {}
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    return {(line["kind"], line["case"]): line["verdict"] for line in lines if line["seed"] == seed}
+
+
+def _judge(bench: Bench, seed: int, case: int, keep: Path) -> Verdict:
+    rng = random.Random(f"{seed}/{bench.kind.name}/{case}")
+    file = rng.choice(bench.files)
+    data = mutant(rng, file.read_bytes())
+    verdict = bench.judge(file, data)
+    if verdict.name not in cases.WELL:
+        path = keep / f"{bench.kind.name.replace(' ', '_')}-{seed}-{case}-{file.name}"
+        path.write_bytes(data)
+        print(f"  {verdict.name}: {path}: {verdict.told}", flush=True)
+    return verdict
+
+
+def _told(counts: Results, kind: str) -> str:
+    return ", ".join(f"{count} {verdict}" for (name, verdict), count in sorted(counts.items()) if name == kind)
+
+
+def kill(number: int, seed: int) -> int:
+    """How ``number`` kills ended; 1 where one ended badly."""
+    with tempfile.TemporaryDirectory(prefix="egvs-fuzz-") as temporary:
+        cases.warm_up(Path(temporary))
+        counts = kills.kill(number, seed, Path(temporary) / "kills")
+    print(f"{number} kills: " + ", ".join(f"{count} {verdict}" for verdict, count in counts.most_common()), flush=True)
+    return int(set(counts) != {kills.SAME})
+
+
+def main() -> int:
+    """Parse, fuzz, print the table."""
+    parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__.split(":")[0])
+    parser.add_argument("--cases", type=int, default=1000, help="mutants, shared out evenly among the kinds")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--kinds", default="", help=f"some of: {', '.join(KINDS)}; all by default")
+    parser.add_argument("--keep", type=Path, default=Path("build/fuzz"), help="folder of results and of bad mutants")
+    parser.add_argument("--kills", type=int, default=0, help="instead: runs that are killed, and run again")
+    given = parser.parse_args()
+    if given.kills:
+        return kill(given.kills, given.seed)
+    kinds = [name.strip() for name in given.kinds.split(",") if name.strip()] or list(KINDS)
+    if unknown := [name for name in kinds if name not in KINDS]:
+        parser.error(f"unknown kinds {', '.join(unknown)}; some of: {', '.join(KINDS)}")
+    counts = fuzz(kinds, given.cases, given.seed, given.keep)
+    verdicts = Counter[str]()
+    for (_, verdict), count in counts.items():
+        verdicts[verdict] += count
+    print(
+        f"{sum(verdicts.values())} mutants of {len(kinds)} kinds: "
+        + ", ".join(f"{n} {v}" for v, n in verdicts.most_common())
+    )
+    return int(any(verdict not in cases.WELL for verdict in verdicts))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

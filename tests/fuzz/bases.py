@@ -1,0 +1,347 @@
+"""Sound files of every kind, small and quick, and the scenarios that name them.
+
+Nothing in them depends on the clock, so that a seed gives the same mutants on any day; what the program itself writes
+(``run.json``, the store, the study) holds durations, and is the exception.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import re
+import shutil
+import struct
+from datetime import date
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pyarrow.csv
+import pyarrow.parquet as pq
+
+from tests.conftest import SCENARIO, SITES, collection, fcd, feature, write_mini
+
+_KINDS = SCENARIO[SCENARIO.index("[[traffic.kinds]]") : SCENARIO.index("[statics]")]
+_TRAFFIC = SCENARIO[SCENARIO.index("[traffic]") : SCENARIO.index("[statics]")]
+SUMO = """
+vehicles = 3
+frames = 30
+frame_period_s = 0.5
+step_s = 0.5
+warmup_s = 10
+hold = "at_most"
+"""
+ROUTES = """<routes>
+ <vType id="car" length="4.5" width="1.8" height="1.5" maxSpeed="14" sigma="0.5"/>
+ <route id="r" edges="left0A0 A0right0"/>
+ <flow id="f" type="car" route="r" begin="0" end="60" period="4" departSpeed="max"/>
+ <vehicle id="v" type="car" depart="1"><route edges="bottom0A0 A0top0"/></vehicle>
+</routes>
+"""
+ADDITIONAL = """<additional>
+ <vType id="lorry" vClass="truck" length="8" width="2.4" height="3"/>
+ <inductionLoop id="d" lane="left0A0_0" pos="-10" freq="10" file="d.xml"/>
+ <flow id="g" type="lorry" from="top0A0" to="A0left0" begin="0" end="60" period="15"/>
+</additional>
+"""
+CONFIGURATION = """<configuration>
+ <input><net-file value="net.net.xml"/><route-files value="own.rou.xml"/><additional-files value="own.add.xml"/></input>
+ <time><begin value="0"/><end value="100"/><step-length value="0.5"/></time>
+ <processing><time-to-teleport value="-1"/></processing>
+ <output><summary-output value="summary.xml"/></output>
+</configuration>
+"""
+POLYGONS = """<additional>
+ <location netOffset="0.00,0.00" convBoundary="0,0,100,100" origBoundary="0,0,100,100" projParameter="!"/>
+ <poly id="house" type="building" color="255,0,0" fill="1" layer="1" shape="14,5 18,5 18,8 14,8 14,5">
+  <param key="height" value="6"/>
+ </poly>
+ <poly id="lawn" type="landuse.grass" shape="0,0 5,0 5,5" layer="0"/>
+ <poi id="tree" type="natural.tree" x="22" y="-5"/>
+</additional>
+"""
+BEAMS = "elevation_deg,azimuth_deg\n" + "".join(
+    f"{elevation},{azimuth}\n" for azimuth in range(0, 360, 6) for elevation in (-15, -10, -5, 0, 5)
+)
+VTYPES = '<additional>\n <vType id="car" length="4.5" width="1.8" height="1.5" vClass="passenger"/>\n</additional>\n'
+GEOJSON_SITES = collection(
+    feature({"type": "Point", "coordinates": [10, 12, 3]}, name="pole_a", owner="city"),
+    feature({"type": "Point", "coordinates": [30.5, -12]}, name="pole_b", z_m=3, yaw_deg=90),
+)
+
+
+def mini(folder: Path, *changes: tuple[str, str]) -> Path:
+    """The scenario that all tests share, with parts of its text replaced; its folder."""
+    made = write_mini(folder / "scenario")
+    text = SCENARIO
+    for old, new in changes:
+        assert old in text, old
+        text = text.replace(old, new)
+    (made / "scenario.toml").write_text(text)
+    return made
+
+
+# ---- traffic
+
+
+@cache
+def network() -> bytes:
+    """One crossing with lights, without the date that SUMO puts into its head."""
+    import tempfile
+
+    from pipeline.traffic import sumo
+
+    with tempfile.TemporaryDirectory() as folder:
+        flags = [
+            "--grid",
+            "--grid.number",
+            "1",
+            "--grid.attach-length",
+            "100",
+            "--default-junction-type",
+            "traffic_light",
+        ]
+        sumo.run("netgenerate", [*flags, "--offset.disable-normalization", "-o", "net.net.xml"], Path(folder))
+        return re.sub(rb"<!--.*?-->\s*", b"", (Path(folder) / "net.net.xml").read_bytes(), flags=re.DOTALL)
+
+
+def _simulated(folder: Path, source: str) -> Path:
+    """With SUMO; the crossing's middle is at 100, 100."""
+    kinds = _KINDS if source == 'network = "net.net.xml"' or source.endswith('gz"') else ""
+    made = mini(folder, (_TRAFFIC, f"[traffic]\n{source}{SUMO}{kinds}"),
+                ("center_m = [20, 0, 2.5]", "center_m = [100, 100, 2.5]"), ("blocks = 4", "blocks = 3"))  # fmt: skip
+    (made / "sites.csv").write_text("site,x_m,y_m,z_m\npole_a,110,112,3\npole_b,88,88,3\n")
+    for name, content in (("own.rou.xml", ROUTES), ("own.add.xml", ADDITIONAL), ("own.sumocfg", CONFIGURATION)):
+        (made / name).write_text(content)
+    (made / "net.net.xml").write_bytes(network())
+    return made
+
+
+def drawn(folder: Path) -> None:
+    """Drawn trips on a network."""
+    _simulated(folder, 'network = "net.net.xml"')
+
+
+def drawn_gz(folder: Path) -> None:
+    """The same, gzipped."""
+    made = _simulated(folder, 'network = "net.net.xml.gz"')
+    (made / "net.net.xml.gz").write_bytes(gzip.compress(network(), mtime=0))
+
+
+def routed(folder: Path) -> None:
+    """A network with routes."""
+    _simulated(folder, 'network = "net.net.xml"\nroutes = ["own.rou.xml"]')
+
+
+def configured(folder: Path) -> None:
+    """A configuration of SUMO, with routes and additional files."""
+    _simulated(folder, 'sumocfg = "own.sumocfg"')
+
+
+def finished(form: str):
+    """A finished file in one of the forms that SUMO writes, maybe gzipped."""
+
+    def make(folder: Path) -> None:
+        made = mini(folder, ('"fcd.csv"', f'"fcd.{form}"'))
+        (made / "fcd.csv").unlink()
+        (made / f"fcd.{form}").write_bytes(_fcd(form))
+
+    return make
+
+
+def _fcd(form: str) -> bytes:
+    if form.endswith(".gz"):
+        return gzip.compress(_fcd(form.removesuffix(".gz")), mtime=0)
+    if form == "csv":
+        return fcd().encode()
+    table = pyarrow.csv.read_csv(io.BytesIO(fcd().encode()), parse_options=pyarrow.csv.ParseOptions(delimiter=";"))
+    if form == "parquet":
+        pq.write_table(table, out := io.BytesIO())
+        return out.getvalue()
+    lines = ["<fcd-export>"]
+    for i, row in enumerate(table.to_pylist()):
+        if i % 2 == 0:
+            lines.append(f' <timestep time="{row["timestep_time"]:.2f}">')
+        own = {key.removeprefix("vehicle_"): value for key, value in row.items() if key != "timestep_time"}
+        lines.append("  <vehicle " + " ".join(f'{key}="{value}"' for key, value in own.items()) + "/>")
+        if i % 2:
+            lines.append(" </timestep>")
+    return "\n".join([*lines, "</fcd-export>", ""]).encode()
+
+
+def typed(folder: Path) -> None:
+    """A finished file whose sizes stand in a file of vTypes."""
+    made = mini(folder, (_KINDS, ""), ('fcd = "fcd.csv"', 'fcd = "fcd.csv"\nvtypes = ["own.add.xml"]'))
+    (made / "own.add.xml").write_text(VTYPES)
+
+
+# ---- static world
+
+
+def polygons(folder: Path) -> None:
+    """SUMO's polygons."""
+    made = mini(folder, ('footprints = ["statics.geojson"]', 'polygons = ["own.poly.xml"]'))
+    (made / "own.poly.xml").write_text(POLYGONS)
+
+
+def _box():
+    import trimesh
+
+    box = trimesh.creation.box((4.0, 3.0, 6.0))
+    box.apply_translation((16.0, 6.5, 3.0))
+    return box
+
+
+_MTL = b"newmtl wall\nKd 0.5 0.5 0.5\nmap_Kd wall.png\n"
+
+
+def mesh(name: str):
+    """A house as a mesh; its scenario names the file ``name``."""
+
+    def make(folder: Path) -> None:
+        made = mini(folder, ('footprints = ["statics.geojson"]', f'meshes = [{{ file = "{name}" }}]'))
+        box, form = _box(), name.rpartition(".")[2]
+        if form == "obj":
+            corners = "".join(f"v {x} {y} {z}\n" for x, y, z in box.vertices)
+            triangles = "".join(f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in box.faces)
+            (made / name).write_text(f"mtllib house.mtl\no house\n{corners}usemtl wall\n{triangles}")
+            (made / "house.mtl").write_bytes(_MTL)
+        elif form == "gltf":
+            (made / name).write_text(json.dumps(_gltf(box, "house.bin"), indent=1))
+            (made / "house.bin").write_bytes(_buffer(box))
+        elif form == "glb":
+            (made / name).write_bytes(_glb(box))
+        else:
+            box.export(made / name)
+
+    return make
+
+
+def _buffer(box) -> bytes:
+    return box.vertices.astype("<f4").tobytes() + box.faces.astype("<u2").tobytes()
+
+
+def _gltf(box, uri: str) -> dict:
+    points, corners = len(box.vertices), box.faces.size
+    buffer = {"byteLength": len(_buffer(box))} | ({"uri": uri} if uri else {})
+    low, high = (list(map(float, bound)) for bound in box.bounds)
+    return {
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1, "mode": 4}]}], "buffers": [buffer],
+        "bufferViews": [{"buffer": 0, "byteOffset": 0, "byteLength": 12 * points},
+                        {"buffer": 0, "byteOffset": 12 * points, "byteLength": 2 * corners}],
+        "accessors": [{"bufferView": 0, "componentType": 5126, "count": points, "type": "VEC3", "min": low,
+                       "max": high},
+                      {"bufferView": 1, "componentType": 5123, "count": corners, "type": "SCALAR"}],
+    }  # fmt: skip
+
+
+def _glb(box) -> bytes:
+    text, body = json.dumps(_gltf(box, "")).encode(), _buffer(box)
+    text, body = text + b" " * (-len(text) % 4), body + b"\0" * (-len(body) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(body), b"BIN\0") + body
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+# ---- sites, sensors, scans
+
+
+def sites(folder: Path) -> None:
+    """Sites as GeoJSON."""
+    made = mini(folder, ('"sites.csv"', '"sites.geojson"'))
+    (made / "sites.geojson").write_text(GEOJSON_SITES)
+
+
+def beams(folder: Path) -> None:
+    """A sensor with a table of beams."""
+    made = mini(folder, ("elevations_deg = [-15, 5]\nchannels = 8\nazimuth_step_deg = 1.0\n", 'beams = "beams.csv"\n'))
+    (made / "beams.csv").write_text(BEAMS)
+
+
+def _points() -> np.ndarray:
+    """Returns of a scan from (10, 12, 3): the ground along rings."""
+    azimuth = np.deg2rad(np.arange(0, 360, 3))
+    rings = [np.column_stack([10 + r * np.cos(azimuth), 12 + r * np.sin(azimuth), 0 * azimuth]) for r in (6, 9, 14, 25)]
+    return np.round(np.concatenate(rings), 3)
+
+
+def measured(name: str):
+    """A measured empty scan of the only site."""
+
+    def make(folder: Path) -> None:
+        made = mini(folder, ('sensor = "small"', f'sensor = "small"\npoints = "{name}"'))
+        (made / "sites.csv").write_text("".join(SITES.splitlines(keepends=True)[:2]))
+        _write_points(made / name)
+
+    return make
+
+
+def _write_points(path: Path) -> None:
+    points, form = _points(), path.suffix.removeprefix(".")
+    if form in ("las", "laz"):
+        import laspy
+
+        header = laspy.LasHeader(version="1.4", point_format=6)
+        header.scales, header.creation_date = [0.001] * 3, date(2020, 1, 1)
+        cloud = laspy.LasData(header)
+        cloud.x, cloud.y, cloud.z = points.T
+        cloud.write(path)
+        return
+    rows = "".join(f"{x:g},{y:g},{z:g}\n" for x, y, z in points)
+    if form == "csv":
+        path.write_text("x_m,y_m,z_m\n" + rows)
+    elif path.stem == "binary":
+        from pipeline.formats.point_clouds import write_points
+
+        write_points(path, points)
+    elif form == "pcd":
+        fields = "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nCOUNT 1 1 1\n"
+        head = f"{fields}WIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(points)}\nDATA ascii\n"
+        path.write_text(head + rows.replace(",", " "))
+    else:
+        properties = "".join(f"property double {axis}\n" for axis in "xyz")
+        head = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n{properties}end_header\n"
+        path.write_text(head + rows.replace(",", " "))
+
+
+# ---- maps
+
+
+SMALL_OSM = Path(__file__).parents[1] / "importers" / "data" / "small.osm"
+
+
+def extract(name: str):
+    """An extract of a map, beside no scenario."""
+
+    def make(folder: Path) -> None:
+        if name.endswith(".pbf"):
+            from tests.formats.test_osm import pbf_of
+
+            pbf_of(SMALL_OSM, folder / name)
+        elif name.endswith(".gz"):
+            (folder / name).write_bytes(gzip.compress(SMALL_OSM.read_bytes(), mtime=0))
+        else:
+            shutil.copyfile(SMALL_OSM, folder / name)
+
+    return make
+
+
+# ---- what scenarios name beside
+
+
+def heir(folder: Path) -> None:
+    """A scenario that extends another; that other is mutated."""
+    made = mini(folder)
+    (made.parent / "heir").mkdir()
+    (made.parent / "heir" / "scenario.toml").write_text('extends = "../scenario"\n[score]\ngamma = 5\n')
+
+
+def visible(folder: Path) -> None:
+    """Hits of voxels are kept."""
+    mini(folder, ("gamma = 4", 'gamma = 4\nkeep_visibility = "all"'))
+
+
+def plain(folder: Path) -> None:
+    """The scenario as it is."""
+    mini(folder)

@@ -1,0 +1,133 @@
+"""The kinds of files that the program reads: where each lies, which verb reads it, and what it says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from tests.fuzz import bases, meaning
+from tests.fuzz.meaning import Meaning
+
+_RUN = ("run", "scenario", "--out", "out", "--jobs", "1")
+_STUDY = ("accuracy", "scenario", "--out", "out", "--budget", "1s", "--jobs", "1")
+_SCORES = ("out/scores.parquet",)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One kind of file.
+
+    Attributes
+    ----------
+    file
+        What is mutated, in the case's folder; of several files that match, any.
+    make
+        Writes the scenario.
+    meaning
+        Of the file's bytes, read by other code.
+    before
+        Verbs that make what is mutated.
+    verb
+        What reads it.
+    results
+        What the verb writes that must stay the same, or change with the meaning.
+    store
+        Whether there is a store, in the case's folder.
+    names_others
+        Whether a message may name another file: what the mutant names, or what was made of it.
+    may_differ
+        Whether exit code 1 is an answer: files differ.
+    simulated
+        Whether traffic is, of which a scenario promises something.
+    """
+
+    name: str
+    file: str
+    make: Callable[[Path], None]
+    meaning: Meaning
+    before: tuple[tuple[str, ...], ...] = ()
+    verb: tuple[str, ...] = _RUN
+    results: tuple[str, ...] = _SCORES
+    store: bool = False
+    names_others: bool = False
+    may_differ: bool = False
+    simulated: bool = False
+
+
+def _input(name: str, file: str, make: Callable[[Path], None], reads: Meaning, names_others: bool = False) -> Kind:
+    """A file in the scenario's folder, and a whole run."""
+    return Kind(name, f"scenario/{file}", make, reads, names_others=names_others)
+
+
+def _simulated(name: str, file: str, make: Callable[[Path], None], names_others: bool = False) -> Kind:
+    """What SUMO reads a copy of."""
+    reads = meaning.gzipped(meaning.xml)
+    return Kind(name, f"scenario/{file}", make, reads, names_others=names_others, simulated=True)
+
+
+def _artefact(name: str, verb: str) -> Kind:
+    """What a run has written, read by one verb."""
+    make = bases.visible if name.startswith("visibility") else bases.plain
+    verbs = _RUN if verb == "run" else (verb, "scenario", "--out", "out")
+    return Kind(f"{name} {verb}", f"out/{name}", make, meaning.nothing_else, (_RUN,), verbs)
+
+
+def _new(name: str, reads: Meaning) -> Kind:
+    """A map that becomes a scenario."""
+    made = tuple(f"made/{file}" for file in ("network.net.xml", "sites.csv", "statics.geojson"))
+    return Kind(f"new {name}", name, bases.extract(name), reads, verb=("new", "made", "--osm", name), results=made)
+
+
+_ALL = (
+    _input("scenario.toml", "scenario.toml", bases.plain, meaning.toml, True),
+    Kind("extended scenario.toml", "scenario/scenario.toml", bases.heir, meaning.toml,
+         verb=("run", "heir", "--out", "out", "--jobs", "1"), names_others=True),
+    _simulated("net.xml", "net.net.xml", bases.drawn), _simulated("net.xml.gz", "net.net.xml.gz", bases.drawn_gz),
+    _simulated("rou.xml", "own.rou.xml", bases.routed), _simulated("sumocfg", "own.sumocfg", bases.configured, True),
+    _simulated("add.xml", "own.add.xml", bases.configured),
+    *(_input(f"fcd.{form}", f"fcd.{form}", bases.finished(form), reads) for form, reads in (
+        ("csv", meaning.gzipped(meaning.semicolons)), ("csv.gz", meaning.gzipped(meaning.semicolons)),
+        ("xml", meaning.gzipped(meaning.xml)), ("xml.gz", meaning.gzipped(meaning.xml)),
+        ("parquet", meaning.gzipped(meaning.parquet)), ("parquet.gz", meaning.gzipped(meaning.parquet)))),
+    _input("vtypes.xml", "own.add.xml", bases.typed, meaning.gzipped(meaning.xml)),
+    _input("statics.geojson", "statics.geojson", bases.plain, meaning.text_json),
+    _input("poly.xml", "own.poly.xml", bases.polygons, meaning.gzipped(meaning.xml)),
+    _input("mesh.obj", "house.obj", bases.mesh("house.obj"), meaning.obj),
+    _input("mesh.mtl", "house.mtl", bases.mesh("house.obj"), meaning.bytes_themselves),
+    _input("mesh.gltf", "house.gltf", bases.mesh("house.gltf"), meaning.text_json, True),
+    _input("mesh.bin", "house.bin", bases.mesh("house.gltf"), meaning.bytes_themselves, True),
+    _input("mesh.glb", "house.glb", bases.mesh("house.glb"), meaning.glb),
+    _input("mesh.stl", "house.stl", bases.mesh("house.stl"), meaning.stl),
+    _input("mesh.ply", "house.ply", bases.mesh("house.ply"), meaning.ply),
+    _input("sites.csv", "sites.csv", bases.plain, meaning.rows),
+    _input("sites.geojson", "sites.geojson", bases.sites, meaning.text_json),
+    _input("beams.csv", "beams.csv", bases.beams, meaning.rows),
+    _input("scan.csv", "points.csv", bases.measured("points.csv"), meaning.rows),
+    _input("scan.las", "points.las", bases.measured("points.las"), meaning.bytes_themselves),
+    _input("scan.laz", "points.laz", bases.measured("points.laz"), meaning.bytes_themselves),
+    _input("scan.ply", "points.ply", bases.measured("points.ply"), meaning.ply),
+    _input("scan.ply binary", "binary.ply", bases.measured("binary.ply"), meaning.ply),
+    _input("scan.pcd", "points.pcd", bases.measured("points.pcd"), meaning.pcd),
+    _input("scan.pcd binary", "binary.pcd", bases.measured("binary.pcd"), meaning.pcd),
+    _new("map.osm", meaning.gzipped(meaning.xml)), _new("map.osm.gz", meaning.gzipped(meaning.xml)),
+    _new("map.osm.pbf", meaning.bytes_themselves),
+    *(_artefact(name, verb) for name, verb in (
+        ("trajectories.parquet", "tpog"), ("statics.ply", "scan"), ("tpog.parquet", "score"),
+        ("scans.parquet", "score"), ("scores.parquet", "report"), ("blindspots.parquet", "report"),
+        ("visibility.parquet", "run"), ("statics.ply", "run"), ("trajectories.parquet", "run"))),
+    Kind("run.json run", "out/run.json", bases.plain, meaning.text_json, (_RUN,)),
+    Kind("run.json verify", "out/run.json", bases.plain, meaning.text_json, (_RUN,), ("verify", "out"), (".out",),
+         names_others=True, may_differ=True),
+    Kind("run.json compare", "out/run.json", bases.plain, meaning.text_json,
+         (_RUN, ("run", "scenario", "--out", "other", "--jobs", "1")), ("compare", "out", "other"), (".out",),
+         names_others=True),
+    Kind("store note", "store/*/entry.json", bases.plain, meaning.nothing_else,
+         (("run", "scenario", "--out", "first", "--jobs", "1"),), store=True),
+    Kind("study cache", "out/accuracy/**/*.json", bases.plain, meaning.nothing_else, (_STUDY,), _STUDY, (), store=True),
+    Kind("store artefact", "store/*/*.p*", bases.plain, meaning.nothing_else,
+         (("run", "scenario", "--out", "first", "--jobs", "1"),), store=True),
+)  # fmt: skip
+
+KINDS = {kind.name: kind for kind in _ALL}
+"""By name."""

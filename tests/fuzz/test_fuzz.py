@@ -1,0 +1,104 @@
+"""A small fixed slice of the fuzzer, and what it is that it can tell.
+
+The fuzzer runs in a process of its own, since it forks: ``make fuzz`` is the same with more cases.
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+import random
+from pathlib import Path
+
+import pytest
+
+from tests.fuzz import meaning
+from tests.fuzz.kinds import KINDS
+from tests.fuzz.mutating import mutant
+from tests.processes import python
+
+SLICE = "fcd.csv.gz,statics.geojson,sites.csv,scan.pcd binary,beams.csv,tpog.parquet score"
+FUZZ = "import sys; from tests.fuzz.__main__ import main; sys.exit(main())"
+
+
+def test_there_are_kinds_enough_and_each_has_its_own_file() -> None:
+    assert len(KINDS) >= 29
+    assert len({(kind.make, kind.file, kind.verb) for kind in KINDS.values()}) == len(KINDS)
+
+
+@pytest.mark.system
+@pytest.mark.slow
+def test_mutants_of_some_kinds_fare_well(tmp_path: Path) -> None:
+    """And a second call has nothing left to do."""
+    options = ("--cases", 18, "--seed", 11, "--kinds", SLICE, "--keep", tmp_path)
+    done = python(FUZZ, *options)
+    assert done.returncode == 0, done.stdout + done.stderr
+    lines = [json.loads(line) for line in (tmp_path / "results.jsonl").read_text().splitlines()]
+    assert len(lines) == 18 and {line["kind"] for line in lines} == set(SLICE.split(","))
+    assert {line["verdict"] for line in lines} >= {"refused", "legal"}
+    assert [path.name for path in tmp_path.iterdir()] == ["results.jsonl"]
+
+
+FAULTS = {
+    "traceback": "raise ZeroDivisionError",
+    "signal 6": "os.abort()",
+    "exit code 1": "sys.exit(1)",
+    "memory": "bytearray(b'1') * (600 << 20)",
+    "out of time": "while True: pass",
+    "file not named": "sys.exit(2)",
+    "result unreadable": "[path.write_bytes(b'') for path in pathlib.Path('out').glob('*.parquet')]",
+}
+
+
+@pytest.mark.system
+def test_faults_are_told(tmp_path: Path) -> None:
+    """A program that does what it should not gets the verdict that it deserves."""
+    code = f"""
+import os, pathlib, sys
+from pathlib import Path
+import pipeline.cli.app
+from tests.fuzz import cases
+from tests.fuzz.kinds import KINDS
+cases.MOST_BYTES = 1 << 29
+bench = cases.Bench(KINDS["sites.csv"], Path({str(tmp_path)!r}) / "bench")
+cases.MOST_SECONDS = 0.5
+for fault, line in {FAULTS!r}.items():
+    def main(): exec(line)
+    pipeline.cli.app.main = main
+    verdict = bench.judge(bench.files[0], b"site,x_m,y_m,z_m\\n")
+    assert verdict.name == fault, (fault, verdict)
+"""
+    done = python(code)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.system
+def test_killed_runs_come_to_the_same_bytes() -> None:
+    """One that is killed with all its processes, and one that is killed alone."""
+    done = python(FUZZ, "--kills", 2)
+    assert (done.returncode, done.stdout) == (0, "2 kills: 2 same bytes\n"), done.stderr
+
+
+def test_a_seed_gives_the_same_mutants() -> None:
+    """And never the file as it was."""
+    for data in (b"", b"a,b\n1,2\n", gzip.compress(b"<a b='1'/>", mtime=0), bytes(range(256))):
+        one, again = ([mutant(random.Random(f"x{case}"), data) for case in range(40)] for _ in range(2))
+        assert one == again
+        assert data not in one
+
+
+@pytest.mark.parametrize(
+    ("reader", "one", "same", "other", "damaged"),
+    [
+        (meaning.xml, b"<a x='1' y='2'/>", b'<a y="2" x="1"></a>', b"<a x='1' y='3'/>", b"<a x='1'>"),
+        (meaning.text_json, b'{"a": 1, "b": 2}', b'{"b":2,"a":1}', b'{"a": 1, "b": 3}', b'{"a": 1, "a": 1}'),
+        (meaning.rows, b"a,b\n1,2\n", b"a, b\r\n1,2", b"a,b\n1,3\n", b"a,b\n1\n"),
+        (meaning.toml, b"a = 1\nb = 2", b"b = 2\na = 1 # one", b"a = 1", b"a = "),
+        (meaning.obj, b"v 0 0 0\nf 1 1 1", b"# one\nv 0 0.0 0\nf 1//1 1 1", b"v 0 0 1\nf 1 1 1", b"v 0 0 0\nf 1 2 3"),
+    ],
+)
+def test_meaning(reader: meaning.Meaning, one: bytes, same: bytes, other: bytes, damaged: bytes) -> None:
+    assert reader(one) == reader(same)
+    assert reader(one) != reader(other)
+    with pytest.raises(meaning.DAMAGED):
+        reader(damaged)
