@@ -45,7 +45,8 @@ _LONGEST_MESSAGE = 4000
 _ROW = re.compile(r"site '?pole_|site '?c\d")
 """A message may name a row, a site, in place of the file that it stands in."""
 
-_SCORES = ("egvs", "egvs_limit", "rank", "entropy_seen", "expected_detections", "points_on_target", "seen_well")
+_SCORES = ("egvs", "egvs_limit", "rank", "entropy_seen")
+_OF_VEHICLES = ("expected_detections", "points_on_target", "seen_well")
 WELL = ("refused", "same", "legal", "unkept")
 
 
@@ -240,10 +241,14 @@ def _fault_of(ended: Ended) -> Verdict | None:
 
 
 def _has_nan(outcome: Sequence[object]) -> bool:
-    """Whether a score is no number; nobody knows the standard errors of some."""
-    tables = [table for table in outcome if isinstance(table, dict)]
-    values = [v for table in tables for name, column in table.items() if name in _SCORES for v in column]
-    return any(isinstance(value, float) and not math.isfinite(value) for value in values)
+    """Whether a score is no number. Means over vehicles are none where no vehicle is in the region, and no site best,
+    as the run says then."""
+    for table in (table for table in outcome if isinstance(table, dict)):
+        scores = [*_SCORES, *(_OF_VEHICLES if any(table["egvs"]) else ())]
+        values = [value for name in scores for value in table.get(name, ())]
+        if any(isinstance(value, float) and not math.isfinite(value) for value in values):
+            return True
+    return False
 
 
 def warm_up(folder: Path) -> None:
