@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NoReturn
 
-from pipeline.core.errors import EgvsError, InputError
+from pipeline.core.errors import EgvsError, InputError, cut
 from pipeline.core.files import FULL
 from pipeline.core.findings import FindingsError
 
@@ -114,5 +114,5 @@ def _drop(stream: object) -> None:
 
 
 def _fail(message: str, code: int) -> NoReturn:
-    print(f"egvs: {message}", file=sys.stderr)
+    print(f"egvs: {cut(message)}", file=sys.stderr)
     sys.exit(code)
