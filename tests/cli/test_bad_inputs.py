@@ -304,7 +304,7 @@ COMMANDS = {
         r"--set traffic.kinds.tram.share=1: no row 'tram'; one of car, or a number from 0",
     ),
     "a name of 5,000 characters": (
-        ["check", "{mini}", "--set", f'traffic.fcd="{"x" * 5000}"'],
+        ["run", "{mini}", "--set", f'traffic.fcd="{"x" * 5000}"'],
         r"traffic.fcd = 'x+ \.\.\. \([0-9,]+ characters\) \.\.\. x+': is too long for a path",
     ),
     "a size without end": (
