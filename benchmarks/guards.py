@@ -1,20 +1,21 @@
 """What does it cost a plain run that other people's files are not trusted?
 
-``python -m benchmarks.guards [TURNS]`` runs the shipped junction whole, in fresh folders and without a store, in turn
-with everything that stands between files and SUMO, and without: files are copied unread, SUMO is started as it is,
-neither inputs among what is written nor the ends of SUMO's files are looked for. Processor seconds of this process and
-of SUMO; about a minute.
+``python -m benchmarks.guards`` runs the shipped junction whole, in a fresh folder and without a store, and adds up the
+processor time of what stands between files and SUMO: inputs are looked for among what is written, files are read before
+they are copied, SUMO is started by a launcher that confines it, and its files are checked for their end. What a start
+costs is measured apart, with a program that does nothing. Shares of one run, so that a busy machine matters little.
 """
 
 from __future__ import annotations
 
 import os
 import resource
-import shutil
 import statistics
 import subprocess
 import sys
 import tempfile
+import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -24,72 +25,82 @@ from unittest.mock import patch
 import pipeline
 from pipeline.runs import workflow
 from pipeline.traffic import recording, sumo
-from pipeline.traffic.guarded import copies
+from pipeline.traffic.guarded import confined, copies
 
 SCENARIO = Path(__file__).resolve().parent.parent / "scenarios" / "nishishinjuku"
-TURNS, MOST = 7, 1.03
+STARTS, MOST = 15, 0.03
+GUARDS = {
+    "inputs looked for": (workflow, "keep_inputs"),
+    "files read before they are copied": (copies, "copy"),
+    "ends of SUMO's files": (recording, "check_whole"),
+}
+START = "launcher of SUMO"
 
 
 def rows() -> list[tuple[str, str, str, bool]]:
-    """What guards cost, as a ratio; what is wanted; and whether it is so."""
-    ratio = statistics.median(ratios(TURNS))
-    return [("a plain run, guarded : without guards", f"{ratio:.3f}", f"<= {MOST}", ratio <= MOST)]
+    """What guards cost, as a share of a run; what is wanted; and whether it is so."""
+    spent_s, whole_s = run(SCENARIO)
+    share = sum(spent_s.values()) / whole_s
+    return [("guards, share of a plain run", f"{share:.2%}", f"<= {MOST:.0%}", share <= MOST)]
 
 
-def ratios(turns: int) -> list[float]:
-    """Processor seconds of a run with guards as shares of those of one without, turn by turn; which goes first
-    changes."""
-    once()  # compiled, and loaded
-    found = []
-    for turn in range(turns):
-        if turn % 2:
-            plain_s, guarded_s = once(without_guards), once()
-        else:
-            guarded_s, plain_s = once(), once(without_guards)
-        found.append(guarded_s / plain_s)
-    return found
-
-
-def once(guards: Callable[[], Any] = ExitStack) -> float:
-    """Processor seconds of a whole run."""
-    with tempfile.TemporaryDirectory() as folder, patch.dict(os.environ, EGVS_STORE=""), guards():
-        before = _busy_s()
-        pipeline.run(pipeline.load(SCENARIO), Path(folder) / "run", jobs=1)
-        return _busy_s() - before
+def run(scenario: Path) -> tuple[dict[str, float], float]:
+    """Processor seconds of each guard in a whole run, and of the run; kernels were compiled before."""
+    for _ in range(2):
+        with tempfile.TemporaryDirectory() as folder, patch.dict(os.environ, EGVS_STORE=""), accounted() as spent_s:
+            before_s = _busy_s()
+            pipeline.run(pipeline.load(scenario), Path(folder) / "run", jobs=1)
+            whole_s = _busy_s() - before_s
+    return spent_s, whole_s
 
 
 @contextmanager
-def without_guards() -> Iterator[None]:
-    """No guard is at work within the block."""
+def accounted() -> Iterator[dict[str, float]]:
+    """Processor seconds of each guard within the block, filled as they are spent."""
+    spent_s = defaultdict[str, float](float)
 
-    @contextmanager
-    def started(
-        command: Sequence[str], folder: Path, printed: Any, complaints: Any
-    ) -> Iterator[subprocess.Popen[bytes]]:
-        with subprocess.Popen(
-            command, cwd=folder, env=sumo.environment(), stdin=subprocess.DEVNULL, stdout=printed, stderr=complaints
-        ) as process:
-            yield process
+    def timed(name: str, guard: Callable[..., Any]) -> Callable[..., Any]:
+        def work(*arguments: Any) -> Any:
+            start_s = time.process_time()
+            try:
+                return guard(*arguments)
+            finally:
+                spent_s[name] += time.process_time() - start_s
 
-    def copied(path: Path, to: Path) -> list[str]:
-        shutil.copyfile(path, to)
-        return []
+        return work
 
-    with (
-        patch.object(sumo, "_started", started),
-        patch.object(copies, "copy", copied),
-        patch.object(recording, "check_whole", lambda prepared: None),
-        patch.object(workflow, "keep_inputs", lambda scenario, folder: None),
-    ):
-        yield
+    one_s, started = launcher_s(), sumo._started
+
+    def counted(command: Sequence[str], *more: Any) -> Any:
+        spent_s[START] += one_s
+        return started(command, *more)
+
+    with ExitStack() as patches:
+        for name, (module, guard) in GUARDS.items():
+            patches.enter_context(patch.object(module, guard, timed(name, getattr(module, guard))))
+        patches.enter_context(patch.object(sumo, "_started", counted))
+        yield spent_s
 
 
-def _busy_s() -> float:
-    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+def launcher_s() -> float:
+    """Processor seconds that a start by the launcher takes more than one without it."""
+    program, launcher = ["/bin/true"], [sys.executable, "-I", "-S", confined.__file__, os.curdir, str(os.getpid())]
+    taken: dict[bool, list[float]] = {False: [], True: []}
+    for _ in range(STARTS):
+        for by_launcher, several in taken.items():
+            before_s = _busy_s(resource.RUSAGE_CHILDREN)
+            subprocess.run([*launcher, *program] if by_launcher else program, stdin=subprocess.DEVNULL, check=True)
+            several.append(_busy_s(resource.RUSAGE_CHILDREN) - before_s)
+    return statistics.median(taken[True]) - statistics.median(taken[False])
+
+
+def _busy_s(*whose: int) -> float:
+    used = [resource.getrusage(who) for who in whose or (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(its.ru_utime + its.ru_stime for its in used)
 
 
 if __name__ == "__main__":
-    every = ratios(int(sys.argv[1]) if len(sys.argv) > 1 else TURNS)
-    least, median, most = min(every), statistics.median(every), max(every)
-    print(f"guarded : without guards, {len(every)} turns: {least:.3f}, {median:.3f}, {most:.3f}")
+    found_s, all_s = run(SCENARIO)
+    for what, seconds in found_s.items():
+        print(f"{1000 * seconds:8.1f} ms  {seconds / all_s:7.3%}  {what}")
+    print(f"{1000 * sum(found_s.values()):8.1f} ms  {sum(found_s.values()) / all_s:7.3%}  of {all_s:.1f} s in all")

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NoReturn
 
-from pipeline.core.errors import EgvsError, InputError
+from pipeline.core.errors import EgvsError, InputError, cut
 from pipeline.core.files import FULL
 from pipeline.core.findings import FindingsError
 
@@ -60,14 +60,15 @@ def told() -> Iterator[None]:
 def of_system(error: OSError) -> tuple[str, int]:
     """The message and the exit code of what the system has against a file."""
     what = error.strerror or str(error)
+    name = os.fsdecode(error.filename) if isinstance(error.filename, str | bytes) else None
     if error.errno in FULL:
         what = os.strerror(error.errno)  # Arrow says more, and less clearly
-        places = [Path(os.fsdecode(error.filename))] if error.filename else [Path.cwd(), Path(tempfile.gettempdir())]
+        places = [Path(name)] if name else [Path.cwd(), Path(tempfile.gettempdir())]
         room = ", ".join(f"{_room_mb(place):,.1f} MB are free in {_there(place)}" for place in places)
-        return f"{places[0] if error.filename else 'standard output, or a file'}: {what} ({room})", _FAILED
-    if error.filename is not None and isinstance(error, _USERS):
-        return f"{error.filename}: {what}", InputError.exit_code
-    return f"{error.filename or 'system'}: {what}", _FAILED
+        return f"{name or 'standard output, or a file'}: {what} ({room})", _FAILED
+    if name is not None and isinstance(error, _USERS):
+        return f"{name}: {what}", InputError.exit_code
+    return f"{name or 'system'}: {what}", _FAILED
 
 
 def _there(path: Path) -> Path:
@@ -113,5 +114,5 @@ def _drop(stream: object) -> None:
 
 
 def _fail(message: str, code: int) -> NoReturn:
-    print(f"egvs: {message}", file=sys.stderr)
+    print(f"egvs: {cut(message)}", file=sys.stderr)
     sys.exit(code)

@@ -26,7 +26,7 @@ from pipeline.core.errors import InputError
 FULL = (errno.ENOSPC, errno.EDQUOT)
 """What the system says where a disk, or a user's share of it, is full."""
 
-_SCRATCH = "egvs-work-"
+_SCRATCH, _CHANCES = "egvs-work-", 10
 
 
 @contextmanager
@@ -61,16 +61,17 @@ def scratch() -> Iterator[Path]:
     """A folder for work in the system's temporary directory; removed at the end, those of killed programs at once."""
     parent = Path(tempfile.gettempdir())
     _clear(parent)
-    while True:
+    for chances in reversed(range(_CHANCES)):
         with tempfile.TemporaryDirectory(prefix=_SCRATCH, dir=parent, ignore_cleanup_errors=True) as name:
             held = _held(Path(name))
-            if held is None:  # another program took it for one that was left, before it was held
+            if held is None and chances:  # another program took it for one that was left, before it was held
                 continue
             try:
                 with naming(Path(name)):
                     yield Path(name)
             finally:
-                os.close(held)
+                if held is not None:  # there is nothing that could hold it on a disk that knows no locks
+                    os.close(held)
             return
 
 

@@ -92,8 +92,10 @@ def _header(place: str, data: bytes) -> tuple[dict[str, list[str]], int, int]:
         if start >= len(data):
             raise InputError(place, "is not a whole PCD file (no line DATA in its header)", "a PCD file, version 0.7")
         end = data.find(b"\n", start) % (len(data) + 1)  # -1, no further line end, becomes the file's end
-        words = data[start:end].decode("latin-1").split()
+        words = (line := data[start:end].decode("latin-1")).split()
         if words and not words[0].startswith("#"):
+            if not (line.isascii() and line.replace("\t", " ").rstrip("\r").isprintable()):
+                raise InputError(f"{place}: line {lines + 1}", f"{line[:80]!r} is no text", "a whole PCD file")
             header[words[0]] = words[1:]
         start, lines = end + 1, lines + 1
     return header, start, lines

@@ -32,6 +32,7 @@ from pipeline.scenario.validation import ValidationModel
 
 FILE = "scenario.toml"
 _SUMO = "$SUMO_HOME/"
+_LONGEST_NAME = 1000
 
 
 class RoiModel(StrictModel):
@@ -326,6 +327,8 @@ class Scenario(StrictModel):
         InputError when it is not there, or may not be read.
         """
         folders = (sumo_home(),) if name.startswith(_SUMO) else self._folders
+        if len(name) > _LONGEST_NAME:
+            raise InputError(f"{self.file}: {key} = {name!r}", "is too long for a path", "the path of a file")
         for folder in folders:
             if (path := folder / name.removeprefix(_SUMO)).is_file():
                 if os.access(path, os.R_OK):

@@ -98,19 +98,21 @@ class _Cutter:
         check_span(self.window, self.last_ms - self.first_ms, self.step_ms, self.time_steps, self.place)
 
 
-def check_span(window: Window, lasts_ms: int, step_ms: int, time_steps: int, place: str) -> None:
+def check_span(
+    window: Window, lasts_ms: int, step_ms: int, time_steps: int, place: str, file: str = "the file"
+) -> None:
     """InputError where a file does not hold a window's frames.
 
     Its ``time_steps`` are multiples of ``step_ms`` apart; it ends ``lasts_ms`` after the first frame.
     """
     if step_ms and window.period_ms % step_ms:
-        what = f"the file's time steps are {step_ms / 1000:g} s apart"
+        what = f"{file}'s time steps are {step_ms / 1000:g} s apart"
         raise InputError(f"{place}: frame_period_s = {window.period_ms / 1000:g}", what, "a multiple of that")
     there = max(0, lasts_ms // window.period_ms + 1)
     if there < window.count:
         raise InputError(
             f"{place}: frames = {window.count}",
-            f"the file has {there} frames {window.period_ms / 1000:g} s apart after a warm-up of"
+            f"{file} has {there} frames {window.period_ms / 1000:g} s apart after a warm-up of"
             f" {window.skip_ms / 1000:g} s ({time_steps} time steps in all)",
             f"at most {there} frames, or a shorter warmup_s",
         )

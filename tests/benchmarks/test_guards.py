@@ -1,4 +1,4 @@
-"""Are the guards on in one of the two runs that are compared, and off in the other?"""
+"""Is what guards cost added up, and do they guard while it is?"""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-import pipeline
 from benchmarks import guards
 from pipeline.core.errors import InputError
 from pipeline.traffic import sumo
@@ -14,24 +13,16 @@ from pipeline.traffic.guarded import copies
 
 
 @pytest.mark.system
-def test_guards_are_off_within_the_block_alone(tmp_path: Path) -> None:
-    own = tmp_path / "own"
-    own.mkdir()
+def test_guards_work_while_their_time_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(guards, "launcher_s", lambda: 2.0)
     (tmp_path / "a.xml").write_text("<additional><include href='b'/></additional>")
-    with guards.without_guards():
-        assert copies.copy(tmp_path / "a.xml", tmp_path / "b.xml") == []
-        with sumo._started(["/bin/sh", "-c", "exit 0"], own, None, None) as process:
-            assert process.args[0] == "/bin/sh"
-    with pytest.raises(InputError, match="a further file"):
-        copies.copy(tmp_path / "a.xml", tmp_path / "b.xml")
-    with sumo._started(["/bin/sh", "-c", "exit 0"], own, None, None) as process:
-        assert process.args[0] != "/bin/sh"
-
-
-@pytest.mark.system
-def test_both_runs_make_the_same(mini: Path, tmp_path: Path) -> None:
-    pipeline.run(pipeline.load(mini), tmp_path / "guarded")
-    with guards.without_guards():
-        pipeline.run(pipeline.load(mini), tmp_path / "plain")
-    for name in ("trajectories.parquet", "scores.parquet"):
-        assert (tmp_path / "guarded" / name).read_bytes() == (tmp_path / "plain" / name).read_bytes()
+    with guards.accounted() as spent_s:
+        with pytest.raises(InputError, match="a further file"):
+            copies.copy(tmp_path / "a.xml", tmp_path / "b.xml")
+        for _ in range(3):
+            with sumo._started(["/bin/sh", "-c", "exit 0"], tmp_path, None, None) as process:
+                assert "confined.py" in str(process.args)
+    assert spent_s[guards.START] == 6.0
+    assert spent_s["files read before they are copied"] > 0.0
+    with sumo._started(["/bin/sh", "-c", "exit 0"], tmp_path, None, None):
+        assert spent_s[guards.START] == 6.0

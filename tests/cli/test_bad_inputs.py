@@ -303,6 +303,10 @@ COMMANDS = {
         ["run", "{mini}", "--set", "traffic.kinds.tram.share=1"],
         r"--set traffic.kinds.tram.share=1: no row 'tram'; one of car, or a number from 0",
     ),
+    "a name of 5,000 characters": (
+        ["run", "{mini}", "--set", f'traffic.fcd="{"x" * 5000}"'],
+        r"traffic.fcd = 'x+ \.\.\. \([0-9,]+ characters\) \.\.\. x+': is too long for a path",
+    ),
     "a size without end": (
         ["run", "{mini}", "--set", "roi.size_m=[1e308,20,5]"],
         r"roi.voxel_m: 0.5 m gives more than 1e\+300 x 40 x 10 = more than 1e\+300 voxels; .* EGVS_MAX_VOXELS=...",

@@ -82,10 +82,11 @@ def test_a_full_disk_is_told_with_the_file_and_the_room(tmp_path: Path) -> None:
         (errno.EISDIR, "a.csv", 2, "a.csv: Is a directory"),
         (errno.ENOENT, "a.csv", 2, "a.csv: No such file or directory"),
         (errno.EIO, "a.csv", 1, "a.csv: Input/output error"),
+        (errno.EBADF, 7, 1, "system: Bad file descriptor"),
         (errno.ENOENT, None, 1, "system: No such file or directory"),
     ],
 )
-def test_what_a_user_can_put_right_is_wrong_input(number: int, name: str | None, code: int, message: str) -> None:
+def test_what_a_user_can_put_right_is_wrong_input(number: int, name: str | int | None, code: int, message: str) -> None:
     error = OSError(number, os.strerror(number)) if name is None else OSError(number, os.strerror(number), name)
     assert ending.of_system(error) == (message, code)
 

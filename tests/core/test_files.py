@@ -70,3 +70,13 @@ with files.scratch() as folder:
             assert mine.is_dir() and other.is_dir(), "one that is held stays"
     assert {path.name for path in tmp_path.iterdir()} == {"egvs-work-link", "elsewhere"}
     files._clear.cache_clear()
+
+
+def test_where_nothing_can_be_locked_there_are_folders_for_work_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    def unknown(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(files.fcntl, "flock", unknown)
+    with files.scratch() as folder:
+        assert folder.is_dir()
+    assert not folder.exists()

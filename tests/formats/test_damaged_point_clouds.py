@@ -47,6 +47,7 @@ OTHER_COLUMNS = r"has no single column 'x_m' \(its columns: x, y_m, z_m\); a hea
         # PCD, header
         ("a.pcd", "", r"a\.pcd: is not a whole PCD file \(no line DATA in its header\)"),
         ("a.pcd", ASCII_PCD[:40], "is not a whole PCD file"),
+        ("a.pcd", "VERSION\x00\x80 7\n" + ASCII_PCD, r"a\.pcd: line 1: .VERSION.x00.x80 7. is no text"),
         ("a.pcd", ASCII_PCD.replace("FIELDS x y z\n", ""), "its PCD header has no line FIELDS"),
         ("a.pcd", ASCII_PCD.replace("x y z", "x y zz"), r"has no single field 'z' \(its fields: x y zz\); x, y and z"),
         ("a.pcd", ASCII_PCD.replace("x y z", "x x z"), "has no single field 'x'"),

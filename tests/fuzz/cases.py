@@ -45,7 +45,9 @@ _LONGEST_MESSAGE = 4000
 _ROW = re.compile(r"site '?pole_|site '?c\d")
 """A message may name a row, a site, in place of the file that it stands in."""
 
-_SCORES = ("egvs", "egvs_limit", "rank", "entropy_seen", "expected_detections", "points_on_target", "seen_well")
+_SCORES = ("egvs", "egvs_limit", "rank", "entropy_seen")
+_NO_VEHICLE = ("no vehicle in the region", "so none is best")
+_OF_VEHICLES = ("expected_detections", "points_on_target", "seen_well")
 WELL = ("refused", "same", "legal", "unkept")
 
 
@@ -179,7 +181,7 @@ class Bench:
     def _answer(self, ended: Ended, file: Path, data: bytes) -> Verdict:
         last = next((line for line in reversed(ended.err.splitlines()) if line.strip()), "")
         if ended.code == 0 or (ended.code == 1 and self.kind.may_differ and not ended.err):
-            return self._ranking(file, data)
+            return self._ranking(ended, file, data)
         if ended.code == 1 and self.kind.simulated and last.startswith("egvs: scenario/scenario.toml: traffic"):
             return self._if_it_says_something_else(file, data, Verdict("unkept", last[:300]))
         if ended.code != 2:
@@ -191,14 +193,14 @@ class Bench:
             return Verdict("file not named", (last or ended.out)[:300])
         return Verdict("refused", (last or ended.out)[:300])
 
-    def _ranking(self, file: Path, data: bytes) -> Verdict:
+    def _ranking(self, ended: Ended, file: Path, data: bytes) -> Verdict:
         try:
             outcome = self._outcome_of(self._case)
         except DAMAGED as error:
             return Verdict("result unreadable", repr(error)[:300])
         if repr(outcome) == repr(self._outcome):  # in which nan is nan
             return Verdict("same")
-        if _has_nan(outcome):
+        if _has_nan(outcome, ended.out):
             return Verdict("NaN score", repr(outcome)[:300])
         return self._if_it_says_something_else(file, data, Verdict("legal"))
 
@@ -239,10 +241,11 @@ def _fault_of(ended: Ended) -> Verdict | None:
     return None
 
 
-def _has_nan(outcome: Sequence[object]) -> bool:
-    """Whether a score is no number; nobody knows the standard errors of some."""
+def _has_nan(outcome: Sequence[object], out: str) -> bool:
+    """Whether a score is no number; means over vehicles are none where the run says that there is no vehicle."""
+    names = _SCORES if any(said in out for said in _NO_VEHICLE) else (*_SCORES, *_OF_VEHICLES)
     tables = [table for table in outcome if isinstance(table, dict)]
-    values = [v for table in tables for name, column in table.items() if name in _SCORES for v in column]
+    values = [value for table in tables for name in names for value in table.get(name, ())]
     return any(isinstance(value, float) and not math.isfinite(value) for value in values)
 
 

@@ -206,8 +206,8 @@ def test_vtypes_act_on_a_finished_file_alone(mini: Path) -> None:
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("traffic.frames=400", r"frames = 400: the file has 40 frames 0\.5 s apart"),
-        ("traffic.frame_period_s=0.75", r"frame_period_s = 0\.75: the file's time steps are 0\.5 s apart"),
+        ("traffic.frames=400", r"frames = 400: fcd\.csv has 40 frames 0\.5 s apart"),
+        ("traffic.frame_period_s=0.75", r"frame_period_s = 0\.75: fcd\.csv's time steps are 0\.5 s apart"),
         ("traffic.warmup_s=20", r"warmup_s = 20: fcd\.csv lasts 19\.5 s"),
     ],
 )

@@ -121,7 +121,7 @@ BAD = {
         write("f.csv", f"{FCD}\n0;v;1;2;3;car\n1;v;1;2;3;car\n"),
         {"fcd": "f.csv", "frames": 9, "warmup_s": 0, "frame_period_s": 1},
         InputError,
-        r"frames = 9: the file has 2 frames",
+        r"frames = 9: \S+ has 2 frames",
     ),
 }
 

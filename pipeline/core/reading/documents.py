@@ -19,6 +19,7 @@ from pipeline.core.reading.refusing import why
 DEEPEST = 100
 """Tables and lists in one another; of what is read here, none needs ten."""
 
+_MOST_DIGITS = 300
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 
 
@@ -28,7 +29,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     try:
         values = tomllib.loads(data.decode("utf-8").replace("\r\n", "\n").replace("\r", "\n"))
         check_depth(values)
-        json.dumps(values, default=str)  # an integer in hexadecimal digits may be too long to be written
+        _check_digits(values)
     except (ValueError, RecursionError, MemoryError) as error:
         raise InputError(path, f"is not valid TOML: {_said(error)}", "a whole TOML file, in UTF-8") from None
     return values
@@ -38,7 +39,7 @@ def toml_value(text: str) -> Any:
     """A single value as TOML writes it; ValueError where it is none."""
     value = tomllib.loads(f"v = {text}")["v"]
     check_depth(value)
-    json.dumps(value, default=str)
+    _check_digits(value)
     return value
 
 
@@ -54,7 +55,7 @@ def read_json(path: Path, right: str = "a whole JSON file, in UTF-8", limit: lim
 def json_value(data: bytes) -> Any:
     """The value of JSON in UTF-8; ValueError, or RecursionError, where it is none."""
     text = data.decode("utf-8-sig")
-    value = json.loads(text, object_pairs_hook=_once)
+    value = json.loads(text, object_pairs_hook=_once, parse_int=_whole_number)
     check_depth(value)
     if _SURROGATE.search(text):
         json.dumps(value, ensure_ascii=False).encode("utf-8")
@@ -69,6 +70,18 @@ def check_depth(value: Any) -> None:
         if not level:
             return
     raise ValueError(f"it is nested more than {DEEPEST} deep")
+
+
+def _check_digits(value: Any) -> None:
+    """ValueError where an integer has too many digits; in hexadecimal ones Python reads any number."""
+    json.loads(json.dumps(value, default=str), parse_int=_whole_number)
+
+
+def _whole_number(digits: str) -> int:
+    """An integer that a float can be made of."""
+    if len(digits) > _MOST_DIGITS:
+        raise ValueError("a number has too many digits")
+    return int(digits)
 
 
 def _parts(value: Any) -> list[Any]:

@@ -18,6 +18,9 @@ from pipeline.world.mesh import World
 
 _SMALL_M2 = 4.0
 """A solid with less footprint is street furniture."""
+_MANY = 100_000
+"""More small triangles of a kind than this are drawn as squares."""
+_SMALL_M, _SQUARE_M = 0.5, 0.25
 _GREEN = ("tree", "crown", "canopy", "hedge", "bush", "vegetation", "forest", "wood")
 
 
@@ -49,7 +52,7 @@ def outlines_of(world: World, box: Box) -> tuple[Outlines, ...]:
     by_look: dict[str, tuple[list[str], list[Any]]] = {look: ([], []) for look in ("large", "small", "green")}
     for kind in sorted(set(kinds[shown].tolist()) - {"ground"}):
         of_kind = shown & (kinds == kind)
-        shape = shapely.union_all(shapely.polygons(corners[of_kind]))
+        shape = _united(corners[of_kind], box)
         names, shapes = by_look[_look(kind, shape.area / len(np.unique(world.solid_of_face[of_kind])))]
         names.append(kind.replace("_", " "))
         shapes.append(shape)
@@ -59,6 +62,27 @@ def outlines_of(world: World, box: Box) -> tuple[Outlines, ...]:
         for look, (names, shapes) in by_look.items()
         if names
     )
+
+
+def _united(triangles: NDArray[np.float64], box: Box) -> Any:
+    """The area of triangles (n, 3, 2). Of very many, those that are small are drawn as squares: to unite hundreds of
+    thousands that lie over one another takes minutes."""
+    import shapely
+
+    low, high = triangles.min(axis=1), triangles.max(axis=1)
+    small = ((high - low) <= _SMALL_M).all(axis=1) & (low > box[:2]).all(axis=1) & (high < box[2:]).all(axis=1)
+    if np.count_nonzero(small) <= _MANY:
+        return shapely.union_all(shapely.polygons(triangles))
+    first, last = (np.floor((at[small] - box[:2]) / _SQUARE_M).astype(np.int64) for at in (low, high))
+    covered = np.zeros(last.max(axis=0) + 2, dtype=bool)
+    for dx, dy in np.ndindex(*(last - first).max(axis=0) + 1):
+        x, y = np.minimum(first + np.array([dx, dy]), last).T
+        covered[x, y] = True
+    edges = np.diff(covered.astype(np.int8), axis=1, prepend=0, append=0)
+    (row, start), (_, end) = np.nonzero(edges == 1), np.nonzero(edges == -1)
+    x0, y0 = box[:2]
+    runs = shapely.box(x0 + row * _SQUARE_M, y0 + start * _SQUARE_M, x0 + (row + 1) * _SQUARE_M, y0 + end * _SQUARE_M)
+    return shapely.union_all([*runs, shapely.union_all(shapely.polygons(triangles[~small]))])
 
 
 def _look(kind: str, area_m2: float) -> str:

@@ -68,7 +68,7 @@ def window(scenario: Scenario) -> tuple[Window, FcdSurvey]:
         lasts = f"{path.name} lasts {found.lasts_ms / 1000:g} s"
         raise InputError(f"{place}.warmup_s = {traffic.warmup_s:g}", lasts, "a shorter warm-up")
     wanted = Window(frames, period_ms, skip_ms=skip_ms)
-    check_span(wanted, found.lasts_ms - skip_ms, found.step_ms, found.time_steps, place)
+    check_span(wanted, found.lasts_ms - skip_ms, found.step_ms, found.time_steps, place, str(traffic.fcd))
     return wanted, found
 
 
