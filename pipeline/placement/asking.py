@@ -6,7 +6,7 @@ What cannot be is refused here, with the reason and the nearest that can be had.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,6 +18,8 @@ from pipeline.placement.gathering import TargetView, View, VoxelView
 from pipeline.placement.problem import Demand, Problem
 from pipeline.placement.rules import Rules
 from pipeline.placement.sight import Floats, Ints, Row, Sight
+from pipeline.placement.terms import Term
+from pipeline.placement.together import Together
 from pipeline.scenario.models import Scenario
 from pipeline.scenario.placement import ZoneDemand
 from pipeline.scoring.visibility import Beams
@@ -103,12 +105,24 @@ def ask(work: Workspace, heard: Callable[[int], None]) -> Asked:
     demands = []
     if voxels is not None:
         demands = [_zone(scenario, name, zone, sights[0], tpogs[0], voxels.voxels) for name, zone in zones.items()]
-    objective = tuple(every[1:]) if wanted.objective == "worst" else (every[0],)
+    objective: tuple[Term, ...] = (every[0],)
+    if wanted.objective == "worst":
+        objective = tuple(_as_share(scenario, term, rules) for term in every[1:])
     problem = Problem(every[0], objective, tuple(demands), rules, wanted.survives, work.threads)
     whole = problem.together(problem.candidates.tolist())
     for demand in demands:
         _check_zone(scenario, demand, whole.value(demand.term))
     return Asked(problem, sites, score, views, whole.value(problem.joint))
+
+
+def _as_share(scenario: Scenario, term: Term, rules: Rules) -> Term:
+    """A period's score as a share of what all candidates together would have in it, so that quiet periods compare with
+    busy ones."""
+    together = Together([term], np.flatnonzero(~rules.excluded).tolist()).value(term)
+    if not together > 0.0:
+        place = f"{scenario.file}: traffic.periods ({term.name})"
+        raise InputError(place, "no candidate sees anything of its traffic", 'periods with traffic, or "mean"')
+    return replace(term, weight=term.weight / together, exact=lambda totals: term.exact(totals) / together)
 
 
 def _zone(scenario: Scenario, name: str, zone: ZoneDemand, sight: Sight, tpog: Tpog, voxels: Ints) -> Demand:

@@ -75,7 +75,8 @@ def drawn(seed: int) -> Instance:
     at = np.column_stack([rng.random((n, 2)), np.full(n, 3.0)])
     rules = Rules(
         count=int(rng.integers(max(1, len(forced)), 5)), budget=budget, cost=cost, pole_cost=pole_cost, pole=pole,
-        forced=forced, excluded=excluded, most_per_pole=int(rng.choice([1, 2, n])), position_m=at, least_distance_m=near,
+        forced=forced, excluded=excluded, most_per_pole=int(rng.choice([1, 2, n])), position_m=at,
+        least_distance_m=near,
     )  # fmt: skip
     demands = ()
     if rng.random() < 0.3:

@@ -502,7 +502,8 @@ def test_tables_fit_the_terminal(mini: Path, tmp_path: Path, few: None, capsys, 
     study = replace(study, rows=rows)  # the same marks whatever the seconds
     for width in (190, 120, 80):
         if width < 190:
-            monkeypatch.setattr(accuracy_tables, "console", lambda _, width=width: Console(width=width, highlight=False))
+            narrow = Console(width=width, highlight=False)
+            monkeypatch.setattr(accuracy_tables, "console", lambda _, narrow=narrow: narrow)
         accuracy_tables.print_study(study, "egvs run mini")
         table = capsys.readouterr().out.partition("reference: ")[0]
         assert "…" not in table
