@@ -10,7 +10,7 @@ from pipeline.cli import arguments
 from pipeline.cli.arguments import Jobs, Out, ScenarioPath, Set
 
 if TYPE_CHECKING:
-    from pipeline.placement.placing import Placement
+    from pipeline.placement.placing import Moves, Placement
 
 
 def place(
@@ -30,6 +30,10 @@ def place(
     time_limit: Annotated[
         str, typer.Option(metavar="TIME", help="Of --exact, and of the proof for --reach, e.g. 60s or 5m.")
     ] = "60s",
+    refine: Annotated[
+        bool,
+        typer.Option("--refine", help="Then let each sensor move within what [placement.refine] allows."),
+    ] = False,
     set_: Set = None,
     jobs: Jobs = None,
 ) -> None:
@@ -46,7 +50,7 @@ def place(
     folder = out or default_folder(loaded)
     with Screen("place") as screen:
         placed = placing.place(
-            loaded, folder, exact=exact, time_limit_s=limit_s, jobs=jobs, progress=screen.progress,
+            loaded, folder, exact=exact, time_limit_s=limit_s, refine=refine, jobs=jobs, progress=screen.progress,
             listener=screen.stage_event,
         )  # fmt: skip
     print_placement(placed)
@@ -57,7 +61,11 @@ def print_placement(placed: Placement) -> None:
     from pipeline.cli.terminal import WIDE, console, table
 
     out = console(WIDE)
-    names = ("", "site", "z m", "yaw deg", "pitch deg", "sensor", "gain", "joint score", "lost if it fails", "cost")
+    names: tuple[str, ...] = (
+        "", "site", "z m", "yaw deg", "pitch deg", "sensor", "gain", "joint score", "lost if it fails", "cost",
+    )  # fmt: skip
+    if placed.moves is not None:
+        names += ("moved m", "gained by moving")
     plan = table(names, left=("site", "sensor"), whole=names)
     for number, pick in enumerate(placed.picks, start=1):
         pose = pick.site.pose
@@ -66,6 +74,7 @@ def print_placement(placed: Placement) -> None:
         plan.add_row(
             mark, pick.site.name, f"{pose.z_m:g}", f"{pose.yaw_deg:.1f}", f"{pose.pitch_deg:.1f}", pick.site.sensor,
             f"{pick.gain:.6g}", f"{pick.score:.6g}", f"{lost:.1%}", f"{pick.cost:g}",
+            *(() if placed.moves is None else (f"{pick.moved_m:.2f}", f"{pick.gain_by_refining:.6g}")),
         )  # fmt: skip
     out.print(plan)
     if any(pick.is_forced for pick in placed.picks):
@@ -82,27 +91,40 @@ def print_placement(placed: Placement) -> None:
         by = f" by {zone.by} sensors" if zone.by > 1 else ""
         out.print(f"zone {zone.name}: {zone.seen:.1%} of its entropy seen{by}, {zone.share:.1%} asked for")
     out.print(in_words(placed))
+    if placed.moves is not None:
+        out.print(moves_in_words(placed, placed.moves))
     for path in placed.files:
         out.print(str(path))
 
 
 def in_words(placed: Placement) -> str:
     """The plan and its certificate in one sentence."""
-    sites = ", ".join(pick.site.name for pick in placed.picks)
+    solution, point = placed.solution, placed.solution.point
+    joint, sites = point.worth.joint, ", ".join(pick.site.name for pick in placed.picks)
     share = (
-        f"{placed.joint / placed.together:.1%} of what all {placed.candidates} candidates together would"
+        f"{joint / placed.together:.1%} of what all {placed.candidates} candidates together would"
         if placed.together > 0
         else "nothing"
     )
-    cost = f" for {placed.cost:g}" if placed.cost else ""
-    plan = f"{sites}{cost}: {placed.score} {placed.joint:.6g}, {share}; "
-    solution = placed.solution
+    cost = f" for {placed.curve_costs[-1]:g}" if placed.curve_costs[-1] else ""
+    plan = f"{sites}{cost}: {placed.score} {joint:.6g}, {share}; "
     if solution.fewest_is_proved is not None:
         fewer = len(placed.picks) - 1
         return plan + (f"proved: {fewer} cannot" if solution.fewest_is_proved else f"whether {fewer} can is not proved")
     if solution.is_best:
         return plan + "proved: no plan within the rules is better"
     return plan + f"proved: at least {_share(placed.certificate)} of the best possible"
+
+
+def moves_in_words(placed: Placement, moves: Moves) -> str:
+    """What moving its sensors made of the plan."""
+    more = f" ({placed.joint / moves.before - 1.0:+.1%})" if moves.before > 0 else ""
+    cost = f", for {placed.cost:g}" if placed.cost else ""
+    return (
+        f"moved: {placed.score} {moves.before:.6g} before, {placed.joint:.6g} after{more}{cost}; {moves.tried} poses "
+        f"tried in {moves.turns} turns and {moves.seconds:.1f} s, {moves.impossible} of them impossible; "
+        "what is proved holds for candidates as they are given"
+    )
 
 
 def _share(share: float) -> str:

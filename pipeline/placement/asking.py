@@ -45,6 +45,8 @@ class Asked:
         The name of the joint score.
     views
         What each sight is of, for poses that are no candidates; in the order of :attr:`sights`.
+    sights
+        What each candidate sees; those of the problem's terms.
     together
         The joint score of all candidates that are not excluded.
     """
@@ -53,6 +55,7 @@ class Asked:
     sites: tuple[Site, ...]
     score: str
     views: tuple[View, ...]
+    sights: tuple[Sight, ...]
     together: float
 
     def row(self, beams: Beams) -> Row:
@@ -112,7 +115,7 @@ def ask(work: Workspace, heard: Callable[[int], None]) -> Asked:
     whole = problem.together(problem.candidates.tolist())
     for demand in demands:
         _check_zone(scenario, demand, whole.value(demand.term))
-    return Asked(problem, sites, score, views, whole.value(problem.joint))
+    return Asked(problem, sites, score, views, sights, whole.value(problem.joint))
 
 
 def _as_share(scenario: Scenario, term: Term, rules: Rules) -> Term:
@@ -187,7 +190,7 @@ def rules_of(scenario: Scenario, sites: Sequence[Site]) -> Rules:
         raise InputError(f"{place}.count", f"{wanted.count} sensors of {free} {what}", f"at most {free}")
     if wanted.count is not None and wanted.count < len(forced):
         raise InputError(f"{place}.count", f"{wanted.count}, but {len(forced)} are forced", f"at least {len(forced)}")
-    cost, pole_cost = _costs(scenario, sites)
+    cost, pole_cost = costs_of(scenario, sites)
     cost[list(forced)] = pole_cost[list(forced)] = 0.0
     rules = Rules(
         count=wanted.count if wanted.count is not None else free,
@@ -213,7 +216,7 @@ def _index(name: str, names: list[str], place: str) -> int:
     return names.index(name)
 
 
-def _costs(scenario: Scenario, sites: Sequence[Site]) -> tuple[Floats, Floats]:
+def costs_of(scenario: Scenario, sites: Sequence[Site]) -> tuple[Floats, Floats]:
     """What each candidate costs, and what of it is for its pole."""
     costs, has_budget = scenario.costs, scenario.placement.budget is not None
     cost, pole_cost = np.zeros(len(sites)), np.zeros(len(sites))

@@ -1,7 +1,8 @@
 """``egvs place``: the poles that are best together, and how sure that is.
 
 Steps: bring traffic, static world and TPOG up to date as ``egvs run`` does; look from every candidate once; solve what
-``[placement]`` asks for (:mod:`pipeline.placement.planning`); write ``placement.parquet`` and ``curve.parquet`` beside
+``[placement]`` asks for (:mod:`pipeline.placement.planning`); where it is asked for, let the sensors of the plan move
+(:mod:`pipeline.placement.refining.refining`); write ``placement.parquet`` and ``curve.parquet`` beside
 the run, and draw its report anew where there is one.
 """
 
@@ -10,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from time import perf_counter
 
 import numpy as np
 
@@ -17,13 +19,16 @@ from pipeline.core.errors import InputError
 from pipeline.core.progress import Progress, silent
 from pipeline.placement import asking, planning, writing
 from pipeline.placement.asking import Asked
+from pipeline.placement.heuristics import Plan
 from pipeline.placement.joint_score import NEEDED
 from pipeline.placement.planning import Solution
 from pipeline.placement.problem import Problem
+from pipeline.placement.refining import refining
 from pipeline.runs import stages, workflow
 from pipeline.runs.locking import alone
 from pipeline.runs.workflow import StageListener, unheard
 from pipeline.scenario.models import Scenario
+from pipeline.scenario.placement import RefineModel
 from pipeline.sensing.sites import Site
 from pipeline.stages.base import Workspace
 
@@ -44,6 +49,10 @@ class Pick:
         What it adds to the cost.
     loss
         What the whole plan loses of its joint score when it fails.
+    moved_m
+        How far it is from where its candidate hangs; 0 where sensors were not to move.
+    gain_by_refining
+        What the joint score would lose were it alone put back as its candidate hangs.
     """
 
     site: Site
@@ -52,6 +61,8 @@ class Pick:
     score: float
     cost: float
     loss: float
+    moved_m: float = 0.0
+    gain_by_refining: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -62,6 +73,29 @@ class ZoneSeen:
     seen: float
     share: float
     by: int
+
+
+@dataclass(frozen=True)
+class Moves:
+    """What it took to move the sensors of a plan.
+
+    Attributes
+    ----------
+    before
+        The joint score of the plan as its candidates hang.
+    tried, impossible
+        Poses, and those of them that cannot be.
+    turns
+        Of one sensor each.
+    seconds
+        Spent on it.
+    """
+
+    before: float
+    tried: int
+    impossible: int
+    turns: int
+    seconds: float
 
 
 @dataclass(frozen=True)
@@ -81,9 +115,11 @@ class Placement:
     zones
         Those that were demanded.
     solution
-        The curve, the bound, what was proved.
+        The curve, the bound, what was proved; all of it of candidates as they are given.
     curve_sites, curve_costs
         Names and cost of the plan of each point of the curve.
+    moves
+        Of a plan whose sensors were to move: then picks, joint, cost and zones are those after it.
     files
         What was written.
     """
@@ -98,6 +134,7 @@ class Placement:
     solution: Solution
     curve_sites: tuple[tuple[str, ...], ...]
     curve_costs: tuple[float, ...]
+    moves: Moves | None = None
     files: tuple[Path, ...] = ()
 
     @property
@@ -112,6 +149,7 @@ def place(
     *,
     exact: bool = False,
     time_limit_s: float = 60.0,
+    refine: bool = False,
     jobs: int | None = None,
     progress: Progress = silent,
     listener: StageListener = unheard,
@@ -128,6 +166,8 @@ def place(
         Search until the best plan is proved, or the time ends.
     time_limit_s
         Of that search, and of the proof that fewer sensors do not reach what is demanded.
+    refine
+        Then let the sensors of the plan move, as ``[placement.refine]`` does by itself.
 
     Raises
     ------
@@ -135,6 +175,9 @@ def place(
         For a demand that cannot be met, with what can.
     """
     folder = Path(out) if out is not None else workflow.default_folder(scenario)
+    if refine and scenario.placement.refine is None:
+        placement = scenario.placement.model_copy(update={"refine": RefineModel()})
+        scenario = scenario.model_copy(update={"placement": placement})
     asking.check(scenario)
     record = workflow.run(scenario, folder, only=NEEDED, jobs=jobs, progress=progress, listener=listener)
     with alone(folder):
@@ -166,13 +209,33 @@ def solved(work: Workspace, *, exact: bool, time_limit_s: float) -> Placement:
         solution = found
     if solution.point.worth.met < 0.0:
         raise _unmet(scenario, problem, asked, solution, time_limit_s)
-    return _told(asked, problem, solution, scenario)
+    asked = replace(asked, problem=problem)
+    placed = _told(scenario, asked, asked.sites, problem, solution.order, solution)
+    return placed if wanted.refine is None else _refined(work, asked, wanted.refine, placed)
 
 
-def _told(asked: Asked, problem: Problem, solution: Solution, scenario: Scenario) -> Placement:
-    """A solution in the words of the scenario."""
-    rules, plan = problem.rules, solution.order
-    whole = problem.together(plan)
+def _refined(work: Workspace, asked: Asked, wanted: RefineModel, placed: Placement) -> Placement:
+    """A plan after its sensors have moved."""
+    started, solution = perf_counter(), placed.solution
+    refined = refining.refine(work, asked, solution.order, wanted)
+    problem, sites = refined.after.problem, refined.after.sites
+    order = planning.in_order(problem, tuple(range(len(sites))))
+    told = _told(work.scenario, asked, sites, problem, order, solution)
+    picks = tuple(
+        replace(pick, moved_m=refined.moved_m(number), gain_by_refining=refined.gain(number))
+        for pick, number in zip(told.picks, order, strict=True)
+    )
+    seconds = perf_counter() - started
+    moves = Moves(placed.joint, refined.tried, refined.impossible, refined.turns, seconds)
+    return replace(told, picks=picks, moves=moves)
+
+
+def _told(
+    scenario: Scenario, asked: Asked, sites: Sequence[Site], problem: Problem, plan: Plan, solution: Solution
+) -> Placement:
+    """A plan in the words of the scenario; ``sites`` and ``plan`` are those of ``problem``, which need not be the one
+    that was solved."""
+    rules, whole, demanded = problem.rules, problem.together(plan), scenario.placement.zones
     joint, before = whole.value(problem.joint), problem.together()
     picks = []
     for number, candidate in enumerate(plan):
@@ -184,13 +247,11 @@ def _told(asked: Asked, problem: Problem, solution: Solution, scenario: Scenario
         whole.add(candidate)
         cost = rules.cost_of(plan[: number + 1]) - rules.cost_of(plan[:number])
         is_forced = candidate in rules.forced
-        picks.append(Pick(asked.sites[candidate], is_forced, score - so_far, score, cost, loss))
+        picks.append(Pick(sites[candidate], is_forced, score - so_far, score, cost, loss))
     zones = tuple(
-        ZoneSeen(
-            demand.term.name, whole.value(demand.term), demand.least, scenario.placement.zones[demand.term.name].by
-        )
+        ZoneSeen(demand.term.name, whole.value(demand.term), demand.least, demanded[demand.term.name].by)
         for demand in problem.demands
-        if demand.term.name in scenario.placement.zones
+        if demand.term.name in demanded
     )
     return Placement(
         picks=tuple(picks),
@@ -198,11 +259,11 @@ def _told(asked: Asked, problem: Problem, solution: Solution, scenario: Scenario
         joint=joint,
         together=asked.together,
         cost=rules.cost_of(plan),
-        candidates=len(problem.candidates),
+        candidates=len(asked.problem.candidates),
         zones=zones,
         solution=solution,
         curve_sites=tuple(_names(asked, point.plan) for point in solution.curve),
-        curve_costs=tuple(rules.cost_of(point.plan) for point in solution.curve),
+        curve_costs=tuple(asked.problem.rules.cost_of(point.plan) for point in solution.curve),
     )
 
 

@@ -44,7 +44,11 @@ def write(folder: Path, scenario: Scenario, placed: Placement, stages: Mapping[s
         **{key: [getattr(pick, key) for pick in picks] for key in ("gain", "score", "cost", "loss")},
         "bound": [bounds.get(number, bounds[min(bounds)]) for number in range(1, len(picks) + 1)],
     }
-    tables.write(folder / PLACEMENT, "placement", columns, about)
+    moves = _MOVES if placed.moves is not None else ()
+    columns |= {key: [getattr(pick, key) for pick in picks] for key in moves}
+    with tables.writer(folder / PLACEMENT, "placement", moves) as out:
+        out.write(columns)
+        out.describe(about)
     curve = {
         "count": np.array([point.count for point in points], dtype=np.int32),
         "score": [point.worth.joint for point in points],
@@ -61,6 +65,10 @@ def write(folder: Path, scenario: Scenario, placed: Placement, stages: Mapping[s
 
 
 _POSE = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
+_MOVES = ("moved_m", "gain_by_refining")
+"""Columns that a plan has whose sensors were to move."""
+_COUNTED = ("before", "tried", "impossible", "turns")
+"""What is told of its moves; how long they took is no part of a file."""
 
 
 def _about(scenario: Scenario, placed: Placement, stages: Mapping[str, str]) -> dict[str, Any]:
@@ -70,7 +78,7 @@ def _about(scenario: Scenario, placed: Placement, stages: Mapping[str, str]) -> 
         "costs": scenario.costs.model_dump(mode="json"),
         "score": scenario.score.model_copy(update={"gamma": scenario.gamma}).model_dump(mode="json"),
     }
-    solution = placed.solution
+    solution, moves = placed.solution, placed.moves
     return {
         "schema": schemas.VERSION,
         "scenario": {"name": scenario.name, "hash": files.hash_of(settings)},
@@ -90,5 +98,6 @@ def _about(scenario: Scenario, placed: Placement, stages: Mapping[str, str]) -> 
             "is_best": solution.is_best,
             "fewest_is_proved": solution.fewest_is_proved,
             "zones": [asdict(zone) for zone in placed.zones],
+            **({} if moves is None else {"moves": {key: getattr(moves, key) for key in _COUNTED}}),
         },
     }

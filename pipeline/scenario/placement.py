@@ -11,6 +11,8 @@ from pipeline.scenario.score import enclosing
 from pipeline.scenario.types import Name, NotNegative, Point2, Positive
 
 Share = Annotated[float, Field(gt=0, le=1)]
+Turn = Annotated[float, Field(ge=-360, le=360)]
+Tilt = Annotated[float, Field(ge=-90, le=90)]
 
 
 class CostsModel(StrictModel):
@@ -36,6 +38,36 @@ class ZoneDemand(StrictModel):
     _encloses = field_validator("polygon_m")(enclosing)
 
 
+class RefineModel(StrictModel):
+    """How far the sensors of a plan may move from their candidates' poses; those that are forced stay."""
+
+    radius_m: NotNegative | None = Field(
+        None,
+        description="A pole in plan; one of sites.along along its line, by half the spacing if not given. Else 0",
+    )
+    within_m: tuple[tuple[Point2, ...], ...] = Field(
+        (), description="Polygons: a pole that stands in one may be anywhere in it, whatever radius_m says"
+    )
+    heights_m: tuple[Positive, Positive] | None = Field(
+        None, description="Lowest and highest z_m; those of all candidates where it is not given"
+    )
+    yaw_deg: tuple[Turn, Turn] | None = Field(None, description="From, to; any where it is not given")
+    pitch_deg: tuple[Tilt, Tilt] = Field((-30.0, 10.0), description="Lowest and highest, nose up positive")
+    roll_deg: tuple[Turn, Turn] | None = Field(
+        None, description="From, to; as the candidate has it where it is not given"
+    )
+    evaluations: int = Field(300, ge=20, description="Poses that are tried for a sensor in its turn")
+
+    _enclose = field_validator("within_m")(lambda polygons: tuple(map(enclosing, polygons)))
+
+    @field_validator("heights_m", "yaw_deg", "pitch_deg", "roll_deg")
+    @classmethod
+    def _ascending(cls, ends: tuple[float, float] | None) -> tuple[float, float] | None:
+        if ends is not None and ends[0] > ends[1]:
+            raise ValueError(f"{ends[0]:g} to {ends[1]:g}: the lower end comes first")
+        return ends
+
+
 class PlacementModel(StrictModel):
     """What is asked of a plan; options of ``egvs place`` take the place of keys."""
 
@@ -56,6 +88,9 @@ class PlacementModel(StrictModel):
     )
     survives: int = Field(
         0, ge=0, le=1, description="1: what counts is what is left when the sensor that is missed most has failed"
+    )
+    refine: RefineModel | None = Field(
+        None, description="Let the sensors of the plan move, as --refine does; within what the keys of this table say"
     )
 
     @model_validator(mode="after")

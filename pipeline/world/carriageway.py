@@ -102,11 +102,18 @@ class Carriageway:
         """Whether each place (n, 2) lies in a junction, deeper than at a kerb, and not where people walk."""
         import shapely
 
+        found: NDArray[np.bool_] = shapely.intersects(self._inner, shapely.points(at_m))
+        return found
+
+    @cached_property
+    def _inner(self) -> BaseGeometry:
+        """Junctions, deeper than at a kerb, without where people walk."""
+        import shapely
+
         inner = shapely.difference(
             shapely.buffer(_outlines(self.junctions), -limits.LANE_INSET_M), shapely.union_all(_outlines(self.corners))
         )
-        found: NDArray[np.bool_] = shapely.intersects(shapely.union_all(inner), shapely.points(at_m))
-        return found
+        return shapely.union_all(inner)
 
     def touching(self, shapes: Sequence[BaseGeometry] | NDArray[Any]) -> NDArray[np.int64]:
         """(2, k): each shape that has something in common with a lane, and that lane."""
