@@ -211,7 +211,9 @@ def solved(work: Workspace, *, exact: bool, time_limit_s: float) -> Placement:
         raise _unmet(scenario, problem, asked, solution, time_limit_s)
     asked = replace(asked, problem=problem)
     placed = _told(scenario, asked, asked.sites, problem, solution.order, solution)
-    return placed if wanted.refine is None else _refined(work, asked, wanted.refine, placed)
+    if wanted.refine is None or not placed.picks:
+        return placed
+    return _refined(work, asked, wanted.refine, placed)
 
 
 def _refined(work: Workspace, asked: Asked, wanted: RefineModel, placed: Placement) -> Placement:

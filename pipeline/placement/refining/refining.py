@@ -34,8 +34,11 @@ from pipeline.world.carriageway import Carriageway
 WORTHWHILE = 1e-3
 """A turn that adds less than this share is kept, but gives nobody else another turn."""
 
+_JOINT = 1e-3
+"""What the joint score counts beside the value that is asked for, while a sensor is being moved."""
+
 _CANNOT = 1e6
-"""The loss of a pose that cannot be; above every other."""
+"""The loss of a pose that cannot be: above every other."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +143,6 @@ class _Turn:
     def __init__(self, places: _Places, poses: Poses, number: int, freedom: Freedom) -> None:
         self.best, self.tried, self.impossible = poses, 0, 0
         self._places, self._start, self._number, self._freedom = places, poses, number, freedom
-        self._scale = max(abs(poses.worth.value), float(np.finfo(np.float64).tiny))
 
     def losses(self, points: Floats) -> Floats:
         """Of points of the freedom's box, (n, axes); the better the plan, the lower."""
@@ -180,5 +182,9 @@ class _Turn:
         return plan, plan.worth
 
     def _loss(self, worth: Worth) -> float:
-        """The value with its sign turned; what misses demands comes behind all that meets them."""
-        return -worth.value / self._scale if worth.met >= 0.0 else 1.0 - worth.met
+        """Minus the value, with a little of the joint score where the value may not depend on this sensor; what misses
+        demands comes behind all that meets them."""
+        if worth.met < 0.0:
+            return 1.0 - worth.met
+        before, tiny = self._start.worth, float(np.finfo(np.float64).tiny)
+        return -worth.value / max(before.value, tiny) - _JOINT * worth.joint / max(before.joint, tiny)
