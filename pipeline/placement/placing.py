@@ -23,7 +23,7 @@ from pipeline.placement.heuristics import Plan
 from pipeline.placement.joint_score import NEEDED
 from pipeline.placement.planning import Solution
 from pipeline.placement.problem import Problem
-from pipeline.placement.refining import refining
+from pipeline.placement.refining import freedom, refining
 from pipeline.runs import stages, workflow
 from pipeline.runs.locking import alone
 from pipeline.runs.workflow import StageListener, unheard
@@ -179,6 +179,8 @@ def place(
         placement = scenario.placement.model_copy(update={"refine": RefineModel()})
         scenario = scenario.model_copy(update={"placement": placement})
     asking.check(scenario)
+    if scenario.placement.refine is not None:
+        freedom.check(scenario, scenario.placement.refine)
     record = workflow.run(scenario, folder, only=NEEDED, jobs=jobs, progress=progress, listener=listener)
     with alone(folder):
         work = Workspace(scenario, folder, jobs=jobs, progress=progress, recorded=stages.recorded(record))

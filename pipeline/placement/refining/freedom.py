@@ -20,6 +20,7 @@ from pipeline.placement.sight import Floats
 from pipeline.scenario.models import Scenario, SiteLine
 from pipeline.scenario.placement import RefineModel
 from pipeline.sensing.sites import Pose, Site
+from pipeline.sensing.sites import of as sites_of
 
 if TYPE_CHECKING:
     from shapely import LineString
@@ -133,6 +134,18 @@ class Freedom:
         return {"x_m": round(x_m, _LENGTH_DIGITS), "y_m": round(y_m, _LENGTH_DIGITS)}
 
 
+def check(scenario: Scenario, wanted: RefineModel) -> None:
+    """InputError for a polygon that no candidate stands in."""
+    import shapely
+
+    poses = [site.pose for site in sites_of(scenario)]
+    x_m, y_m = [pose.x_m for pose in poses], [pose.y_m for pose in poses]
+    for number, corners in enumerate(wanted.within_m):
+        if not shapely.intersects_xy(shapely.Polygon(corners), x_m, y_m).any():
+            place = f"{scenario.file}: placement.refine.within_m: polygon {number}"
+            raise InputError(place, "no candidate stands in it", "a polygon round one, in the world frame")
+
+
 def freedoms(
     scenario: Scenario, wanted: RefineModel, candidates: Sequence[Site], plan: Sequence[Site], stay: Sequence[bool]
 ) -> tuple[Freedom | None, ...]:
@@ -148,9 +161,8 @@ def freedoms(
     Raises
     ------
     InputError
-        Where no sensor of the plan may do anything, or no candidate stands in a polygon.
+        Where no sensor of the plan may do anything.
     """
-    _check_polygons(scenario, wanted, candidates)
     heights_m = wanted.heights_m or _ends([site.pose.z_m for site in candidates])
     shared = {pole for pole, used in Counter(site.pole for site in plan).items() if used > 1}
     found = tuple(
@@ -219,14 +231,3 @@ def _line_of(rules: Sequence[SiteLine], pose: Pose) -> tuple[LineString, float, 
         if away_m.min() <= _ON_LINE_M:
             return line, float(along_m[np.argmin(away_m)]), rule.spacing_m
     return None
-
-
-def _check_polygons(scenario: Scenario, wanted: RefineModel, candidates: Sequence[Site]) -> None:
-    """InputError for a polygon that no candidate stands in."""
-    import shapely
-
-    x_m, y_m = ([getattr(site.pose, name) for site in candidates] for name in ("x_m", "y_m"))
-    for number, corners in enumerate(wanted.within_m):
-        if not shapely.intersects_xy(shapely.Polygon(corners), x_m, y_m).any():
-            place = f"{scenario.file}: placement.refine.within_m: polygon {number}"
-            raise InputError(place, "no candidate stands in it", "a polygon round one, in the world frame")
