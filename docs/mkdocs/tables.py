@@ -20,7 +20,7 @@ def columns(artefact: str) -> str:
         unit = field.get("unit", "").replace("1", "")
         meaning = _cell(field["description"])
         if not field["constraints"]["required"]:
-            meaning += " *(only where an effect calls for it)*"
+            meaning += " *(not in every file)*"
         rows.append(f"| `{field['name']}` | {field['arrow_type']} | {unit} | {meaning} |")
     keys = ", ".join(f"`{key}`" for key in schema.get("primaryKey", []))
     return "\n".join(rows) + (f"\n\nOne row for each {keys}." if keys else "")
