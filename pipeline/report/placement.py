@@ -66,6 +66,8 @@ class PlacementSummary:
         For 1, 2, ... sensors.
     proof
         What is proved, in a sentence.
+    before
+        The joint score as the candidates hang, where sensors were to move from there; None else.
     map, chart
         Figures, SVG text.
     """
@@ -80,6 +82,7 @@ class PlacementSummary:
     proof: str
     objective: str
     zones: tuple[Mapping[str, Any], ...]
+    before: float | None
     map: str
     chart: str
 
@@ -126,6 +129,7 @@ class PlacementSummary:
             proof=_proof(its, len(picks)),
             objective=_objective(its["asked"]),
             zones=tuple(its["zones"]),
+            before=its["moves"]["before"] if "moves" in its else None,
             map=drawing.plan_map(
                 tpog.grid,
                 occupied,

@@ -177,8 +177,13 @@ def test_the_same_bytes_twice_and_on_two_threads(mini: Path) -> None:
 
 def test_the_command_tells_what_moving_gained(mini: Path, egvs) -> None:
     out = mini / "run"
+    assert egvs("run", mini, "--out", out)[0] == 0
     code, told, _ = egvs("place", mini, "--count", 2, "--refine", "--out", out, "--set", FEW)
     assert code == 0
+    moved = (
+        "Its sensors have moved from where the candidates hang (<code>--refine</code>): as candidates they have 2,650"
+    )
+    assert moved in (out / "report.html").read_text()
     assert "moved: egvs 2650.3 before, " in told
     assert "what is proved holds for candidates as they are given" in told
     assert "gained by moving" in told
