@@ -120,10 +120,13 @@ def moves_in_words(placed: Placement, moves: Moves) -> str:
     """What moving its sensors made of the plan."""
     more = f" ({placed.joint / moves.before - 1.0:+.1%})" if moves.before > 0 else ""
     cost = f", for {placed.cost:g}" if placed.cost else ""
+    asked = f"; what was asked for {moves.value_before:.6g} before, {moves.value:.6g} after"
+    if (moves.value_before, moves.value) == (moves.before, placed.joint):
+        asked = ""
     return (
-        f"moved: {placed.score} {moves.before:.6g} before, {placed.joint:.6g} after{more}{cost}; {moves.tried} poses "
-        f"tried in {moves.turns} turns and {moves.seconds:.1f} s, {moves.impossible} of them impossible; "
-        "what is proved holds for candidates as they are given"
+        f"moved: {placed.score} {moves.before:.6g} before, {placed.joint:.6g} after{more}{asked}{cost}; "
+        f"{moves.tried} poses tried in {moves.turns} turns and {moves.seconds:.1f} s, "
+        f"{moves.impossible} of them impossible; what is proved holds for candidates as they are given"
     )
 
 

@@ -83,6 +83,8 @@ class Moves:
     ----------
     before
         The joint score of the plan as its candidates hang.
+    value_before, value
+        What was asked for of the plan, then and now: :attr:`Worth.value`. Never less now; the joint score may be.
     tried, impossible
         Poses, and those of them that cannot be.
     turns
@@ -92,6 +94,8 @@ class Moves:
     """
 
     before: float
+    value_before: float
+    value: float
     tried: int
     impossible: int
     turns: int
@@ -230,7 +234,8 @@ def _refined(work: Workspace, asked: Asked, wanted: RefineModel, placed: Placeme
         for pick, number in zip(told.picks, order, strict=True)
     )
     seconds = perf_counter() - started
-    moves = Moves(placed.joint, refined.tried, refined.impossible, refined.turns, seconds)
+    values = refined.before.worth.value, refined.after.worth.value
+    moves = Moves(placed.joint, *values, refined.tried, refined.impossible, refined.turns, seconds)
     return replace(told, picks=picks, moves=moves)
 
 

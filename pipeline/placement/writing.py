@@ -67,7 +67,7 @@ def write(folder: Path, scenario: Scenario, placed: Placement, stages: Mapping[s
 _POSE = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
 _MOVES = ("moved_m", "gain_by_refining")
 """Columns that a plan has whose sensors were to move."""
-_COUNTED = ("before", "tried", "impossible", "turns")
+_COUNTED = ("before", "value_before", "value", "tried", "impossible", "turns")
 """What is told of its moves; how long they took is no part of a file."""
 
 

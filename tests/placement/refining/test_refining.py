@@ -21,6 +21,7 @@ from pipeline.traffic import network, sumo_folder
 from tests.checks.conftest import net_xml
 from tests.conftest import BUILDING
 
+HALVES = 'traffic.periods=[{name="a", length_s=12, weight=3}, {name="b", begin_s=12, length_s=8}]'
 FEW = "placement.refine.evaluations=60"
 
 
@@ -44,6 +45,8 @@ def with_sites(folder: Path, poses: dict[str, Pose]) -> None:
         (),
         ("placement.count=1",),
         ("placement.survives=1",),
+        (HALVES, "placement.objective='worst'"),
+        (HALVES, "placement.objective='worst'", "placement.survives=1", "placement.refine.radius_m=2"),
         ("placement.forced=['pole_a']",),
         ("score.rank_by='points_on_target'",),
         ("score.rank_by='expected_detections'", "placement.refine.radius_m=2"),
@@ -56,7 +59,10 @@ def test_a_plan_is_never_worth_less_than_it_was(mini: Path, settings: tuple[str,
     assert placed.moves is not None
     point = placed.solution.point
     assert placed.moves.before == point.worth.joint
-    assert placed.joint >= placed.moves.before
+    assert placed.moves.value_before == point.worth.value
+    assert placed.moves.value > placed.moves.value_before
+    if point.worth.value == point.worth.joint:
+        assert (placed.moves.value, placed.joint > placed.moves.before) == (placed.joint, True)
     assert placed.picks[-1].score == placed.joint
     assert all(zone.seen >= zone.share for zone in placed.zones)
     assert {pick.site.name for pick in placed.picks} == set(placed.curve_sites[-1])
@@ -190,6 +196,10 @@ def test_the_command_tells_what_moving_gained(mini: Path, egvs) -> None:
     table = pq.read_table(out / "placement.parquet")
     assert min(table.column("gain_by_refining").to_pylist()) > 0.0
     assert table.column("moved_m").to_pylist() == [0.0, 0.0]
+    assert "what was asked for" not in told
+    code, told, _ = egvs("place", mini, "--count", 2, "--refine", "--out", out, "--set", FEW, "--set",
+                         "placement.survives=1")  # fmt: skip
+    assert code == 0 and "; what was asked for " in told
     code, told, _ = egvs("place", mini, "--count", 2, "--out", out)
     assert code == 0 and "moved" not in told
     assert "moved_m" not in pq.read_table(out / "placement.parquet").column_names
