@@ -13,13 +13,14 @@ import numpy as np
 from pipeline.artefacts.readers import Tpog, read_periods, read_tpog
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Grid
-from pipeline.placement import gathering, terms
+from pipeline.placement import gathering
 from pipeline.placement.gathering import TargetView, View, VoxelView
-from pipeline.placement.problem import Demand, Problem
-from pipeline.placement.rules import Rules
-from pipeline.placement.sight import Floats, Ints, Row, Sight
-from pipeline.placement.terms import Term
-from pipeline.placement.together import Together
+from pipeline.placement.solving import terms
+from pipeline.placement.solving.problem import Demand, Problem
+from pipeline.placement.solving.rules import Rules
+from pipeline.placement.solving.sight import Floats, Ints, Row, Sight
+from pipeline.placement.solving.terms import Term
+from pipeline.placement.solving.together import Together
 from pipeline.scenario.models import Scenario
 from pipeline.scenario.placement import ZoneDemand
 from pipeline.scoring.visibility import Beams

@@ -14,8 +14,8 @@ import numpy as np
 from pipeline.artefacts.readers import Tpog
 from pipeline.core.parallel import in_order
 from pipeline.effects.base import Detect
-from pipeline.placement import terms
-from pipeline.placement.sight import Floats, GrowingSight, Ints, Row, Sight
+from pipeline.placement.solving import terms
+from pipeline.placement.solving.sight import Floats, GrowingSight, Ints, Row, Sight
 from pipeline.scoring.targets.named import WORTHS
 from pipeline.scoring.targets.seen import SeenTargets
 from pipeline.scoring.visibility import Beams, Visibility

@@ -1,9 +1,9 @@
 """``egvs place``: the poles that are best together, and how sure that is.
 
 Steps: bring traffic, static world and TPOG up to date as ``egvs run`` does; look from every candidate once; solve what
-``[placement]`` asks for (:mod:`pipeline.placement.planning`); where it is asked for, let the sensors of the plan move
-(:mod:`pipeline.placement.refining.refining`); write ``placement.parquet`` and ``curve.parquet`` beside
-the run, and draw its report anew where there is one.
+``[placement]`` asks for (:mod:`pipeline.placement.solving.planning`); where it is asked for, let the sensors of the
+plan move (:mod:`pipeline.placement.refining.refining`); write ``placement.parquet`` and ``curve.parquet`` beside the
+run, and draw its report anew where there is one.
 """
 
 from __future__ import annotations
@@ -17,13 +17,14 @@ import numpy as np
 
 from pipeline.core.errors import InputError
 from pipeline.core.progress import Progress, silent
-from pipeline.placement import asking, planning, writing
+from pipeline.placement import asking, writing
 from pipeline.placement.asking import Asked
-from pipeline.placement.heuristics import Plan
 from pipeline.placement.joint_score import NEEDED
-from pipeline.placement.planning import Solution
-from pipeline.placement.problem import Problem
 from pipeline.placement.refining import freedom, refining
+from pipeline.placement.solving import planning
+from pipeline.placement.solving.heuristics import Plan
+from pipeline.placement.solving.planning import Solution
+from pipeline.placement.solving.problem import Problem
 from pipeline.runs import stages, workflow
 from pipeline.runs.locking import alone
 from pipeline.runs.workflow import StageListener, unheard

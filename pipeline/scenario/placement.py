@@ -83,8 +83,8 @@ class PlacementModel(StrictModel):
     zones: dict[Name, ZoneDemand] = Field(default_factory=dict, description="Parts of the region that must be seen")
     objective: Literal["mean", "worst"] = Field(
         "mean",
-        description="Of traffic with periods: their mix, or the period of which the least is seen, as a share of what all "
-        "candidates together would",
+        description="Of traffic with periods: their mix, or the period of which the least is seen, as a share of what "
+        "all candidates together would",
     )
     survives: int = Field(
         0, ge=0, le=1, description="1: what counts is what is left when the sensor that is missed most has failed"

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core.errors import InputError
-from pipeline.placement.sight import Floats
+from pipeline.placement.solving.sight import Floats
 from pipeline.scenario.models import Scenario, SiteLine
 from pipeline.scenario.placement import RefineModel
 from pipeline.sensing.sites import Pose, Site

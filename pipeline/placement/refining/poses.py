@@ -14,10 +14,10 @@ from functools import cached_property
 import numpy as np
 
 from pipeline.placement.asking import Asked, costs_of
-from pipeline.placement.problem import Problem, Worth
-from pipeline.placement.rules import Rules
-from pipeline.placement.sight import Row, Sight
-from pipeline.placement.terms import Term
+from pipeline.placement.solving.problem import Problem, Worth
+from pipeline.placement.solving.rules import Rules
+from pipeline.placement.solving.sight import Row, Sight
+from pipeline.placement.solving.terms import Term
 from pipeline.scenario.models import Scenario
 from pipeline.sensing.sites import Site
 

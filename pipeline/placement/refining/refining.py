@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from pipeline.core.errors import InputError
 from pipeline.core.parallel import in_order
 from pipeline.placement.asking import Asked
-from pipeline.placement.problem import Worth
 from pipeline.placement.refining.freedom import Freedom, freedoms
 from pipeline.placement.refining.poses import Poses, Rows
 from pipeline.placement.refining.searching import search
-from pipeline.placement.sight import Floats
+from pipeline.placement.solving.problem import Worth
+from pipeline.placement.solving.sight import Floats
 from pipeline.scenario.placement import RefineModel
 from pipeline.scoring.visibility import Beams
 from pipeline.sensing.scanner import Scanner

@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pipeline.placement.sight import Floats
+from pipeline.placement.solving.sight import Floats
 
 Losses = Callable[[Floats], Floats]
 """Of points (n, axes), (n,) float64; finite."""

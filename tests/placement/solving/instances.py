@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.kernels.placement.together import CAPPED, LOGARITHM, SATURATING
-from pipeline.placement.problem import Demand, Problem
-from pipeline.placement.rules import Rules
-from pipeline.placement.sight import Row, Sight
-from pipeline.placement.terms import Term
+from pipeline.placement.solving.problem import Demand, Problem
+from pipeline.placement.solving.rules import Rules
+from pipeline.placement.solving.sight import Row, Sight
+from pipeline.placement.solving.terms import Term
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.placement.rules import Rules
-from pipeline.placement.sight import Floats, Ints
-from pipeline.placement.terms import Term
-from pipeline.placement.together import Together
+from pipeline.placement.solving.rules import Rules
+from pipeline.placement.solving.sight import Floats, Ints
+from pipeline.placement.solving.terms import Term
+from pipeline.placement.solving.together import Together
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from pipeline.kernels.placement.together import CAPPED, LOGARITHM, SATURATING
-from pipeline.placement.sight import GrowingSight, Row
-from pipeline.placement.together import Together
-from tests.placement.instances import sight_of, term_of, worth
+from pipeline.placement.solving.sight import GrowingSight, Row
+from pipeline.placement.solving.together import Together
+from tests.placement.solving.instances import sight_of, term_of, worth
 
 HITS = np.array([[3, 0, 1, 0], [0, 2, 5, 0], [1, 1, 1, 0]])
 WEIGHT = np.array([1.0, 2.0, 0.5, 9.0])

@@ -12,9 +12,9 @@ from time import perf_counter
 
 import numpy as np
 
-from pipeline.placement import bounds, exact, heuristics
-from pipeline.placement.heuristics import Plan
-from pipeline.placement.problem import Problem, Worth
+from pipeline.placement.solving import bounds, exact, heuristics
+from pipeline.placement.solving.heuristics import Plan
+from pipeline.placement.solving.problem import Problem, Worth
 
 STEPS = 160
 """Of Frank and Wolfe's for the bound of a plan, at most."""

@@ -18,10 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.kernels.placement import together as kernels
-from pipeline.placement.rules import Rules
-from pipeline.placement.sight import Floats, Ints
-from pipeline.placement.terms import Term
-from pipeline.placement.together import spread
+from pipeline.placement.solving.rules import Rules
+from pipeline.placement.solving.sight import Floats, Ints
+from pipeline.placement.solving.terms import Term
+from pipeline.placement.solving.together import spread
 
 ROUNDING = 1e-9
 """Bounds are raised by this share: their sums are off by less than 1e-11 of it."""

@@ -31,7 +31,7 @@ import numpy as np
 
 from pipeline.artefacts.readers import Tpog
 from pipeline.kernels.placement.together import CAPPED, LOGARITHM, SATURATING
-from pipeline.placement.sight import Floats, Ints, Sight
+from pipeline.placement.solving.sight import Floats, Ints, Sight
 from pipeline.scoring.egvs import EntropyField
 from pipeline.scoring.targets.scores import SEEN_WELL_POINTS, log_points, mean, well
 from pipeline.scoring.voxel_shares import OccupiedVoxels

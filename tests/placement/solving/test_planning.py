@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from pipeline.placement import exact, planning
-from pipeline.placement.problem import Demand
-from tests.placement.instances import drawn, every_plan, value_of
+from pipeline.placement.solving import exact, planning
+from pipeline.placement.solving.problem import Demand
+from tests.placement.solving.instances import drawn, every_plan, value_of
 
 
 def unheard(_: int) -> None:

@@ -12,9 +12,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from pipeline.placement.problem import Problem, Worth
-from pipeline.placement.sight import Floats, Ints
-from pipeline.placement.together import Together
+from pipeline.placement.solving.problem import Problem, Worth
+from pipeline.placement.solving.sight import Floats, Ints
+from pipeline.placement.solving.together import Together
 
 Guide = Callable[[Together, Ints], tuple[Floats, ...]]
 """Of a plan and some candidates: what each is chosen by, the most important last."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.placement.sight import Floats, Ints
+from pipeline.placement.solving.sight import Floats, Ints
 
 Mask = NDArray[np.bool_]
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from pipeline.core.parallel import in_order
 from pipeline.kernels.placement import together as kernels
-from pipeline.placement.sight import Floats, Ints, Row
-from pipeline.placement.terms import Term
+from pipeline.placement.solving.sight import Floats, Ints, Row
+from pipeline.placement.solving.terms import Term
 
 
 class Together:

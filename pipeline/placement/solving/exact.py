@@ -15,11 +15,11 @@ from time import perf_counter
 
 import numpy as np
 
-from pipeline.placement import bounds
-from pipeline.placement.heuristics import Plan
-from pipeline.placement.problem import Problem, Worth
-from pipeline.placement.rules import Rules
-from pipeline.placement.sight import Floats, Ints
+from pipeline.placement.solving import bounds
+from pipeline.placement.solving.heuristics import Plan
+from pipeline.placement.solving.problem import Problem, Worth
+from pipeline.placement.solving.rules import Rules
+from pipeline.placement.solving.sight import Floats, Ints
 
 _STEPS = 12
 """Of Frank and Wolfe's at a node; the root has had its own."""

@@ -1,0 +1,1 @@
+"""Plans and proofs: sums over cells that sensors raise together, rules, bounds, searches."""
