@@ -186,6 +186,7 @@ def test_all_missing_kinds_are_asked_for_at_once(mini: Path, tmp_path: Path, egv
         *(([f"<a><vType id='x' height='{height}'/></a>"], f"vType x: height: '{height}'; a length of at least 0.001 m")
           for height in ("tall", "0", "-1", "nan", "inf", "1e-300", "2001", "1_0", "٣")),
         (["<a><vType id='x'></a>"], "is not well-formed XML"),
+        (["<a><vType id='x y&gt;'/></a>"], r"types0\.xml: SUMO does not take its types: sumo ended with exit code 1:"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_with_a_file_of_vtypes_is_said(

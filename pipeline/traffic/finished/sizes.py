@@ -58,7 +58,11 @@ def of_types(scenario: Scenario, types: Collection[str]) -> dict[str, Size]:
     traffic, vtypes = scenario.traffic, check_types(scenario, types)
     sizes = kind_sizes(traffic.kinds)
     if vtypes or any(name not in sizes for name in types):
-        sizes |= _asked(vtypes) | kind_sizes(traffic.own_kinds)
+        try:
+            sizes |= _asked(vtypes) | kind_sizes(traffic.own_kinds)
+        except sumo.RefusedError as error:
+            place = ", ".join(map(str, files(scenario))) or sumo_folder.place_of(scenario)
+            raise InputError(place, f"SUMO does not take its types: {error}", "types that SUMO reads") from None
     return sizes
 
 
