@@ -130,6 +130,7 @@ _PROMISED: dict[str, tuple[str, ...]] = {
     "placement": ("inputs", "stages", "plan"),
     "curve": ("inputs", "stages", "plan"),
     "detection": ("inputs", "frames", "stages"),
+    "fused": ("inputs", "frames", "shown"),
     "correlation": ("inputs", "frames", "stages", "own_score", "shown"),
 }
 """What the metadata of an artefact must hold for those who read it."""
@@ -168,8 +169,10 @@ def _is_sound(key: str, value: Any) -> bool:
         return isinstance(value, list) and all(isinstance(s, dict) and all(k in s for k in _SITE) for s in value)
     if key == "periods":
         return periods.are_sound(value)
-    if key == "inputs":
+    if key in ("inputs", "score"):
         return isinstance(value, str)
+    if key in ("bound", "certificate"):
+        return isinstance(value, float) and 0 <= value < math.inf
     if key == "cells":
         return _are_cells(value)
     if key == "plan":

@@ -13,12 +13,15 @@ from pipeline.scenario.score import RECOMMENDED
 from pipeline.validation.agreement import main_measure
 from pipeline.validation.detection import ALL
 from pipeline.validation.looking import LookListener
+from pipeline.validation.site_findings import POINTS
 
 if TYPE_CHECKING:
     from pipeline.core.cost import Cost
     from pipeline.scenario.models import Scenario
     from pipeline.validation.agreement import ScoreName, Validation
     from pipeline.validation.exports.exporting import Export
+    from pipeline.validation.fused.validating import PlanValidation
+    from pipeline.validation.metrics.leave_out import Estimate
     from pipeline.validation.statistics.correlation import Correlation
     from pipeline.validation.surrogates.base import Value
     from pipeline.validation.surrogates.registry import Entry
@@ -93,6 +96,45 @@ def _interval(its: Correlation) -> str:
     return f"{its.value:.2f}{between}"
 
 
+_BOXED = {
+    "AP BEV .7, %": "ap_bev_r40_iou70",
+    "3D .7": "ap_3d_r40_iou70",
+    "BEV .5": "ap_bev_r40_iou50",
+    "3D .5": "ap_3d_r40_iou50",
+}
+_COUNTED = {"seen with 1 point, %": "seen_1", "5": "seen_5", "20": "seen_20"}
+
+
+def print_plan_validation(done: PlanValidation) -> None:
+    """What each detector finds with 1, 2, ... sensors, and what the last one brings."""
+    rows = [row for row in done.rows if row.detection.objects_of == ALL]
+    for detector in dict.fromkeys(row.detection.detector for row in rows):
+        shown = _COUNTED if detector == POINTS else _BOXED
+        what = "seen_20" if detector == POINTS else "BEV + 3D .7"
+        names = (detector, "with", *shown, f"gain, {what}")
+        lines = table(names, left=names[1:2], whole=names)
+        for row in (row for row in rows if row.detection.detector == detector):
+            values = (row.detection.measures[name] for name in shown.values())
+            also = f"+ {row.sites[-1]}" if len(row.sites) > 1 else row.sites[0]
+            gain = _percent(row.gain) if len(row.sites) > 1 else ""
+            lines.add_row(str(len(row.sites)), also, *map(_percent, values), gain)
+        console(_FILE_WIDTH, soft_wrap=False).print(lines, markup=False)
+    some = rows[0].detection
+    print(f"{some.objects} vehicles in {some.frames} frames of traffic that the TPOG never saw; ± is a standard error")
+    print(f"fused clouds of the plan by {done.plan.score} in {done.plan.path}, shown by {_measures(done)}")
+    for doubt in done.doubts:
+        print(f"warning: {doubt}")
+    print(done.path)
+
+
+def _measures(done: PlanValidation) -> str:
+    return ", ".join(dict.fromkeys(main_measure(row.detection.detector) for row in done.rows))
+
+
+def _percent(its: Estimate) -> str:
+    return f"{100 * its.value:.1f} ± {100 * its.se:.1f}"
+
+
 _HEADS = {"ap_combined_r40_iou70": "AP from above + in space, %", "seen_20": "seen with 20 points, %"}
 
 
@@ -137,30 +179,49 @@ class LookLines(LookListener):
         Prints a line.
     """
 
+    NOUN = "site"
+
     def __init__(self, say: Callable[[str], None]) -> None:
         self._say = say
+
+    def clouds(self, place: str) -> int:
+        """How many sensors look from a place."""
+        del place
+        return 1
 
     def begins(self, missing: Mapping[str, Sequence[str]], frames: int, processes: int) -> None:
         """What is left to do, and about how long that takes."""
         names = list(dict.fromkeys(name for its in missing.values() for name in its))
         left = sum(map(bool, missing.values()))
         if not left:
-            self._say(f"all that detectors find from {len(missing)} sites was kept from before")
+            self._say(f"all that detectors find from {len(missing)} {self.NOUN}s was kept from before")
             return
         kept = f" ({len(missing) - left} of {len(missing)} were kept from before)" if left < len(missing) else ""
         looks = {name: sum(name in its for its in missing.values()) for name in names}
-        looks["points"] = left  # the clouds, which all need
-        seconds = SITE_S * left + 1e-3 * frames * sum(FRAME_MS.get(name, 0.0) * count for name, count in looks.items())
+        looks["points"] = sum(self.clouds(place) for place, its in missing.items() if its)  # which all need
+        seconds = SITE_S * looks["points"] + 1e-3 * frames * sum(
+            FRAME_MS.get(name, 0.0) * count for name, count in looks.items()
+        )
         about = f"about {_duration(seconds / processes)} with a VLP-32C"
         unknown = [name for name in names if name not in FRAME_MS]
         but = f", and what {', '.join(unknown)} takes" if unknown else ""
         cores = f"{processes} process{'es' if processes > 1 else ''}"
-        sites = f"{left} site{'s' if left > 1 else ''}"
+        sites = f"{left} {self.NOUN}{'s' if left > 1 else ''}"
         self._say(f"{frames} frames from {sites}{kept}, {', '.join(names)}, {cores}: {about}{but}")
 
     def looked(self, site: str, detectors: Sequence[str], cost: Cost) -> None:
         """One line a site."""
         self._say(f"{cost.seconds:>8.1f} s   {site}: {', '.join(detectors)}")
+
+
+class FusedLines(LookLines):
+    """Tells in lines how far the looking from groups of sites is."""
+
+    NOUN = "group"
+
+    def clouds(self, place: str) -> int:
+        """How many sensors are in a group."""
+        return place.count(" + ") + 1
 
 
 def _duration(seconds: float) -> str:

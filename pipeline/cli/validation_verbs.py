@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pipeline.cli import arguments
 from pipeline.cli.arguments import Jobs, Out, ScenarioPath, Set
 from pipeline.core.errors import InputError, MissingBackendError
+
+if TYPE_CHECKING:
+    from pipeline.scenario.models import Scenario
 
 DEFAULT_FRAMES = 1000
 """Of validation: average precision, BEV + 3D on a scale from 0 to 200, then had a standard error of 2.4 to 6.5."""
@@ -67,9 +70,15 @@ def validate(
     keep: Annotated[
         bool, typer.Option("--keep", help="Also write ground truth and detections as KITTI labels and results.")
     ] = False,
+    plan: Annotated[
+        bool, typer.Option("--plan", help="Look from this run's plan (egvs place) instead: fused clouds of 1, 2, ...")
+    ] = False,
+    plan_from: Annotated[
+        Path | None, typer.Option("--plan-from", metavar="DIR", help="The same for the plan in another run's folder.")
+    ] = None,
     jobs: Jobs = None,
 ) -> None:
-    """What would detectors find from each site, and which score foretells it?"""
+    """What would detectors find from each site, and which score foretells it? And in the fused clouds of a plan?"""
     from pipeline.cli import validation_tables
     from pipeline.cli.progress import Screen
     from pipeline.runs.workflow import default_folder
@@ -79,12 +88,33 @@ def validate(
     loaded = load(scenario, set_ or ())
     folder = out or default_folder(loaded)
     names = [name.strip() for name in detector.split(",") if name.strip()]
+    if plan or plan_from is not None:
+        if detections is not None or keep:
+            option = "--keep" if keep else "--detections"
+            raise InputError(option, "given with a plan", "one of them: results are those of single sites")
+        _validate_plan(loaded, folder, plan_from or folder, frames, names, jobs)
+        return
     with Screen("validate") as screen:
         done = validating.validate(
             loaded, folder, frames=frames, detectors=names, detections=detections, keep=keep, jobs=jobs,
             progress=screen.progress, listener=validation_tables.LookLines(screen.say),
         )  # fmt: skip
     validation_tables.print_validation(loaded, folder, done)
+
+
+def _validate_plan(
+    loaded: Scenario, folder: Path, plan_folder: Path, frames: int, detectors: list[str], jobs: int | None
+) -> None:
+    from pipeline.cli import validation_tables
+    from pipeline.cli.progress import Screen
+    from pipeline.validation.fused import validating
+
+    with Screen("validate") as screen:
+        done = validating.validate(
+            loaded, folder, plan_folder, frames=frames, detectors=detectors, jobs=jobs, progress=screen.progress,
+            listener=validation_tables.FusedLines(screen.say),
+        )  # fmt: skip
+    validation_tables.print_plan_validation(done)
 
 
 def train(

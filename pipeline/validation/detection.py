@@ -98,8 +98,12 @@ def _together(doubts: Sequence[tuple[str, str, Finding]]) -> list[Finding]:
 
 def write(path: Path, rows: Sequence[SiteDetection], metadata: Mapping[str, Any]) -> None:
     """Write ``detection.parquet``."""
+    tables.write(path, "detection", {"site": [row.site for row in rows], **columns_of(rows)}, dict(metadata))
+
+
+def columns_of(rows: Sequence[SiteDetection]) -> dict[str, list[Any]]:
+    """All columns but the site's, by name."""
     columns: dict[str, list[Any]] = {
-        "site": [row.site for row in rows],
         "detector": [row.detector for row in rows],
         "objects_of": [row.objects_of for row in rows],
         "frames": [row.frames for row in rows],
@@ -110,7 +114,7 @@ def write(path: Path, rows: Sequence[SiteDetection], metadata: Mapping[str, Any]
     for name in MEASURES:
         columns[name] = [row.measures[name].value for row in rows]
         columns[f"{name}_se"] = [row.measures[name].se for row in rows]
-    tables.write(path, "detection", columns, dict(metadata))
+    return columns
 
 
 PRECISION = tuple(

@@ -1,7 +1,7 @@
 """Looks at all frames from each site with each detector, on all cores; what the store has is not looked at again.
 
-A site is one task: its sweeps are made once for all detectors that miss. Random numbers belong to a site and a frame,
-so neither cores nor order matter.
+Places are sites, or several sites at once (:mod:`pipeline.validation.fused`). A place is one task: its sweeps are made
+once for all detectors that miss. Random numbers belong to a site and a frame, so neither cores nor order matter.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, Protocol, TypeVar
 
 from pipeline.artefacts import schemas
 from pipeline.core import code_digest, files, parallel
@@ -37,8 +38,40 @@ from pipeline.validation.site_findings import POINTS, Found, FoundBoxes, FoundPo
 from pipeline.validation.sweeps import Detections
 from pipeline.validation.unseen_record import UnseenRecord
 
-_Task = tuple[Site, Sequence[str]]
-"""A site, and the detectors that look from it."""
+
+class Place(Protocol):
+    """What is looked from: it has a name of its own."""
+
+    @property
+    def name(self) -> str:
+        """Among the places that are looked from at once."""
+        raise NotImplementedError
+
+
+PlaceT = TypeVar("PlaceT", bound=Place)
+PlaceT_contra = TypeVar("PlaceT_contra", bound=Place, contravariant=True)
+
+
+class Looking(Protocol[PlaceT_contra]):
+    """A record seen from places of one kind by some detectors; can be sent to another process."""
+
+    @property
+    def record(self) -> UnseenRecord:
+        """Whose frames are looked at."""
+        raise NotImplementedError
+
+    @property
+    def names(self) -> list[str]:
+        """The detectors, points on vehicles first."""
+        raise NotImplementedError
+
+    def at(self, place: PlaceT_contra, names: Sequence[str]) -> dict[str, Found]:
+        """What some of the detectors find from a place."""
+        raise NotImplementedError
+
+    def key(self, place: PlaceT_contra, name: str) -> str:
+        """Hash of everything that a detector's findings from a place depend on."""
+        raise NotImplementedError
 
 
 class LookListener:
@@ -63,6 +96,11 @@ class Look:
 
     record: UnseenRecord
     detectors: dict[str, Detector]
+
+    @property
+    def names(self) -> list[str]:
+        """The detectors, points on vehicles first."""
+        return [POINTS, *self.detectors]
 
     @cached_property
     def scanner(self) -> Scanner:
@@ -110,8 +148,8 @@ _KIND = {FoundPoints: "points", FoundBoxes: "detections"}
 
 
 def look_from(
-    sites: Sequence[Site],
-    look: Look,
+    sites: Sequence[PlaceT],
+    look: Looking[PlaceT],
     *,
     jobs: int | None = None,
     progress: Progress = silent,
@@ -131,7 +169,7 @@ def look_from(
     RunError
         Where a process was ended from outside.
     """
-    names, told = [POINTS, *look.detectors], listener or LookListener()
+    names, told = look.names, listener or LookListener()
     found: dict[str, dict[str, Found]] = {}
     for site in sites:
         known = {name: _taken(_kind_of(name), look.key(site, name)) for name in names}
@@ -153,8 +191,8 @@ def look_from(
 
 
 def _each(
-    look: Look, tasks: Sequence[_Task], processes: int
-) -> Generator[tuple[Site, dict[str, Found], Cost], None, None]:
+    look: Looking[PlaceT], tasks: Sequence[tuple[PlaceT, Sequence[str]]], processes: int
+) -> Generator[tuple[PlaceT, dict[str, Found], Cost], None, None]:
     """Every task's findings, as they are ready; when an error or an interrupt ends it, what is at work ends too."""
     if processes <= 1:
         for task in tasks:
@@ -176,7 +214,9 @@ def _each(
         pool.shutdown(cancel_futures=True)
 
 
-def _submitted(pool: ProcessPoolExecutor, tasks: Sequence[_Task]) -> dict[Future[tuple[dict[str, Found], Cost]], Site]:
+def _submitted(
+    pool: ProcessPoolExecutor, tasks: Sequence[tuple[PlaceT, Sequence[str]]]
+) -> dict[Future[tuple[dict[str, Found], Cost]], PlaceT]:
     """All tasks, begun. Processes begin with the signals that are blocked here, and keep to that: an interrupt at the
     terminal reaches all, and is answered by the one that the user sees."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
@@ -186,17 +226,17 @@ def _submitted(pool: ProcessPoolExecutor, tasks: Sequence[_Task]) -> dict[Future
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _looked(look: Look, task: _Task) -> tuple[dict[str, Found], Cost]:
+def _looked(look: Looking[PlaceT], task: tuple[PlaceT, Sequence[str]]) -> tuple[dict[str, Found], Cost]:
     with measured() as cost:
         found = look.at(*task)
     return found, cost
 
 
-_ready: Look | None = None
+_ready: Looking[Any] | None = None
 """In a process of the pool: what it looks with."""
 
 
-def _begin(look: Look) -> None:
+def _begin(look: Looking[Any]) -> None:
     global _ready
     _ready = look
     os.environ["OMP_NUM_THREADS"] = "1"  # before scikit-learn is loaded: its threads would wait for one another
@@ -211,7 +251,7 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _work(task: _Task) -> tuple[dict[str, Found], Cost]:
+def _work(task: tuple[Place, Sequence[str]]) -> tuple[dict[str, Found], Cost]:
     assert _ready is not None
     return _looked(_ready, task)
 

@@ -7,10 +7,7 @@ was found; work out every score; correlate. ``detection.parquet``, ``surrogates.
 
 from __future__ import annotations
 
-import shutil
-import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,12 +17,11 @@ from numpy.typing import NDArray
 
 from pipeline.artefacts import checksums, schemas, tables
 from pipeline.artefacts.readers import VALIDATION_SUMS
-from pipeline.artefacts.traffic_frames import TrafficFrame
 from pipeline.core import files
 from pipeline.core.errors import InputError
-from pipeline.core.findings import WARNINGS, Finding, seen_from, warnings_of
+from pipeline.core.findings import WARNINGS, seen_from
 from pipeline.core.progress import Progress, silent
-from pipeline.runs import stage_keys, stages
+from pipeline.runs import stage_keys
 from pipeline.runs.guarding import keep_inputs
 from pipeline.runs.locking import alone
 from pipeline.runs.stages import RANKING
@@ -40,6 +36,7 @@ from pipeline.validation.detectors import kitti_results, registry
 from pipeline.validation.detectors.base import Detector
 from pipeline.validation.looking import Look, LookListener, look_from
 from pipeline.validation.metrics.matching import within
+from pipeline.validation.preparing import checked, not_unseen, refuse_empty, workshop
 from pipeline.validation.site_findings import POINTS, FoundBoxes
 from pipeline.validation.statistics.coefficients import KINDS
 from pipeline.validation.statistics.correlation import Study
@@ -49,7 +46,6 @@ from pipeline.validation.surrogates.gathering import Surrogates
 from pipeline.validation.unseen_record import UnseenRecord, prepare
 
 CORRELATION = "correlation.parquet"
-_WORK = ".validate-"
 
 
 def validate(
@@ -89,11 +85,11 @@ def validate(
     """
     chosen = {name: registry.make(name) for name in dict.fromkeys(detectors) if name != POINTS}
     _keep_inputs(scenario, out, detections, keep=keep)
-    with alone(out), _workshop(out) as folder:
-        doubts = _checked(scenario, folder / "check", progress)
+    with alone(out), workshop(out) as folder:
+        doubts = checked(scenario, folder / "check", progress)
         record = prepare(scenario, folder / "unseen", frames, jobs=jobs, progress=progress)
         watched = list(record.read())
-        _refuse_empty(scenario, record, watched)
+        refuse_empty(scenario, record, watched)
         given = _given(detections, record, chosen)
         look = Look(record, chosen)
         found = look_from(record.scene.sites, look, jobs=jobs, progress=progress, listener=listener)
@@ -101,7 +97,7 @@ def validate(
         rows, undefined = detection.measured(watched, record.scene.roi, found)
         surrogates = gathering.surrogates_of(scenario, folder / "scores", jobs=jobs, progress=progress)
         agreements = correlated(record.scene.sites, scenario, rows, surrogates)
-        told = (*doubts, *_not_unseen(scenario), *undefined, *surrogates.skipped)
+        told = (*doubts, *not_unseen(scenario), *undefined, *surrogates.skipped)
         done = Validation(tuple(rows), surrogates, tuple(agreements), told)
         _write(out, folder, scenario, record, done, given)
         if keep:
@@ -170,37 +166,6 @@ def _by_score(sites: Sequence[str], surrogates: Surrogates) -> dict[ScoreName, N
         name = ScoreName(row.score, row.parameters_json)
         found.setdefault(name, np.full(len(sites), np.nan))[place[row.site]] = row.sign * row.value
     return found
-
-
-@contextmanager
-def _workshop(out: Path) -> Iterator[Path]:
-    """A folder to work in, within the run's folder, which is held; those that were killed have left theirs."""
-    for left in out.glob(f"{_WORK}*"):
-        shutil.rmtree(left)
-    with tempfile.TemporaryDirectory(prefix=_WORK, dir=out) as folder:
-        yield Path(folder)
-
-
-def _checked(scenario: Scenario, folder: Path, progress: Progress) -> list[Finding]:
-    """What the check warns of; its errors are raised."""
-    folder.mkdir()
-    work = Workspace(scenario, folder, progress=progress)
-    made = stages.make("check", work, stage_keys.inputs("check", work).read)
-    return list(warnings_of([made.summary]))
-
-
-def _refuse_empty(scenario: Scenario, record: UnseenRecord, watched: Sequence[TrafficFrame]) -> None:
-    if not any(len(frame.wanted(record.scene.roi)) for frame in watched):
-        found = f"no vehicle's centre is in it in any of {record.frames} frames of unseen traffic"
-        raise InputError(f"{scenario.file}: roi", found, "a region with traffic, or more --frames")
-
-
-def _not_unseen(scenario: Scenario) -> list[Finding]:
-    """A warning where the frames are those that the TPOG was counted from."""
-    if not scenario.is_recorded:
-        return []
-    what = "the traffic is a finished file: sites are judged by frames that the TPOG was counted from"
-    return [Finding("seen traffic", f"{scenario.file}: traffic.fcd", what, "a network or a sumocfg has traffic unseen")]
 
 
 def _write(

@@ -18,7 +18,7 @@ def nothing_starts(monkeypatch):
     def started(*arguments, **_):
         raise AssertionError(f"work was started: {arguments}")
 
-    for module, name in ((validating, "_checked"), (validating, "prepare"), (unseen_record, "bring")):
+    for module, name in ((validating, "checked"), (validating, "prepare"), (unseen_record, "bring")):
         monkeypatch.setattr(module, name, started)
 
 

@@ -1,12 +1,13 @@
-"""Estimates the ground round a site from its empty scan, so that detectors count heights from it.
+"""Estimates the ground round a site, or several, from their empty scans, so that detectors count heights from it.
 
 Steps: the lowest return of each square; of these, what the ground can be: the highest surface below all returns that
 nowhere climbs more steeply than a street; between the squares that lie on it, straight lines; beyond them, the nearest.
-What is known to a roadside unit is used alone, its pose and its empty scan: no map.
+What is known to a roadside unit is used alone, its pose and its empty scan: no map. Several put their scans together.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,14 +47,20 @@ class GroundMap:
     @classmethod
     def of(cls, view: SiteView, roi: Roi) -> GroundMap:
         """The ground in and round the region of interest, as the site's empty scan has it."""
+        return cls.together((view,), roi)
+
+    @classmethod
+    def together(cls, views: Sequence[SiteView], roi: Roi) -> GroundMap:
+        """The same, as the empty scans of several sites have it."""
         low = np.asarray(roi.origin_m)[:2] - _AROUND_M
         shape = tuple(np.ceil((np.asarray(roi.size_m)[:2] + 2 * _AROUND_M) / SQUARE_M).astype(int).tolist())
-        points = empty_points(view)
+        points = np.concatenate([empty_points(view) for view in views])
         cell = np.floor((points[:, :2] - low) / SQUARE_M).astype(np.int64)
         inside = ((cell >= 0) & (cell < shape)).all(axis=1)
         lowest = np.full(shape, np.inf)
         np.minimum.at(lowest, tuple(cell[inside].T), points[inside, 2])
-        return cls(low + SQUARE_M / 2, _surface(lowest, fallback_m=float(points[:, 2].min(initial=view.pose.z_m))))
+        lowest_m = min(view.pose.z_m for view in views)
+        return cls(low + SQUARE_M / 2, _surface(lowest, fallback_m=float(points[:, 2].min(initial=lowest_m))))
 
     def height_m(self, xy_m: Floats) -> Floats:
         """The ground's z below places (n, 2) in the world frame, (n,)."""

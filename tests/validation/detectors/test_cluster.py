@@ -101,7 +101,8 @@ def test_what_a_pole_hides_of_a_car_is_completed():
     found = detector.detect(sweep)
     assert len(found.boxes) == 1
     assert overlaps([car], found)[0].min() > 0.7
-    blind = replace(detector, still=whole.still)  # did it not know of the column, it would take it for something short
+    # did it not know of the column, it would take it for something short
+    blind = replace(detector, joint=replace(detector.joint, still=whole.joint.still))
     assert overlaps([car], blind.detect(sweep))[0].min() < 0.7 if len(blind.detect(sweep).boxes) else True
 
 
@@ -121,7 +122,9 @@ def test_a_lorry_is_as_long_as_it_looks():
 def test_an_empty_sweep_and_one_point_are_nothing():
     detector, sweep = look([(12.0, 5.0, *CAR, 0.4)])
     assert detector.detect(Sweep(np.empty((0, 4), np.float32), np.empty(0, np.uint32))).boxes.shape == (0, 7)
-    new = np.flatnonzero(np.linalg.norm(sweep.points[:, :3], axis=1) < detector.view.empty_range_m[sweep.beam] - 1)[:1]
+    new = np.flatnonzero(
+        np.linalg.norm(sweep.points[:, :3], axis=1) < detector.joint.views[0].empty_range_m[sweep.beam] - 1
+    )[:1]
     assert len(new) == 1
     assert detector.detect(Sweep(sweep.points[new], sweep.beam[new])).scores.shape == (0,)
 

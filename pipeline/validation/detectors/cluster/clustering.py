@@ -4,16 +4,21 @@ Steps: points are averaged over small squares of the ground, so that a wall of p
 clustered by DBSCAN (Ester, Kriegel, Sander, Xu, KDD 1996), with a reach that grows with the range as the distance
 between two beams does. The result does not depend on the order of the points.
 
-Frame: the world's axes, x and y from the sensor, z from the ground, in metres.
+Points of several sensors share the squares. Each sensor's squares are clustered by its own range; squares of different
+sensors belong together where they are neighbours within the reach of a near one; what is linked either way is one.
+
+Frame: the world's axes, x and y from the sensor (of several, from the first), z from the ground, in metres.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from pipeline.core.errors import MissingBackendError
 
@@ -60,12 +65,15 @@ class Clusters:
         Mean of the points of each square, (s, 2) float64, cluster after cluster.
     square_starts
         As ``starts``, of the squares.
+    sensor
+        Which sensor each point is of, (n,) int64.
     """
 
     points_m: Floats
     starts: Ints
     squares_m: Floats
     square_starts: Ints
+    sensor: Ints
 
     def __len__(self) -> int:
         return len(self.starts) - 1
@@ -74,6 +82,12 @@ class Clusters:
     def of_point(self) -> Ints:
         """The cluster of each point, (n,)."""
         return np.repeat(np.arange(len(self)), np.diff(self.starts))
+
+    def from_place(self, at_m: Floats) -> Clusters:
+        """The same as seen from another place, its x, y from here."""
+        if not at_m.any():
+            return self
+        return replace(self, points_m=self.points_m - np.append(at_m, 0.0), squares_m=self.squares_m - at_m)
 
     @property
     def top_m(self) -> Floats:
@@ -84,24 +98,39 @@ class Clusters:
         return found
 
 
-def clusters_of(points_m: Floats, density: Density) -> Clusters:
+ONE_SENSOR_M = np.zeros((1, 2))
+"""Where a single sensor is: at the origin."""
+
+
+def clusters_of(
+    points_m: Floats, density: Density, sensor: Ints | None = None, sensors_m: Floats = ONE_SENSOR_M
+) -> Clusters:
     """Cluster points (n, 3).
+
+    Parameters
+    ----------
+    sensor
+        Which sensor each point is of, (n,); the only one when None.
+    sensors_m
+        Where sensors are in plan, (k, 2).
 
     Raises
     ------
     MissingBackendError
         When scikit-learn is not installed.
     """
-    points_m = points_m[np.lexsort(points_m.T)]
+    sensor = np.zeros(len(points_m), dtype=np.int64) if sensor is None else sensor
+    order = np.lexsort((sensor, *points_m.T))
+    points_m, sensor = points_m[order], sensor[order]
     ids = np.floor(points_m[:, :2] / SQUARE_M).astype(np.int64)
     _, square = np.unique(ids[:, 0] * 2**32 + ids[:, 1], return_inverse=True)
     count = np.bincount(square)
     squares_m = np.column_stack([np.bincount(square, points_m[:, axis]) / count for axis in range(2)])
-    label = _dbscan(squares_m, density)
+    label = _labels(squares_m, square, sensor, sensors_m, density)
     label = _large_ones(label, np.bincount(label[square] + 1, minlength=1)[1:], density.least_points)
     points, starts = _in_order(label[square])
     squares, square_starts = _in_order(label)
-    return Clusters(points_m[points], starts, squares_m[squares], square_starts)
+    return Clusters(points_m[points], starts, squares_m[squares], square_starts, sensor[points])
 
 
 def _large_ones(label: Ints, points: Ints, least: int) -> Ints:
@@ -119,13 +148,40 @@ def _in_order(label: Ints) -> tuple[Ints, Ints]:
     return order[starts[0] :], starts - starts[0]
 
 
-def _dbscan(squares_m: Floats, density: Density) -> Ints:
-    """The cluster of each square, -1 for none."""
-    if not len(squares_m):
+def _labels(squares_m: Floats, square: Ints, sensor: Ints, sensors_m: Floats, density: Density) -> Ints:
+    """The cluster of each square, -1 for none; ``square`` and ``sensor`` are those of each point."""
+    if len(sensors_m) == 1:
+        return _dbscan(_warped(squares_m, density), density)
+    linked = [_dbscan(squares_m / density.reach_m, density)]
+    for number, at_m in enumerate(sensors_m):
+        rows = np.unique(square[sensor == number])
+        label = np.full(len(squares_m), _NO_CLUSTER)
+        label[rows] = _dbscan(_warped(squares_m[rows] - at_m, density), density)
+        linked.append(label)
+    return _united(linked)
+
+
+def _united(labels: list[Ints]) -> Ints:
+    """Clusters of those that share a cluster of any of several labellings, directly or through others; -1 for none."""
+    count = len(labels[0])
+    if not count:
+        return labels[0]
+    first = count + np.cumsum([0, *(label.max(initial=_NO_CLUSTER) + 1 for label in labels)])
+    ends = [np.flatnonzero(label >= 0) for label in labels]
+    squares = np.concatenate(ends)
+    nodes = np.concatenate([label[rows] + start for label, rows, start in zip(labels, ends, first[:-1], strict=True)])
+    links = coo_array((np.ones(len(squares), dtype=np.int8), (squares, nodes)), shape=(first[-1], first[-1]))
+    found = np.full(count, _NO_CLUSTER)
+    inside = np.unique(squares)
+    found[inside] = np.unique(connected_components(links, directed=False)[1][inside], return_inverse=True)[1]
+    return found
+
+
+def _dbscan(places: Floats, density: Density) -> Ints:
+    """The cluster of each place where a distance of 1 is the reach, -1 for none."""
+    if not len(places):
         return np.empty(0, dtype=np.int64)
-    found: Ints = _scikit_learn()(eps=1.0, min_samples=density.core_squares, algorithm="kd_tree").fit_predict(
-        _warped(squares_m, density)
-    )
+    found: Ints = _scikit_learn()(eps=1.0, min_samples=density.core_squares, algorithm="kd_tree").fit_predict(places)
     return found.astype(np.int64)
 
 

@@ -3,10 +3,15 @@
 Steps of a sweep: take the background off, beam by beam (:mod:`pipeline.validation.detectors.background`); count heights
 from the ground (:mod:`pipeline.validation.detectors.ground`); cluster; fit a rectangle to each cluster; see what hides
 the rest of it; complete it to the nearest kind, away from the sensor. People and bicycles are kinds too, and left out.
+
+With several sensors each takes its own background off, by its own empty scan; the new points of all are clustered
+together, in the world's axes, over the ground that all empty scans show. A cluster with the points of all is then
+completed as the sensor sees it that has most points on it: away from that one, by what hides it from there.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, ClassVar
 
@@ -18,7 +23,7 @@ from pipeline.core.grid import Roi
 from pipeline.validation.detectors import background
 from pipeline.validation.detectors.cluster import hiding, kinds
 from pipeline.validation.detectors.cluster.clustering import Clusters, Density, clusters_of
-from pipeline.validation.detectors.cluster.completing import Completed, Tolerances, complete
+from pipeline.validation.detectors.cluster.completing import Tolerances, complete
 from pipeline.validation.detectors.cluster.hiding import RangeImage
 from pipeline.validation.detectors.cluster.l_shape import rectangles
 from pipeline.validation.detectors.ground import GroundMap, empty_points
@@ -54,58 +59,96 @@ class Cluster:
 
     def at(self, view: SiteView, roi: Roi) -> ClusterAtSite:
         """The detector at one site."""
-        ground, points = GroundMap.of(view, roi), empty_points(view)
-        upright = points[points[:, 2] - ground.height_m(points[:, :2]) > HEIGHTS_M[0]]
-        return ClusterAtSite(self, view, roi, ground, RangeImage.of(upright - np.asarray(view.pose.position_m)))
+        return ClusterAtSite(self.together((view,), roi))
+
+    def together(self, views: Sequence[SiteView], roi: Roi) -> ClusterAtSites:
+        """The detector at several sites."""
+        ground, still = GroundMap.together(views, roi), []
+        for view in views:
+            points = empty_points(view)
+            upright = points[points[:, 2] - ground.height_m(points[:, :2]) > HEIGHTS_M[0]]
+            still.append(RangeImage.of(upright - np.asarray(view.pose.position_m)))
+        return ClusterAtSites(self, tuple(views), roi, ground, tuple(still))
 
 
 @dataclass(frozen=True)
 class ClusterAtSite:
-    """The detector at one site; ``still`` is what of the static world may hide vehicles."""
+    """The detector at one site."""
 
-    detector: Cluster
-    view: SiteView
-    roi: Roi
-    ground: GroundMap
-    still: RangeImage
+    joint: ClusterAtSites
 
     def detect(self, sweep: Sweep) -> Detections:
         """The vehicles of one sweep."""
-        new = background.new_in(sweep, self.view)
-        points_m = background.in_world(Sweep(sweep.points[new], sweep.beam[new]), self.view)
-        sensor_m = np.asarray(self.view.pose.position_m)
-        clusters = clusters_of(self._near_the_ground(points_m), self.detector.density)
+        return self.joint.detect((sweep,))
+
+
+@dataclass(frozen=True)
+class ClusterAtSites:
+    """The detector at some sites; ``still`` is what of the static world may hide vehicles, as each of them sees it."""
+
+    detector: Cluster
+    views: tuple[SiteView, ...]
+    roi: Roi
+    ground: GroundMap
+    still: tuple[RangeImage, ...]
+
+    @property
+    def _at_m(self) -> Floats:
+        """Where the sensors are in the world frame, (k, 3)."""
+        return np.array([view.pose.position_m for view in self.views])
+
+    def detect(self, sweeps: Sequence[Sweep]) -> Detections:
+        """The vehicles of one instant."""
+        each = [_new(sweep, view) for sweep, view in zip(sweeps, self.views, strict=True)]
+        points_m, sensor = np.concatenate(each), np.repeat(np.arange(len(each)), [len(its) for its in each])
+        near_m, kept = self._near_the_ground(points_m)
+        from_first_m = self._at_m[:, :2] - self._at_m[0, :2]
+        clusters = clusters_of(near_m, self.detector.density, sensor[kept], from_first_m)
         if not len(clusters):
             return Detections.none()
+        points_on = np.zeros((len(self.views), len(clusters)), dtype=np.int64)
+        np.add.at(points_on, (clusters.sensor, clusters.of_point), 1)
+        best = points_on.argmax(axis=0)
+        found = [self._seen_from(k, clusters, best == k, points_m) for k in np.unique(best).tolist()]
+        boxes, cost, points = (np.concatenate(its) for its in zip(*found, strict=True))
+        return apart(Detections(boxes, scores(points, cost)), points)
+
+    def _near_the_ground(self, points_m: Floats) -> tuple[Floats, NDArray[np.int64]]:
+        """The points in and round the region of interest, x, y from the first sensor, z from the ground; which."""
+        low = np.asarray(self.roi.origin_m)[:2] - AROUND_M
+        high = low + np.asarray(self.roi.size_m)[:2] + 2 * AROUND_M
+        rows = np.flatnonzero(((points_m[:, :2] >= low) & (points_m[:, :2] <= high)).all(axis=1))
+        above_m = points_m[rows, 2] - self.ground.height_m(points_m[rows, :2])
+        kept = (above_m > HEIGHTS_M[0]) & (above_m < HEIGHTS_M[1])
+        rows = rows[kept]
+        return np.column_stack([points_m[rows, :2] - self._at_m[0, :2], above_m[kept]]), rows
+
+    def _seen_from(
+        self, k: int, clusters: Clusters, wanted: NDArray[np.bool_], points_m: Floats
+    ) -> tuple[Floats, Floats, NDArray[np.int64]]:
+        """Boxes in the world frame, costs and points of some clusters that are vehicles, as one sensor sees them."""
+        sensor_m = self._at_m[k]
+        clusters = clusters.from_place(sensor_m[:2] - self._at_m[0, :2])
         own_m = clusters.points_m.copy()
         own_m[:, 2] += self.ground.height_m(own_m[:, :2] + sensor_m[:2]) - sensor_m[2]
-        image = self.still.with_points(points_m - sensor_m, np.full(len(points_m), -1))
+        image = self.still[k].with_points(points_m - sensor_m, np.full(len(points_m), -1))
         image = image.with_points(own_m, clusters.of_point)
         found = rectangles(clusters.squares_m, clusters.square_starts)
         spans = hiding.spans_of(own_m, clusters, image)
         hidden = hiding.hidden_ends(clusters, found, spans)
         table = kinds.kinds()
-        boxes = complete(found, hidden, spans, clusters.top_m, table, self.detector.tolerances)
-        return self._detections(boxes, clusters, table.is_vehicle)
-
-    def _near_the_ground(self, points_m: Floats) -> Floats:
-        """The points in and round the region of interest: x, y from the sensor, z from the ground."""
-        low = np.asarray(self.roi.origin_m)[:2] - AROUND_M
-        high = low + np.asarray(self.roi.size_m)[:2] + 2 * AROUND_M
-        points_m = points_m[((points_m[:, :2] >= low) & (points_m[:, :2] <= high)).all(axis=1)]
-        above_m = points_m[:, 2] - self.ground.height_m(points_m[:, :2])
-        kept = (above_m > HEIGHTS_M[0]) & (above_m < HEIGHTS_M[1])
-        xy_m = points_m[kept, :2] - np.asarray(self.view.pose.position_m)[:2]
-        return np.column_stack([xy_m, above_m[kept]])
-
-    def _detections(self, found: Completed, clusters: Clusters, is_vehicle: NDArray[np.bool_]) -> Detections:
-        """Those that are vehicles, in the world frame, with scores."""
-        vehicles = is_vehicle[found.kind]
-        boxes = found.boxes[vehicles]
-        boxes[:, :2] += np.asarray(self.view.pose.position_m)[:2]
+        done = complete(found, hidden, spans, clusters.top_m, table, self.detector.tolerances)
+        rows = wanted & table.is_vehicle[done.kind]
+        boxes = done.boxes[rows]
+        boxes[:, :2] += sensor_m[:2]
         boxes[:, 2] += self.ground.height_m(boxes[:, :2])
-        points = np.diff(clusters.starts)[vehicles]
-        return apart(Detections(boxes, scores(points, found.cost[vehicles])), points)
+        return boxes, done.cost[rows], np.diff(clusters.starts)[rows]
+
+
+def _new(sweep: Sweep, view: SiteView) -> Floats:
+    """What is new since a sensor's empty scan, in the world frame, (n, 3)."""
+    new = background.new_in(sweep, view)
+    return background.in_world(Sweep(sweep.points[new], sweep.beam[new]), view)
 
 
 def scores(points: NDArray[np.int64], cost: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""PointPillars at a site: the shipped model, run by onnxruntime on one core.
+"""PointPillars at a site, or at several: the shipped model, run by onnxruntime on one core.
 
 Steps for a sweep: heights over the ground, pillars, the network, boxes; windows that together cover the region of
 interest each keep what is in their own part of it; of two boxes that overlap, the surer one stays.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -51,7 +52,11 @@ class PointPillars:
 
     def at(self, view: SiteView, roi: Roi) -> _AtSite:
         """The detector at one site."""
-        return _AtSite(Model.of(self.model), view, roi)
+        return _AtSite(self.together((view,), roi))
+
+    def together(self, views: Sequence[SiteView], roi: Roi) -> _AtSites:
+        """The detector at several sites."""
+        return _AtSites(Model.of(self.model), tuple(views), roi)
 
 
 @dataclass(frozen=True)
@@ -109,8 +114,19 @@ class Model:
 class _AtSite:
     """The detector at one site."""
 
+    joint: _AtSites
+
+    def detect(self, sweep: Sweep) -> Detections:
+        """The vehicles of one sweep."""
+        return self.joint.detect((sweep,))
+
+
+@dataclass(frozen=True)
+class _AtSites:
+    """The detector at some sites, whose points are put together."""
+
     model: Model
-    view: SiteView
+    views: tuple[SiteView, ...]
     roi: Roi
 
     @cached_property
@@ -119,11 +135,11 @@ class _AtSite:
 
     @cached_property
     def _zero(self) -> HeightZero:
-        return HeightZero(self.model.about["convention"], self.view, self.roi)
+        return HeightZero(self.model.about["convention"], self.views[0], self.roi, self.views[1:])
 
-    def detect(self, sweep: Sweep) -> Detections:
-        """The vehicles of one sweep."""
-        seen = SeenPoints.of(sweep, self.view, self._zero)
+    def detect(self, sweeps: Sequence[Sweep]) -> Detections:
+        """The vehicles of one instant."""
+        seen = SeenPoints.together(sweeps, self.views, self._zero)
         found = [self._in(window, seen) for window in self._windows]
         boxes, scores = np.concatenate([f.boxes for f in found]), np.concatenate([f.scores for f in found])
         return apart(Detections(boxes, scores), scores)

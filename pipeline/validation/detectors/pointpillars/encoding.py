@@ -5,6 +5,9 @@ ground (:mod:`pipeline.validation.detectors.ground`), so that it does not matter
 convention, that of detectors made for cars (heights from the sensor, from 3 m below it to 1 m above), is here to show
 what it does.
 
+Several sensors' points are put together in the world frame; whether a point is new, and its range, are said by the
+sensor that it is of.
+
 Features of a point: from the pillar's centre (x, y), height, intensity, from the mean of the pillar's points (x, y, z),
 whether it is new since the empty scan, and its share of 50 m from the sensor.
 """
@@ -12,6 +15,7 @@ whether it is new since the empty scan, and its share of 50 m from the sensor.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -79,7 +83,7 @@ class Window:
 
 @dataclass(frozen=True)
 class SeenPoints:
-    """The points of a sweep with all that pillars tell of them.
+    """The points of a sweep, or of several, with all that pillars tell of them.
 
     Attributes
     ----------
@@ -100,6 +104,23 @@ class SeenPoints:
     @classmethod
     def of(cls, sweep: Sweep, view: SiteView, zero: HeightZero) -> SeenPoints:
         """Of a sweep."""
+        return cls.together((sweep,), (view,), zero)
+
+    @classmethod
+    def together(cls, sweeps: Sequence[Sweep], views: Sequence[SiteView], zero: HeightZero) -> SeenPoints:
+        """Of the sweeps of one instant, in the order of the sites."""
+        each = [cls._of_one(sweep, view, zero) for sweep, view in zip(sweeps, views, strict=True)]
+        if len(each) == 1:
+            return each[0]
+        return cls(
+            *(
+                np.concatenate([getattr(its, name) for its in each])
+                for name in ("xy_m", "height_m", "intensity", "new", "range_m")
+            )
+        )
+
+    @classmethod
+    def _of_one(cls, sweep: Sweep, view: SiteView, zero: HeightZero) -> SeenPoints:
         at = background.in_world(sweep, view)
         range_m = np.sqrt((sweep.points[:, :3].astype(np.float64) ** 2).sum(axis=1))
         heights = at[:, 2] - zero.below_m(at[:, :2])
@@ -107,10 +128,10 @@ class SeenPoints:
 
 
 class HeightZero:
-    """What heights are counted from at one site."""
+    """What heights are counted from at one site, or at several: their ground, or the first one's sensor."""
 
-    def __init__(self, convention: Convention, view: SiteView, roi: Roi) -> None:
-        self._ground = GroundMap.of(view, roi) if convention == "ground" else None
+    def __init__(self, convention: Convention, view: SiteView, roi: Roi, others: Sequence[SiteView] = ()) -> None:
+        self._ground = GroundMap.together((view, *others), roi) if convention == "ground" else None
         self._sensor_m = view.pose.z_m
 
     def below_m(self, xy_m: Floats) -> Floats:

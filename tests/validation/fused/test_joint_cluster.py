@@ -1,0 +1,98 @@
+"""The detector cluster with several sensors, on scenes small enough to know the answer."""
+
+from dataclasses import replace
+
+import hypothesis
+import numpy as np
+import pytest
+from hypothesis import strategies
+
+from pipeline.sensing.sites import Pose
+from pipeline.validation.detectors.cluster.clustering import Density, _united, clusters_of
+from pipeline.validation.detectors.cluster.detector import Cluster
+from pipeline.validation.sweeps import Detections, Sweep
+from tests.validation.detectors.test_cluster import CAR, ROI, look, overlaps
+
+NEAR, FAR = Pose(0.0, 0.0, 4.0), Pose(0.0, 30.0, 4.0, yaw_deg=40.0)
+
+
+def fused(boxes, poses, still=(), noise_m=0.0):
+    """What sensors find together, and what each finds alone."""
+    seen = [look(boxes, pose, still=still, noise_m=noise_m) for pose in poses]
+    joint = Cluster().together([detector.joint.views[0] for detector, _ in seen], ROI)
+    return joint.detect([sweep for _, sweep in seen]), [detector.detect(sweep) for detector, sweep in seen]
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.7, 1.6])
+def test_a_car_between_two_sensors_is_found_once(yaw):
+    boxes = [(4.0, 15.0, *CAR, yaw)]
+    found, alone = fused(boxes, [NEAR, FAR], noise_m=0.03)
+    assert len(found.scores) == 1 and overlaps(boxes, found).min() > 0.7
+    assert found.scores[0] > 0.5 * max(its.scores.max() for its in alone)
+
+
+def test_one_finds_what_is_hidden_from_the_other():
+    wall = (0.0, 20.0, 60.0, 0.4, 6.0, 0.0)
+    boxes = [(12.0, 5.0, *CAR, 0.4), (-12.0, 26.0, *CAR, 0.4)]
+    found, alone = fused(boxes, [NEAR, replace(FAR, y_m=40.0)], still=[wall])
+    assert overlaps(boxes, found).min() > 0.7
+    assert [len(its.scores) for its in alone] == [1, 1]
+    assert [overlaps(boxes[k : k + 1], alone[k]).min() > 0.7 for k in (0, 1)] == [True, True]
+
+
+def test_each_takes_off_its_own_background():
+    still = [(3.0, 8.0, 1.3, 0.5, 2.0, 0.4), (-5.0, 18.0, 2.0, 2.0, 2.0, 0.0)]
+    found, _ = fused([], [NEAR, FAR], still=still, noise_m=0.02)
+    assert len(found.scores) == 0
+
+
+def test_sensors_that_see_nothing_new_change_nothing():
+    boxes = [(6.0, 5.0, *CAR, 0.3)]
+    far_off = replace(NEAR, x_m=3000.0)
+    found, (alone, nothing) = fused(boxes, [NEAR, far_off])
+    assert len(nothing.scores) == 0
+    np.testing.assert_allclose(found.boxes, alone.boxes, atol=1e-9)
+    np.testing.assert_allclose(found.scores, alone.scores)
+
+
+def test_sweeps_without_points_are_nothing():
+    detector, _ = look([], NEAR)
+    joint = Cluster().together([detector.joint.views[0]] * 2, ROI)
+    empty = Sweep(np.empty((0, 4), np.float32), np.empty(0, np.uint32))
+    assert joint.detect([empty, empty]).boxes.shape == Detections.none().boxes.shape
+
+
+def test_neighbours_of_different_sensors_are_linked_and_others_are_not():
+    density = Density(least_points=2)
+    points = np.array([[10.0, 0.05, 1.0], [10.5, 0.05, 1.0], [11.3, 0.05, 1.0], [40.0, 0.05, 1.0], [40.75, 0.05, 1.0]])
+    sensors_m = np.array([[0.0, 0.0], [45.0, 0.0]])
+
+    def sizes(sensor):
+        return np.diff(clusters_of(points, density, np.array(sensor), sensors_m).starts).tolist()
+
+    assert sizes([0, 1, 0, 0, 0]) == [2, 2]  # 0.5 m apart; and 0.75 m, near at a range of 40 m
+    assert sizes([0, 1, 0, 1, 1]) == [2]  # but not at 5 m
+    assert sizes([0, 1, 0, 0, 1]) == [2]  # nor between sensors
+
+
+LABELS = strategies.lists(strategies.integers(-1, 4), min_size=8, max_size=8)
+
+
+@hypothesis.given(strategies.lists(LABELS, min_size=1, max_size=3))
+def test_what_is_linked_any_way_is_one(labels):
+    found = _united([_compact(label) for label in labels])
+    linked = np.zeros((8, 8), dtype=bool)
+    for label in labels:
+        linked |= (np.equal.outer(label, label)) & (np.array(label) >= 0)
+    for _ in range(8):  # whatever is reached in so many steps
+        linked = (linked.astype(int) @ linked.astype(int)) > 0
+    for i in range(8):
+        assert (found[i] >= 0) == linked[i, i]
+        for j in range(8):
+            assert (found[i] == found[j] and found[i] >= 0) == bool(linked[i, j])
+
+
+def _compact(label):
+    """As DBSCAN numbers clusters: 0, 1, ..."""
+    known = sorted({its for its in label if its >= 0})
+    return np.array([known.index(its) if its >= 0 else -1 for its in label])
