@@ -1,0 +1,1 @@
+"""Measurements of plans of several sensors."""
