@@ -10,6 +10,9 @@ rest, the other end does. The smallest cost wins:
 with the azimuth :math:`\Delta\alpha` by which the box ends elsewhere than the cluster, as far as nothing hides it; the
 extent e that was seen and the box's size s along an axis; its height h, the highest point t, and the kind's share q of
 the traffic. So a box that beams have passed through loses to one that they could not have met.
+
+Where another sensor shows an end that this one does not, it stays as well; an axis of which both ends stay is as long
+as it is seen, with :math:`\sigma_o` either way.
 """
 
 from __future__ import annotations
@@ -72,7 +75,13 @@ class Completed:
 
 
 def complete(
-    found: Rectangles, hidden: NDArray[np.bool_], spans: Spans, top_m: Floats, kinds: Kinds, tolerances: Tolerances
+    found: Rectangles,
+    hidden: NDArray[np.bool_],
+    shown: NDArray[np.bool_],
+    spans: Spans,
+    top_m: Floats,
+    kinds: Kinds,
+    tolerances: Tolerances,
 ) -> Completed:
     """The best box of each cluster.
 
@@ -80,17 +89,19 @@ def complete(
     ----------
     found, hidden, spans
         Its rectangle, which ends of it are no sides, (m, 2, 2), and where it ends as the sensor sees it.
+    shown
+        Which ends other sensors show to be sides, (m, 2, 2).
     top_m
         Its highest point, from the ground, (m,).
     """
     along = kinds.size_m[:, :2]
     size = np.stack([along, along[:, ::-1]])[None]  # (1, turned, kind, axis): the length along axis 0, or along axis 1
-    fixed_m, way = _fixed(found.ends_m, hidden)
+    fixed_m, way, whole = _fixed(found.ends_m, hidden, shown)
     centre = fixed_m[:, None, None, :] + 0.5 * way[:, None, None, :] * size
     extent = found.ends_m[..., 1] - found.ends_m[..., 0]
     range_m = np.hypot(*found.ends_m.mean(axis=2).T)
     cost = _end_cost(centre, size, found.yaw_rad, spans, range_m, tolerances)
-    cost += _size_cost(size, extent, tolerances)
+    cost += _size_cost(size, extent, whole, tolerances)
     height_m = tolerances.height_m + tolerances.height_per_range * range_m
     cost += (((kinds.size_m[:, 2] - top_m[:, None]) / height_m[:, None]) ** 2)[:, None]
     cost -= 2.0 * np.log(kinds.share / kinds.share.sum())
@@ -104,22 +115,28 @@ def complete(
     return Completed(boxes, kind, cost[rows, turned, kind])
 
 
-def _fixed(ends_m: Floats, hidden: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-    """What stays along each axis, and which way the box goes on from there (0: both ways), both (m, 2).
+def _fixed(
+    ends_m: Floats, hidden: NDArray[np.bool_], shown: NDArray[np.bool_]
+) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """What stays along each axis, which way the box goes on from there (0: both ways), whether both ends are sides that
+    were seen; all (m, 2).
 
     The sensor is at 0 of both axes. One that is between the ends sees both; where both are hidden, neither is known.
     """
     low_m, high_m = ends_m[..., 0], ends_m[..., 1]
-    low_stays = ~hidden[..., 0] & ((low_m > 0.0) | hidden[..., 1])
-    high_stays = ~hidden[..., 1] & ((high_m < 0.0) | hidden[..., 0])
-    fixed_m = np.where(low_stays, low_m, np.where(high_stays, high_m, 0.5 * (low_m + high_m)))
-    return fixed_m, low_stays.astype(np.float64) - high_stays
+    low_seen = (~hidden[..., 0] & (low_m > 0.0)) | shown[..., 0]
+    high_seen = (~hidden[..., 1] & (high_m < 0.0)) | shown[..., 1]
+    low_stays = low_seen | (~hidden[..., 0] & hidden[..., 1])
+    high_stays = high_seen | (~hidden[..., 1] & hidden[..., 0])
+    one = np.where(low_stays, low_m, high_m)
+    fixed_m = np.where(low_stays ^ high_stays, one, 0.5 * (low_m + high_m))
+    return fixed_m, low_stays.astype(np.float64) - high_stays, low_seen & high_seen
 
 
-def _size_cost(size: Floats, extent: Floats, tolerances: Tolerances) -> Floats:
+def _size_cost(size: Floats, extent: Floats, whole: NDArray[np.bool_], tolerances: Tolerances) -> Floats:
     """What it costs that a box is smaller or larger than what is seen, (m, 2, kinds)."""
     larger = size - extent[:, None, None, :]
-    off = np.where(larger < 0.0, larger / tolerances.over_m, larger / tolerances.under_m)
+    off = np.where((larger < 0.0) | whole[:, None, None, :], larger / tolerances.over_m, larger / tolerances.under_m)
     cost: Floats = (off**2).sum(axis=3)
     return cost
 

@@ -6,7 +6,8 @@ the rest of it; complete it to the nearest kind, away from the sensor. People an
 
 With several sensors each takes its own background off, by its own empty scan; the new points of all are clustered
 together, in the world's axes, over the ground that all empty scans show. A cluster with the points of all is then
-completed as the sensor sees it that has most points on it: away from that one, by what hides it from there.
+completed as the sensor sees it that has most points on it: away from that one, by what hides it from there, and
+between the ends that other sensors show.
 """
 
 from __future__ import annotations
@@ -137,7 +138,8 @@ class ClusterAtSites:
         spans = hiding.spans_of(own_m, clusters, image)
         hidden = hiding.hidden_ends(clusters, found, spans)
         table = kinds.kinds()
-        done = complete(found, hidden, spans, clusters.top_m, table, self.detector.tolerances)
+        shown = hiding.shown_ends(clusters, found, self._at_m[:, :2] - sensor_m[:2], k)
+        done = complete(found, hidden, shown, spans, clusters.top_m, table, self.detector.tolerances)
         rows = wanted & table.is_vehicle[done.kind]
         boxes = done.boxes[rows]
         boxes[:, :2] += sensor_m[:2]

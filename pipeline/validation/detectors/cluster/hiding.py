@@ -149,6 +149,35 @@ def hidden_ends(clusters: Clusters, found: Rectangles, spans: Spans) -> Bools:
     return ends
 
 
+def shown_ends(clusters: Clusters, found: Rectangles, sensors_m: Floats, but: int) -> Bools:
+    """Which ends of the rectangles other sensors show: they face them, and have points on them spread as on a side.
+
+    Parameters
+    ----------
+    sensors_m
+        Where the sensors are in plan, in the clusters' frame, (s, 2).
+    but
+        The sensor that is left out.
+
+    Returns
+    -------
+    NDArray
+        Of the low and the high end along both axes, (m, 2, 2) bool.
+    """
+    ends = np.zeros((len(clusters), 2, 2), dtype=np.bool_)
+    for k in range(len(clusters)):
+        rows = slice(clusters.starts[k], clusters.starts[k + 1])
+        uv_m, sensor = found.along_axes(k, clusters.points_m[rows, :2]), clusters.sensor[rows]
+        from_m = found.along_axes(k, sensors_m)
+        for other in np.setdiff1d(sensor, but).tolist():
+            for axis, end in np.ndindex(2, 2):
+                beyond_m = (from_m[other, axis] - found.ends_m[k, axis, end]) * (1 if end else -1)
+                on_end = (sensor == other) & (np.abs(uv_m[:, axis] - found.ends_m[k, axis, end]) < _ON_END_M)
+                if beyond_m > 0.0 and on_end.any():
+                    ends[k, axis, end] |= np.ptp(uv_m[on_end, 1 - axis]) >= _SIDE_M
+    return ends
+
+
 def _cells(points_m: Floats) -> tuple[Ints, Ints, Floats]:
     """Column and row of points (n, 3) in the image, and their horizontal ranges."""
     range_m = np.hypot(points_m[:, 0], points_m[:, 1])
