@@ -169,10 +169,8 @@ def _is_sound(key: str, value: Any) -> bool:
         return isinstance(value, list) and all(isinstance(s, dict) and all(k in s for k in _SITE) for s in value)
     if key == "periods":
         return periods.are_sound(value)
-    if key in ("inputs", "score"):
+    if key == "inputs":
         return isinstance(value, str)
-    if key in ("bound", "certificate"):
-        return isinstance(value, float) and 0 <= value < math.inf
     if key == "cells":
         return _are_cells(value)
     if key == "plan":

@@ -20,7 +20,7 @@ from pipeline.scenario.models import Scenario
 _CLOUDS = (".ply", ".pcd")
 """Ends of ``scan_<site>``, which ``egvs scan --points`` writes."""
 
-_UNSHOWN = ("surrogates.parquet", ACCURACY_SUMS, VALIDATION_SUMS, PLACEMENT_SUMS)
+_UNSHOWN = ("surrogates.parquet", "fused.parquet", ACCURACY_SUMS, VALIDATION_SUMS, PLACEMENT_SUMS)
 """What studies leave beside what the report shows."""
 
 

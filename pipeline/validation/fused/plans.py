@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.artefacts import tables
+from pipeline.artefacts import checksums, tables
+from pipeline.artefacts.readers import PLACEMENT_SUMS
 from pipeline.core.errors import InputError
 from pipeline.placement.writing import PLACEMENT
 from pipeline.scenario.models import Scenario
@@ -73,6 +74,7 @@ def read(folder: Path, scenario: Scenario) -> Plan:
     if not path.is_file():
         right = f"egvs place {scenario.name} --count 3 makes one; --plan-from names the folder of another"
         raise InputError(path, "no such file: no plan was made there", right)
+    checksums.check(path.with_name(PLACEMENT_SUMS), "run egvs place again")
     table, about = tables.read(path, "placement")
     of = about.get("scenario")
     if not isinstance(of, dict) or of.get("name") != scenario.name:
@@ -87,7 +89,7 @@ def read(folder: Path, scenario: Scenario) -> Plan:
         sensors.of_scenario(site.sensor, scenario, f"{path}: {site.name}")
         point_clouds.check(site)
     stages = about["stages"]
-    return Plan(path, sites, str(about["score"]), str(about["inputs"]), str(stages.get("statics", "")))
+    return Plan(path, sites, str(about["plan"].get("score")), str(about["inputs"]), str(stages.get("statics", "")))
 
 
 def _site(path: Path, row: dict[str, Any], points: str | None) -> Site:

@@ -19,6 +19,7 @@ from pipeline.core import files
 from pipeline.core.errors import InputError
 from pipeline.core.findings import WARNINGS, Finding, seen_from
 from pipeline.core.progress import Progress, silent
+from pipeline.runs.guarding import keep_inputs
 from pipeline.runs.locking import alone
 from pipeline.scenario.models import Scenario
 from pipeline.validation import detection, unseen_traffic
@@ -88,6 +89,7 @@ def validate(
         fused clouds; more frames than traffic has; no vehicle in the region of interest.
     """
     chosen, plan = joint_detectors(detectors), plans.read(plan_folder, scenario)
+    keep_inputs(scenario, out)
     with alone(out), workshop(out) as folder:
         doubts = checked(scenario, folder / "check", progress)
         record = prepare(scenario, folder / "unseen", frames, jobs=jobs, progress=progress)

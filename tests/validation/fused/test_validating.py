@@ -140,6 +140,7 @@ def test_single_detectors_and_results_of_sites(egvs, planned, monkeypatch, tmp_p
 def test_a_plan_that_was_altered(egvs, planned, change, message):
     mini, out = planned
     table, about = tables.read(out / "placement.parquet", "placement")
+    (out / "placement.sha256").unlink()
     tables.write(out / "placement.parquet", "placement", {**table.to_pydict(), **change}, about)
     assert message in _refused(egvs, mini, out, "--plan")
 
