@@ -8,8 +8,10 @@ import pytest
 from hypothesis import strategies
 
 from pipeline.sensing.sites import Pose
-from pipeline.validation.detectors.cluster.clustering import Density, _united, clusters_of
+from pipeline.validation.detectors.cluster.clustering import Clusters, Density, _united, clusters_of
 from pipeline.validation.detectors.cluster.detector import Cluster
+from pipeline.validation.detectors.cluster.hiding import shown_ends
+from pipeline.validation.detectors.cluster.l_shape import Rectangles
 from pipeline.validation.sweeps import Detections, Sweep
 from tests.validation.detectors.test_cluster import CAR, ROI, look, overlaps
 
@@ -73,6 +75,30 @@ def test_neighbours_of_different_sensors_are_linked_and_others_are_not():
     assert sizes([0, 1, 0, 0, 0]) == [2, 2]  # 0.5 m apart; and 0.75 m, near at a range of 40 m
     assert sizes([0, 1, 0, 1, 1]) == [2]  # but not at 5 m
     assert sizes([0, 1, 0, 0, 1]) == [2]  # nor between sensors
+
+
+def test_ends_that_another_sensor_faces_and_sees_as_sides():
+    """A box of 4 m x 2 m round (0, 10); one sensor at the origin sees its south, one at (10, 20) its north and east."""
+    along = np.linspace(-2.0, 2.0, 9)
+    south, north = (np.column_stack([along, np.full(9, y), np.ones(9)]) for y in (9.0, 11.0))
+    east = np.column_stack([np.full(5, 2.0), np.linspace(9.0, 11.0, 5), np.ones(5)])
+    points, sensor = np.concatenate([south, north, east]), np.repeat([0, 1, 1], [9, 9, 5])
+    starts = np.array([0, len(points)])
+    clusters = Clusters(points, starts, points[:, :2], starts, sensor)
+    box = Rectangles(np.zeros(1), np.array([[[-2.0, 2.0], [9.0, 11.0]]]), np.ones(1))
+    sensors_m = np.array([[0.0, 0.0], [10.0, 20.0]])
+    assert shown_ends(clusters, box, sensors_m, 0).tolist() == [[[False, True], [False, True]]]
+    assert shown_ends(clusters, box, sensors_m, 1).tolist() == [[[False, False], [True, False]]]
+    edge = replace(clusters, sensor=np.where(points[:, 0] >= 2.0, 1, 0))  # of the east alone, the north by its corner
+    assert shown_ends(edge, box, sensors_m, 0).tolist() == [[[False, True], [False, False]]]
+
+
+@pytest.mark.parametrize(("x_m", "size_m"), [(0.0, (4.3, 1.79, 1.46)), (4.0, (10.5, 2.5, 3.7))])
+def test_what_is_seen_from_both_ends_is_as_long_as_it_looks(x_m, size_m):
+    """A car on the line between two sensors, of which neither sees its length; a lorry beside it."""
+    boxes = [(x_m, 15.0, *size_m, np.pi / 2)]
+    found, _ = fused(boxes, [Pose(0.2, 0.0, 2.0), Pose(-0.2, 30.0, 2.0)])
+    assert overlaps(boxes, found).min() > 0.7
 
 
 LABELS = strategies.lists(strategies.integers(-1, 4), min_size=8, max_size=8)
