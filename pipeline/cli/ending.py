@@ -30,6 +30,9 @@ _OPEN_FLAGS = (os.O_RDONLY, os.O_WRONLY, os.O_WRONLY)
 _USERS = (FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError)
 """What the system says of a file that the user can put right."""
 
+_NO_NAME = (errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL)
+"""What the system says of a name that is none of a file."""
+
 _LESS = "larger voxels, a smaller region, fewer beams or fewer --jobs take less"
 
 
@@ -66,7 +69,7 @@ def of_system(error: OSError) -> tuple[str, int]:
         places = [Path(name)] if name else [Path.cwd(), Path(tempfile.gettempdir())]
         room = ", ".join(f"{_room_mb(place):,.1f} MB are free in {_there(place)}" for place in places)
         return f"{name or 'standard output, or a file'}: {what} ({room})", _FAILED
-    if name is not None and isinstance(error, _USERS):
+    if name is not None and (isinstance(error, _USERS) or error.errno in _NO_NAME):
         return f"{name}: {what}", InputError.exit_code
     return f"{name or 'system'}: {what}", _FAILED
 

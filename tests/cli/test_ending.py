@@ -81,6 +81,7 @@ def test_a_full_disk_is_told_with_the_file_and_the_room(tmp_path: Path) -> None:
         (errno.EACCES, "a.csv", 2, "a.csv: Permission denied"),
         (errno.EISDIR, "a.csv", 2, "a.csv: Is a directory"),
         (errno.ENOENT, "a.csv", 2, "a.csv: No such file or directory"),
+        (errno.ENAMETOOLONG, "a.csv", 2, "a.csv: File name too long"),
         (errno.EIO, "a.csv", 1, "a.csv: Input/output error"),
         (errno.EBADF, 7, 1, "system: Bad file descriptor"),
         (errno.ENOENT, None, 1, "system: No such file or directory"),

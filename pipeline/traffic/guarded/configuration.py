@@ -8,6 +8,7 @@ traffic.
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -192,7 +193,14 @@ def _options(path: Path) -> Iterator[tuple[str, str]]:
 
 def _seconds(value: str, path: Path) -> float:
     try:
-        return float(value)
+        seconds = float(value)
     except ValueError:
-        right = "for example 25200 for seven o'clock"
-        raise InputError(f"{path}: begin = {value!r}", "is no number of seconds", right) from None
+        seconds = math.nan
+    if not 0.0 <= seconds <= _LATEST_S:
+        right = f"0 to {_LATEST_S:g}, for example 25200 for seven o'clock"
+        raise InputError(f"{path}: begin = {value[:80]!r}", "is no number of seconds", right)
+    return seconds
+
+
+_LATEST_S = 1e9
+"""SUMO counts milliseconds in 64 bits; this is thirty years."""

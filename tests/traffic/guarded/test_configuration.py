@@ -64,3 +64,11 @@ def test_what_is_no_option_of_sumo_is_an_error(tmp_path):
 def test_options_of_the_traffic_are_taken_over(tmp_path):
     taken = read(tmp_path, '<scale value="2"/><processing><ignore-route-errors v="true"/></processing><b value="7"/>')
     assert (taken.options, taken.begin_s) == ({"scale": "2", "ignore-route-errors": "true"}, 7.0)
+
+
+@pytest.mark.parametrize("value", ["nan", "-inf", "1e308", "-1", "seven"])
+def test_a_beginning_that_is_no_time_is_refused(value, tmp_path):
+    with pytest.raises(
+        InputError, match=f"begin = '{value}': is no number of seconds; 0 to 1e\\+09, for example 25200"
+    ):
+        read(tmp_path, f'<begin value="{value}"/>')
