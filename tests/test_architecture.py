@@ -136,6 +136,7 @@ SCENE = "from pipeline import *; s = load('mini'); scene = build_scene(s); "
 USES = {
     "EgvsError": "EgvsError('text')",
     "InputError": "InputError('place', 'found', 'right').right == 'right'",
+    "JointScore": "JointScore.of(__import__('pipeline').load('mini'), 'run').candidates == ('pole_a', 'pole_b')",
     "Pose": "Pose(1.0, 2.0, 3.0).position_m == (1.0, 2.0, 3.0)",
     "RunError": "RunError('text').exit_code == 1",
     "Scanner": SCENE + "Scanner(scene).scan_site(scene.sites[0]).beams_in_roi > 0",
@@ -148,6 +149,7 @@ USES = {
     "World": SCENE + "isinstance(scene.world, World) and scene.world.triangles_m.shape[1:] == (3, 3)",
     "build_scene": "build_scene(__import__('pipeline').load('mini')).sites",
     "load": "load('mini').name == 'mini'",
+    "place": "len(place(__import__('pipeline').load('mini', ['placement.count=1']), 'placed').picks) == 1",
     "read_scans": "len(read_scans('run/scans.parquet').to_pandas())",
     "read_scores": "list(read_scores('run/scores.parquet').to_pandas().site) == ['pole_a', 'pole_b']",
     "read_scores_by_period": "from pipeline import load, run; "

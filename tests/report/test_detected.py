@@ -99,4 +99,8 @@ def test_a_damaged_validation_is_named(mini, tmp_path, egvs):
     (out / "correlation.parquet").write_bytes(b"PAR1")
     code, _, error = egvs("run", mini, "--out", out)
     assert code == 2
+    assert "correlation.parquet: is not the file of which validation.sha256 has the checksum; remove it, or" in error
+    (out / "validation.sha256").unlink()  # as an earlier version left none
+    code, _, error = egvs("run", mini, "--out", out)
+    assert code == 2
     assert "correlation.parquet: is not what egvs validate writes; remove it, or run egvs validate again" in error

@@ -651,4 +651,8 @@ def test_a_damaged_study_is_named(mini, tmp_path, egvs):
     )
     code, _, error = egvs("run", mini, "--out", out)
     assert code == 2
+    assert "accuracy.parquet: is not the file of which accuracy.sha256 has the checksum; remove it, or run" in error
+    (out / "accuracy.sha256").unlink()  # as an earlier version left none
+    code, _, error = egvs("run", mini, "--out", out)
+    assert code == 2
     assert "accuracy.parquet: is no accuracy study; remove it, or run egvs accuracy again" in error
