@@ -136,7 +136,7 @@ SCENE = "from pipeline import *; s = load('mini'); scene = build_scene(s); "
 USES = {
     "EgvsError": "EgvsError('text')",
     "InputError": "InputError('place', 'found', 'right').right == 'right'",
-    "JointScore": "JointScore.of(__import__('pipeline').load('mini'), 'run').candidates == ('pole_a', 'pole_b')",
+    "JointScore": "JointScore.of(__import__('pipeline').load('mini'), 'joint').candidates == ('pole_a', 'pole_b')",
     "Pose": "Pose(1.0, 2.0, 3.0).position_m == (1.0, 2.0, 3.0)",
     "RunError": "RunError('text').exit_code == 1",
     "Scanner": SCENE + "Scanner(scene).scan_site(scene.sites[0]).beams_in_roi > 0",
