@@ -186,6 +186,8 @@ def rules_of(scenario: Scenario, sites: Sequence[Site]) -> Rules:
     if both := [names[i] for i in forced if excluded[i]]:
         raise InputError(f"{place}.forced", f"{both[0]}, whose pole is excluded", "one of them")
     free = int(np.count_nonzero(~excluded))
+    if not free:
+        raise InputError(f"{place}.excluded", "every candidate is excluded", "fewer of them")
     if wanted.count is not None and wanted.count > free:
         what = "candidates" if free == len(sites) else f"candidates that are not excluded (of {len(sites)})"
         raise InputError(f"{place}.count", f"{wanted.count} sensors of {free} {what}", f"at most {free}")

@@ -215,7 +215,7 @@ def solved(work: Workspace, *, exact: bool, time_limit_s: float) -> Placement:
             raise _out_of_reach(scenario, problem, asked)
         solution = found
     if solution.point.worth.met < 0.0:
-        raise _unmet(scenario, problem, asked, solution, time_limit_s)
+        raise _unmet(scenario, problem, asked, solution)
     asked = replace(asked, problem=problem)
     placed = _told(scenario, asked, asked.sites, problem, solution.order, solution)
     if wanted.refine is None or not placed.picks:
@@ -283,15 +283,17 @@ def _names(asked: Asked, plan: Sequence[int]) -> tuple[str, ...]:
 
 def _out_of_reach(scenario: Scenario, problem: Problem, asked: Asked) -> InputError:
     """That no plan within the rules reaches the share that was asked for."""
-    nearest = planning.best(replace(problem, demands=problem.demands[:-1]), search_all=False, time_limit_s=0.0,
-                            heard=lambda _: None).point  # fmt: skip
-    reached = nearest.worth.value / asked.together if asked.together > 0.0 else 0.0
+    within = replace(problem, demands=problem.demands[:-1])
+    nearest = planning.best(within, search_all=False, time_limit_s=0.0, heard=lambda _: None)
+    if nearest.point.worth.met < 0.0:
+        return _unmet(scenario, within, asked, nearest)
+    reached = nearest.point.worth.joint / asked.together if asked.together > 0.0 else 0.0
     found = f"{scenario.placement.reach:g}, and no plan within the count, the budget and the other rules was found"
-    right = f"at most {np.floor(reached * 1000) / 1000:g}, as {', '.join(_names(asked, nearest.plan))} reach"
+    right = f"at most {np.floor(reached * 1000) / 1000:g}, as {', '.join(_names(asked, nearest.order))} reach"
     return InputError(f"{scenario.file}: placement.reach", found, right)
 
 
-def _unmet(scenario: Scenario, problem: Problem, asked: Asked, solution: Solution, time_limit_s: float) -> InputError:
+def _unmet(scenario: Scenario, problem: Problem, asked: Asked, solution: Solution) -> InputError:
     """That no plan within the rules sees enough of every zone."""
     seen = problem.together(solution.order)
     short = [its for its in problem.demands if its.unmet(seen.value(its.term)) > 0.0]

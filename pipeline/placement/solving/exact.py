@@ -16,7 +16,7 @@ from time import perf_counter
 import numpy as np
 
 from pipeline.placement.solving import bounds
-from pipeline.placement.solving.heuristics import Plan
+from pipeline.placement.solving.heuristics import Plan, shorter
 from pipeline.placement.solving.problem import Problem, Worth
 from pipeline.placement.solving.rules import Rules
 from pipeline.placement.solving.sight import Floats, Ints
@@ -176,7 +176,8 @@ class _Search:
     def _try_each(self, chosen: tuple[int, ...], candidates: Ints, met: Floats, value: Floats) -> None:
         """The plans with one more, the best first, as long as they may be better."""
         for candidate, its_met, its_value in zip(candidates.tolist(), met.tolist(), value.tolist(), strict=True):
-            if its_met < self.worth.met or (its_met <= self.worth.met and not self._may_be_better(its_value)):
+            is_less_met = its_met < self.worth.met - bounds.ROUNDING
+            if is_less_met or (its_met <= self.worth.met and not self._may_be_better(its_value)):
                 if not self.problem.demands:
                     break
                 continue
@@ -185,5 +186,6 @@ class _Search:
 
     def _try(self, plan: tuple[int, ...], worth: Worth) -> None:
         plan = tuple(sorted(plan))
-        if worth > self.worth or (worth == self.worth and self.plan is not None and plan < self.plan):
+        is_as_good = worth == self.worth and self.plan is not None
+        if worth > self.worth or (is_as_good and shorter(plan) < shorter(self.plan or ())):
             self.plan, self.worth = plan, worth

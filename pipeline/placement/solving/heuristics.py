@@ -9,6 +9,7 @@ sums are cut off at a level that is searched for (Krause et al. 2008).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import astuple
 
 import numpy as np
 
@@ -16,8 +17,11 @@ from pipeline.placement.solving.problem import Problem, Worth
 from pipeline.placement.solving.sight import Floats, Ints
 from pipeline.placement.solving.together import Together
 
-Guide = Callable[[Together, Ints], tuple[Floats, ...]]
-"""Of a plan and some candidates: what each is chosen by, the most important last."""
+Each = tuple[Floats, Floats, Floats]
+"""See :meth:`Problem.with_each`."""
+
+Guide = Callable[[Together, Ints, Each], tuple[Floats, ...]]
+"""Of a plan, some candidates, and what it is worth with each: what they are chosen by, the most important last."""
 
 Plan = tuple[int, ...]
 
@@ -36,10 +40,15 @@ def best_found(problem: Problem) -> tuple[Plan, Worth]:
 
 
 def best_of(problem: Problem, plans: Sequence[Plan]) -> tuple[Plan, Worth]:
-    """The best of some plans; of equals the first in the order of candidates."""
+    """The best of some plans; of equals the one of fewest sensors, and the first in the order of candidates."""
     worths = [(plan, problem.worth(plan)) for plan in plans]
     most = max(worth for _, worth in worths)
-    return min(plan for plan, worth in worths if worth == most), most
+    return min((plan for plan, worth in worths if worth == most), key=shorter), most
+
+
+def shorter(plan: Plan) -> tuple[int, Plan]:
+    """What plans that are worth the same are ordered by."""
+    return len(plan), plan
 
 
 def greedy(problem: Problem, start: Plan = (), guide: Guide | None = None) -> Plan:
@@ -49,12 +58,10 @@ def greedy(problem: Problem, start: Plan = (), guide: Guide | None = None) -> Pl
     if guide is None and problem.is_plain:
         return _lazy(problem, seen)
     while len(candidates := np.flatnonzero(problem.rules.may_join(seen.chosen))):
-        keys = problem.with_each(seen, candidates)[::-1] if guide is None else guide(seen, candidates)
-        joint = problem.with_each(seen, candidates)[2] if guide is not None else keys[0]
-        now = seen.value(problem.joint)
-        if not (joint > now * (1.0 + _NOTHING)).any():
+        each, now = problem.with_each(seen, candidates), problem.worth_of(seen)
+        if not any((its > was + _NOTHING * abs(was)).any() for its, was in zip(each, astuple(now), strict=True)):
             break
-        order = np.lexsort((-candidates, *keys))
+        order = np.lexsort((-candidates, *(each[::-1] if guide is None else guide(seen, candidates, each))))
         seen.add(int(candidates[order[-1]]))
     return tuple(seen.chosen)
 
@@ -99,8 +106,8 @@ def _starts(problem: Problem) -> list[Plan]:
 
 
 def _by_cost(problem: Problem) -> Guide:
-    def guide(seen: Together, candidates: Ints) -> tuple[Floats, ...]:
-        met, value, joint = problem.with_each(seen, candidates)
+    def guide(seen: Together, candidates: Ints, each: Each) -> tuple[Floats, ...]:
+        met, value, joint = each
         cost = problem.rules.further_cost(seen.chosen)[candidates]
         worth = problem.worth_of(seen)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -113,16 +120,13 @@ def _by_cost(problem: Problem) -> Guide:
 
 def _by_levels(problem: Problem) -> list[Plan]:
     """Plans for the worst of several records: greedy on the sum of all, each cut off at a level."""
-    low, high, plans = (
-        0.0,
-        min(problem.together(problem.candidates.tolist()).value(term) for term in problem.objective),
-        [],
-    )
+    every, plans = problem.together(problem.candidates.tolist()), []
+    low, high = 0.0, min(every.value(term) for term in problem.objective)
     for _ in range(_LEVELS):
         level = 0.5 * (low + high)
 
-        def guide(seen: Together, candidates: Ints, level: float = level) -> tuple[Floats, ...]:
-            met, _, joint = problem.with_each(seen, candidates)
+        def guide(seen: Together, candidates: Ints, each: Each, level: float = level) -> tuple[Floats, ...]:
+            met, _, joint = each
             values = [seen.value(term) + seen.gains(term, candidates) for term in problem.objective]
             return joint, np.sum([np.minimum(value, level) for value in values], axis=0), met
 

@@ -68,7 +68,8 @@ class Solution:
     nodes
         Of the exact search; 0 where there was none.
     is_best
-        Whether it is proved that there is no better plan.
+        Whether it is proved that there is no better plan; by its bound alone, none that is better by more than the
+        bound's rounding.
     fewest_is_proved
         Whether it is proved that one sensor less cannot meet the demands; None where that was not asked for.
     """
@@ -98,18 +99,22 @@ def best(problem: Problem, *, search_all: bool, time_limit_s: float, heard: Hear
     heard
         Called with the number of sensors that plans were found for.
     """
-    curve, its = _curve(problem, heard)
-    point, nodes, is_best = curve[-1], 0, False
+    rules, nodes, is_best = problem.rules, 0, False
+    if np.isinf(rules.budget):
+        curve, its = _curve(problem, rules.most_sensors, heard)
+        last = curve.pop()
+    else:  # how many sensors a budget is best spent on, the plan tells
+        curve = []
+        last, its = _point(problem.with_count(rules.most_sensors), ())
     if search_all:
-        found = exact.search(problem, point.plan, its, time_limit_s=time_limit_s)
+        found = exact.search(problem, last.plan, its, time_limit_s=time_limit_s)
         assert found.plan is not None
-        point = replace(point, plan=found.plan, worth=found.worth, bound=min(point.bound, found.bound))
         nodes, is_best = found.nodes, found.is_whole
-        if is_best:
-            point = replace(point, bound=found.worth.value)
-        curve[-1] = point
-    is_best = is_best or point.certificate >= 1.0
-    return Solution(in_order(problem, point.plan), tuple(curve), nodes, is_best)
+        last = replace(last, plan=found.plan, worth=found.worth, bound=min(last.bound, found.bound))
+    if not np.isinf(rules.budget):
+        curve, last = _below(problem, last, heard)
+    is_best = is_best or last.certificate >= 1.0
+    return Solution(in_order(problem, last.plan), (*curve, last), nodes, is_best)
 
 
 def fewest(problem: Problem, *, time_limit_s: float, heard: Heard) -> Solution | None:
@@ -117,13 +122,16 @@ def fewest(problem: Problem, *, time_limit_s: float, heard: Heard) -> Solution |
     until = perf_counter() + time_limit_s
     curve: list[CurvePoint] = []
     its: list[Bounds] = []
-    for count in range(max(1, len(problem.rules.forced)), problem.rules.count + 1):
-        point, bound = _point(problem.with_count(count), curve[-1].plan if curve else ())
+    for count in range(_least(problem), problem.rules.most_sensors + 1):
+        smaller = curve[-1].plan if curve else ()
+        point, bound = _point(problem.with_count(count), smaller)
         curve.append(point)
         its.append(bound)
         heard(count)
         if point.worth.met >= 0.0:
             break
+        if len(curve) > 1 and point.plan == smaller and len(smaller) < count - 1:
+            return None  # no sensor may join, or none helps
     else:
         return None
     proved, nodes = True, 0
@@ -139,23 +147,34 @@ def fewest(problem: Problem, *, time_limit_s: float, heard: Heard) -> Solution |
     return Solution(in_order(problem, curve[-1].plan), tuple(curve), nodes, fewest_is_proved=proved)
 
 
-def _curve(problem: Problem, heard: Heard) -> tuple[list[CurvePoint], Bounds]:
-    """Plans of 1, 2, ... sensors, and what bounds the last one."""
+def _curve(problem: Problem, most: int, heard: Heard) -> tuple[list[CurvePoint], Bounds]:
+    """Plans of 1, 2, ..., ``most`` sensors, or up to where no further one adds anything; and what bounds the last."""
     points: list[CurvePoint] = []
     its: Bounds = ()
-    greedy = heuristics.greedy(problem) if problem.is_plain else ()
-    first, most = max(1, len(problem.rules.forced)), problem.rules.most_sensors
-    last, last_its = (None, its) if np.isinf(problem.rules.budget) else _point(problem.with_count(most), (), greedy)
-    for count in range(first, most + 1 if last is None else len(last.plan)):
+    greedy = heuristics.greedy(problem) if problem.is_plain and np.isinf(problem.rules.budget) else ()
+    for count in range(_least(problem), most + 1):
         point, its = _point(problem.with_count(count), points[-1].plan if points else (), greedy[:count])
         points.append(point)
         heard(count)
-        if last is None and problem.is_plain and not _gains_any(problem, point.plan):
+        if problem.is_plain and not _gains_any(problem, point.plan):
             break
-    if last is not None:
-        points.append(replace(last, count=max(first, len(last.plan))))
-        its = last_its
     return points, its
+
+
+def _least(problem: Problem) -> int:
+    """The smallest number of sensors that plans are told for."""
+    return max(1, len(problem.rules.forced))
+
+
+def _below(problem: Problem, last: CurvePoint, heard: Heard) -> tuple[list[CurvePoint], CurvePoint]:
+    """Plans of fewer sensors than one within a budget; and that one, or a better one that was met among them."""
+    curve, _ = _curve(problem, len(last.plan) - 1, heard)
+    better = [point for point in curve if point.worth > last.worth]
+    if better:
+        top = max(better, key=lambda point: point.worth)
+        last = replace(last, plan=top.plan, worth=top.worth, bound=max(last.bound, top.worth.value))
+    count = max(_least(problem), len(last.plan))
+    return [point for point in curve if point.count < count], replace(last, count=count)
 
 
 def _gains_any(problem: Problem, plan: Plan) -> bool:

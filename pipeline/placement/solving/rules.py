@@ -136,10 +136,8 @@ class Rules:
     def _first_of_poles(self, pole: Ints, chosen: Sequence[int]) -> Mask:
         """Which of some candidates, given by their poles, are among the first that have room at theirs."""
         order = np.argsort(pole, kind="stable")
-        starts = np.flatnonzero(np.diff(pole[order], prepend=-1))
-        number = np.empty(len(pole), dtype=np.int64)
-        lengths = np.diff(np.append(starts, len(pole)))
-        number[order] = np.arange(len(pole)) - np.repeat(starts, lengths)
+        ordered, number = pole[order], np.empty(len(pole), dtype=np.int64)
+        number[order] = np.arange(len(pole)) - np.searchsorted(ordered, ordered)
         if not chosen:
             return number < self.most_per_pole
         poles, used = np.unique(self.pole[list(chosen)], return_counts=True)

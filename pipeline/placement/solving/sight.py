@@ -44,7 +44,7 @@ class Row:
         """From the hits of every cell, (n,) whole numbers; more than ``most`` in a cell count as so many."""
         cells = np.flatnonzero(hits).astype(np.int32)
         kind = np.uint16 if most <= _SMALL else np.int64
-        return cls(cells, np.minimum(hits[cells], most).astype(kind))
+        return cls(cells, np.minimum(hits[cells].astype(np.int64), most).astype(kind))
 
 
 @dataclass(frozen=True, eq=False)

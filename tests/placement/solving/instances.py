@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,9 +33,11 @@ def term_of(
     name: str, sight: Sight, weight: np.ndarray, *, curve: int = CAPPED, scale: float = 3.0, each_once: bool = False
 ) -> Term:
     """A sum whose exact value is :func:`math.fsum`'s."""
+    most = int(np.bincount(sight.cells, sight.amounts).max(initial=0))
+    worths = np.array([worth(curve, scale, total) for total in range(most + 1)])
 
     def exact(totals: np.ndarray) -> float:
-        return math.fsum(w * worth(curve, scale, int(t)) for w, t in zip(weight.tolist(), totals.tolist(), strict=True))
+        return math.fsum((weight * worths[totals]).tolist())
 
     return Term(name, sight, weight, curve, scale, each_once, exact)
 
@@ -87,6 +89,44 @@ def drawn(seed: int) -> Instance:
     return Instance(Problem(mix, objective, demands, rules, int(rng.random() < 0.15)), hits)
 
 
+def drawn_degenerate(seed: int) -> Instance:
+    """A problem with 1 to 9 candidates, many of them equal or blind: caps of nothing and of infinity, records without
+    traffic, all candidates forced, costs of nothing, budgets that are sums of decimals, zones that two must see,
+    counts above the candidates."""
+    rng = np.random.default_rng(10_000 + seed)
+    n, cells = int(rng.integers(1, 10)), int(rng.integers(1, 25))
+    kinds = rng.integers(0, 4, (max(1, n // int(rng.integers(1, 4))), cells)) * (rng.random((1, cells)) < 0.7)
+    hits = kinds[rng.integers(0, len(kinds), n)] * (rng.random(n) < 0.85)[:, None]
+    sight, curve = sight_of(hits), int(rng.choice([CAPPED, CAPPED, LOGARITHM, SATURATING]))
+    scale = float(rng.choice([0.0, 1.0, 2.5, np.inf])) if curve == CAPPED else 3.0
+    weight = rng.integers(0, 3, cells) * rng.choice([1.0, 0.1, 0.0])
+    records = [term_of(f"r{i}", sight, weight * (rng.random(cells) < 0.6), curve=curve, scale=scale) for i in range(2)]
+    mix = term_of("", sight, records[0].weight + records[1].weight, curve=curve, scale=scale)
+    objective = tuple(records) if rng.random() < 0.25 else (mix,)
+    forced = tuple(rng.permutation(n)[: int(rng.choice([0, 0, 1, n]))].tolist())
+    excluded = rng.random(n) < 0.15
+    excluded[list(forced)] = False
+    cost = rng.choice([0.0, 0.1, 0.2, 0.3, 0.7], n)
+    pole_cost = np.minimum(cost, rng.choice([0.0, 0.1, 0.2], n))
+    cost[list(forced)] = pole_cost[list(forced)] = 0.0
+    rules = Rules(
+        count=int(rng.integers(max(1, len(forced)), n + 4)), budget=float(rng.choice([np.inf, 0.1 + 0.2, 0.3, 0.9])),
+        cost=cost, pole_cost=pole_cost, pole=rng.integers(0, n, n), forced=forced, excluded=excluded,
+        most_per_pole=int(rng.choice([1, 2, n])), position_m=rng.integers(0, 3, (n, 3)).astype(float),
+        least_distance_m=float(rng.choice([0.0, 0.0, 1.0])),
+    )  # fmt: skip
+    zone, demands = rng.integers(0, 2, cells).astype(float), ()
+    if rng.random() < 0.3 and zone.any():
+        demands = (Demand(_seen_by(sight, zone, int(rng.choice([1, 2]))), float(rng.choice([0.25, 0.5, 1.0]))),)
+    return Instance(Problem(mix, objective, demands, rules, int(rng.random() < 0.2)), hits)
+
+
+def _seen_by(sight: Sight, zone: np.ndarray, sensors: int) -> Term:
+    """The share of a zone's cells that so many see; its weights are those of a sum that is never below it."""
+    term = term_of("zone", sight, zone / (zone.sum() * sensors), scale=float(sensors), each_once=True)
+    return replace(term, exact=lambda totals: float(zone[totals >= sensors].sum() / zone.sum()))
+
+
 def every_plan(problem: Problem):
     """All subsets that keep the rules, by the rules as a person would read them."""
     rules, n = problem.rules, len(problem.rules.cost)
@@ -120,11 +160,7 @@ def value_of(problem: Problem, plan: tuple[int, ...], hits: np.ndarray) -> tuple
 
     def of(term: Term, those: tuple[int, ...]) -> float:
         rows = hits[list(those)] > 0 if term.each_once else hits[list(those)]
-        totals = rows.sum(axis=0).astype(int) if those else np.zeros(hits.shape[1], dtype=int)
-        return math.fsum(
-            w * worth(term.curve, term.scale, int(t))
-            for w, t in zip(term.weight.tolist(), totals.tolist(), strict=True)
-        )
+        return term.exact(rows.sum(axis=0).astype(int))
 
     met = all(of(demand.term, plan) >= demand.least * (1 - 1e-12) for demand in problem.demands)
     left = [tuple(j for j in plan if j != i) for i in plan] if problem.survives else [plan]

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from pipeline.placement.solving import exact, planning
-from pipeline.placement.solving.problem import Demand
-from tests.placement.solving.instances import drawn, every_plan, value_of
+from pipeline.placement.solving.problem import Demand, Problem
+from pipeline.placement.solving.rules import Rules
+from tests.placement.solving.instances import drawn, drawn_degenerate, every_plan, sight_of, term_of, value_of
 
 
 def unheard(_: int) -> None:
@@ -86,3 +88,68 @@ def test_a_search_that_runs_out_of_time_proves_what_it_says() -> None:
         best = best_of_all(its)
         assert best is not None
         assert found.point.bound >= best, seed
+
+
+@pytest.mark.parametrize("start", range(0, 150, 50))
+def test_degenerate_problems_are_solved_and_every_point_of_the_curve_holds(start: int) -> None:
+    """The plan is the best one, whether the search ends or not no bound is exceeded, and no larger plan is worse."""
+    for seed in range(start, start + 50):
+        its = drawn_degenerate(seed)
+        if not its.problem.rules.keeps(its.problem.rules.forced):
+            continue
+        plans = [(len(plan), *value_of(its.problem, plan, its.hits)) for plan in every_plan(its.problem)]
+        for limit_s in (0.0, 60.0):
+            found = planning.best(its.problem, search_all=True, time_limit_s=limit_s, heard=unheard)
+            worth = found.point.worth
+            assert its.problem.rules.keeps(found.order), seed
+            assert (worth.met >= 0.0, worth.value) == value_of(its.problem, found.order, its.hits), seed
+            assert all(one.worth <= more.worth for one, more in zip(found.curve, found.curve[1:], strict=False)), seed
+            for point in found.curve:
+                assert len(point.plan) <= point.count, seed
+                values = [value for size, met, value in plans if met and size <= point.count]
+                assert point.bound >= max(values, default=0.0), seed
+        best = max((value for _, met, value in plans if met), default=None)
+        assert (worth.met >= 0.0, worth.value) == (best is not None, best if best is not None else worth.value), seed
+
+
+def test_the_fewest_of_degenerate_problems() -> None:
+    for seed in range(100):
+        its = drawn_degenerate(seed)
+        problem = its.problem
+        if problem.demands or not problem.rules.keeps(problem.rules.forced):
+            continue
+        together = problem.together(problem.candidates.tolist()).value(problem.joint)
+        for share in (0.3, 1.0):
+            asked = replace(problem, demands=(Demand(problem.joint, share * together),))
+            enough = [len(plan) for plan in every_plan(asked) if value_of(asked, plan, its.hits)[0]]
+            found = planning.fewest(asked, time_limit_s=30.0, heard=unheard)
+            assert (found is None) == (not enough), seed
+            assert found is None or (found.fewest_is_proved and len(found.order) <= max(1, min(enough))), seed
+
+
+def rules_for(count: int, cost: list[float], budget: float = np.inf) -> Rules:
+    """Of candidates with a pole each."""
+    n, price = len(cost), np.array(cost)
+    blank = np.zeros((n, 3))
+    return Rules(count, budget, price, 0 * price, np.arange(n), (), np.zeros(n, dtype=bool), n, blank, 0.0)
+
+
+def test_many_cheap_ones_are_found_beside_a_dear_one_that_sees_more() -> None:
+    """Greedy by gain alone takes the dear one and has nothing left; by gain per cost all the cheap ones."""
+    hits = np.zeros((21, 23), dtype=int)
+    hits[0, :3], hits[range(1, 21), range(3, 23)] = 1, 1
+    term = term_of("", sight_of(hits), np.ones(23), scale=1.0)
+    problem = Problem(term, (term,), (), rules_for(21, [20.0, *[1.0] * 20], 20.0))
+    found = planning.best(problem, search_all=False, time_limit_s=0.0, heard=unheard)
+    assert (found.point.worth.value, found.point.count, len(found.curve)) == (20.0, 20, 20)
+
+
+def test_a_second_sensor_is_put_up_for_a_zone_that_two_must_see_though_the_score_gains_nothing() -> None:
+    hits = np.ones((5, 4), dtype=int)
+    sight = sight_of(hits)
+    term = term_of("", sight, np.ones(4), scale=1.0)
+    zone = term_of("zone", sight, np.full(4, 1 / 12), scale=3.0, each_once=True)
+    zone = replace(zone, exact=lambda totals: float((totals >= 3).mean()))
+    problem = Problem(term, (term,), (Demand(zone, 1.0),), rules_for(5, [0.0] * 5))
+    found = planning.best(problem, search_all=False, time_limit_s=0.0, heard=unheard)
+    assert (found.order, found.point.worth.met) == ((0, 1, 2), 0.0)

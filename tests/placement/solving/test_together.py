@@ -81,3 +81,5 @@ def test_more_hits_than_count_are_kept_as_so_many() -> None:
     assert row.cells.tolist() == [1, 2]
     assert (row.amounts.tolist(), row.amounts.dtype) == ([5, 3], np.uint16)
     assert Row.of(np.array([70_000]), 2**40).amounts.tolist() == [70_000]
+    counted = Row.of(np.array([0, 2, 3], dtype=np.uint32), 2**62)  # as scans are counted, with a cap of infinity
+    assert (counted.amounts.tolist(), counted.amounts.dtype) == ([2, 3], np.int64)
