@@ -1,0 +1,204 @@
+"""What a sensor is worth where somebody has moved it: the numbers of ``egvs score``, from any pose.
+
+Steps for a pose: ask the rules of ``egvs check`` that are about one site; cast the empty scan from there; score it
+against the TPOG, and against the vehicles of recorded frames where the scenario asks for that; rank it among the
+candidates, as if the moved one hung there in place of its own. Nothing here knows of a page or a browser.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping
+from copy import copy
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.artefacts.readers import Tpog, read_scores, read_tpog
+from pipeline.checks import sites as rules
+from pipeline.checks.subject import Subject
+from pipeline.core import files
+from pipeline.core.errors import InputError
+from pipeline.core.findings import Finding
+from pipeline.scenario.models import Scenario
+from pipeline.scoring.scorer import Scorer
+from pipeline.scoring.targets.named import WORTHS
+from pipeline.scoring.visibility import Beams
+from pipeline.sensing.scanner import Scanner
+from pipeline.sensing.scene import Scene
+from pipeline.sensing.sites import Pose, Site
+from pipeline.stages.base import Workspace
+from pipeline.stages.shared.scene import scene_of
+from pipeline.stages.shared.target_scores import TPOG, TRAJECTORIES, Targets
+from pipeline.traffic import sumo_folder
+from pipeline.traffic.network import Network
+from pipeline.world.carriageway import Carriageway
+
+KEPT = "kept_sites.csv"
+"""Where poses are kept, in the scenario's folder: a file of sites that ``sites.file`` can name."""
+
+_COLUMNS = ("site", "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg", "sensor")
+
+
+@dataclass(frozen=True)
+class Rating:
+    """What a sensor is worth in a pose.
+
+    Attributes
+    ----------
+    site
+        The candidate that it comes from.
+    scores
+        By name: ``egvs`` in bits, ``entropy_seen`` as a share, and what else the scenario asks for; empty where no
+        sensor can stand.
+    rank
+        Among the candidates, 1 is best; 0 where no sensor can stand.
+    findings
+        What the check says of the place; one of them is an error where no sensor can stand.
+    """
+
+    site: Site
+    scores: Mapping[str, float]
+    rank: int
+    findings: tuple[Finding, ...] = ()
+
+    @property
+    def stands(self) -> bool:
+        """Whether a sensor can stand there."""
+        return bool(self.scores)
+
+
+class Session:
+    """A run that is being explored. It changes nothing in the run's folder.
+
+    Parameters
+    ----------
+    work
+        A folder in which all stages up to ``score`` are done.
+    """
+
+    def __init__(self, work: Workspace) -> None:
+        self.scenario: Scenario = work.scenario
+        self.scene: Scene = scene_of(work)
+        self.tpog: Tpog = read_tpog(work.path(TPOG))
+        self.candidates: dict[str, Rating] = self._rated(work)
+        # Without sites: one caster serves every pose.
+        self._scanner = Scanner(replace(self.scene, sites=()))
+        self._scorer = Scorer(self.scene, self.tpog, work.path(TRAJECTORIES))
+        asked = any(name in WORTHS for name in self.scenario.score.asked)
+        self._targets = Targets(_without_blindspots(work), self.tpog.grid) if asked else None
+
+    @property
+    def rank_by(self) -> str:
+        """The score that ranks."""
+        return str(self.scenario.score.rank_by)
+
+    @property
+    def ranked(self) -> list[Rating]:
+        """The candidates, the best first."""
+        return sorted(self.candidates.values(), key=lambda rating: rating.rank)
+
+    @cached_property
+    def network(self) -> Network | None:
+        """The roads, where the scenario has some."""
+        return sumo_folder.roads(self.scenario)
+
+    @cached_property
+    def carriageway(self) -> Carriageway | None:
+        """The lanes that vehicles drive on, where the scenario has some."""
+        found = None if self.network is None else Carriageway.of(self.network)
+        return found if found is not None and found.lanes else None
+
+    def rate(self, name: str, pose: Pose) -> Rating:
+        """What the sensor of a candidate is worth in a pose; KeyError where there is no such candidate."""
+        site = replace(self.candidates[name].site, pose=pose)
+        if site.points is not None and pose != self.candidates[name].site.pose:
+            finding = Finding("measured scan", f"site {name}", "its empty scan was measured",
+                              "its own pose: what would be measured elsewhere is not known", is_error=True)  # fmt: skip
+            return Rating(site, {}, 0, (finding,))
+        findings = self._findings(site)
+        if any(finding.is_error for finding in findings):
+            return Rating(site, {}, 0, findings)
+        scores = self._scores(Beams.of(self._scanner.scan_site(site)))
+        return Rating(site, scores, self._rank(name, scores[self.rank_by]), findings)
+
+    def hits(self, site: Site) -> NDArray[np.float64]:
+        """The beams of a sensor that cross each voxel, (nx, ny, nz) float64; InputError where it cannot stand."""
+        return self._scorer.hits(Beams.of(self._scanner.scan_site(site)))
+
+    def keep(self, rating: Rating) -> tuple[Path, str]:
+        """Add a pose to the file of kept sites; the file, and the name that it has there.
+
+        Raises
+        ------
+        InputError
+            Where the file is another one than this program's own: it stays as it is. Or where no sensor can stand.
+        """
+        path = self.scenario.folder / KEPT
+        if not rating.stands:
+            raise InputError(f"site {rating.site.name}", "no sensor can stand there", "a free place")
+        rows = _kept_rows(path)
+        taken = {row[0] for row in rows} | self.candidates.keys()
+        name = next(new for n in range(1, len(taken) + 2) if (new := f"{rating.site.name[:72]}-{n}") not in taken)
+        pose = rating.site.pose
+        rows.append([name, *(repr(float(value)) for value in (*pose.position_m, *pose.angles_deg)), rating.site.sensor])
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows([_COLUMNS, *rows])
+        files.write_text(path, text.getvalue())
+        return path, name
+
+    def _rated(self, work: Workspace) -> dict[str, Rating]:
+        """The candidates as ``scores.parquet`` has them."""
+        path = work.path("scores.parquet")
+        work.digest(path.name)
+        rows = {row["site"]: row for row in read_scores(path).to_pylist()}
+        if rows.keys() != {site.name for site in self.scene.sites}:
+            raise InputError(path, "holds other sites than the scenario", "egvs run makes it again")
+        names = dict.fromkeys(("egvs", "entropy_seen", *self.scenario.score.asked))
+        return {
+            site.name: Rating(site, {name: rows[site.name][name] for name in names}, rows[site.name]["rank"])
+            for site in self.scene.sites
+        }
+
+    def _findings(self, site: Site) -> tuple[Finding, ...]:
+        """What the check says of a place, candidates of a rule included: nobody has sorted this one out."""
+        asked = self.scenario.sites.model_copy(update={"only_free": False})
+        scenario = self.scenario.model_copy(update={"sites": asked})
+        subject = Subject(scenario, self.network, self.carriageway, self.scene.world, (site,), self.scene)
+        return (*rules.poses(subject), *rules.on_lanes(subject))
+
+    def _scores(self, beams: Beams) -> dict[str, float]:
+        found = self._scorer.score(beams)
+        scores = {"egvs": found.egvs, "entropy_seen": found.entropy_seen}
+        scores |= {name: float(value[0]) for name, value in found.shares.items()}
+        if self._targets is not None:
+            its = self._targets.scores(self._targets.see(beams)).scores
+            scores |= {name: float(value[0]) for name, value in its.items()}
+        return scores
+
+    def _rank(self, name: str, score: float) -> int:
+        others = (its.scores[self.rank_by] for other, its in self.candidates.items() if other != name)
+        return 1 + sum(other > score for other in others)
+
+
+def _without_blindspots(work: Workspace) -> Workspace:
+    """The same folder where blind spots are not asked for: they cost time for every pose, and change no score."""
+    score = work.scenario.score.model_copy(update={"blindspots": False})
+    without = copy(work)
+    without.scenario = work.scenario.model_copy(update={"score": score})
+    return without
+
+
+def _kept_rows(path: Path) -> list[list[str]]:
+    """The rows of a file of kept sites; none where there is no file yet."""
+    if not path.is_file():
+        return []
+    with path.open(newline="", encoding="utf-8", errors="replace") as file:
+        header, *rows = [row for row in csv.reader(file) if row] or [[]]
+    if tuple(header) != _COLUMNS or any(len(row) != len(_COLUMNS) for row in rows):
+        raise InputError(path, "was not written by egvs explore, and stays as it is", "move it elsewhere to keep poses")
+    return rows

@@ -1,0 +1,53 @@
+"""What the page says of a sensor in words: markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from pipeline.explore.session import Rating
+
+MOST_LISTED = 20
+"""Rows of the ranked list; the others are in the list to choose from."""
+
+_SHARES = ("entropy_seen", "coverage", "expected_visibility", "expected_detections", "seen_well")
+_STEERS = str.maketrans({sign: f"\\{sign}" for sign in "\\`*_{}[]()<>#+-.!|"})
+
+
+def in_words(rating: Rating, rank_by: str, candidate: Rating, candidates: int) -> str:
+    """What a sensor is worth where it is, beside its candidate; or why none can stand there."""
+    told = "\n".join(
+        f"- {'**cannot stand:**' if finding.is_error else '**warning:**'} {plain(str(finding))}"
+        for finding in rating.findings
+    )
+    if not rating.stands:
+        return f"## no score\n\n{told}"
+    score, before = rating.scores[rank_by], candidate.scores[rank_by]
+    more = f" ({score / before - 1.0:+.1%})" if before > 0.0 and rating.site.pose != candidate.site.pose else ""
+    rows = "\n".join(f"| {plain(name)} | {value_in_words(name, value)} |" for name, value in rating.scores.items())
+    head = f"## {value_in_words(rank_by, score)}{more}\n\nrank {rating.rank} of {candidates}"
+    return f"{head}\n\n| score | value |\n|---|---|\n{rows}\n\n{told}"
+
+
+def ranking(ranked: Sequence[Rating], rank_by: str) -> str:
+    """The best candidates as a table."""
+    rows = "\n".join(
+        f"| {its.rank} | {plain(its.site.name)} | {value_in_words(rank_by, its.scores[rank_by])} |"
+        for its in ranked[:MOST_LISTED]
+    )
+    rest = f"\n\n... and {len(ranked) - MOST_LISTED} more" if len(ranked) > MOST_LISTED else ""
+    return f"| rank | site | {plain(rank_by)} |\n|---|---|---|\n{rows}{rest}"
+
+
+def choice(rating: Rating, rank_by: str) -> str:
+    """A candidate in the list to choose from."""
+    return f"{rating.rank}. {rating.site.name}: {value_in_words(rank_by, rating.scores[rank_by])}"
+
+
+def value_in_words(name: str, value: float) -> str:
+    """A score with as many digits as a planner reads."""
+    return f"{value:.2%}" if name in _SHARES else f"{value:,.1f}" if abs(value) >= 100.0 else f"{value:.4g}"
+
+
+def plain(text: str) -> str:
+    """A text that markdown shows as it is."""
+    return text.translate(_STEERS).replace("\n", " ")
