@@ -67,9 +67,8 @@ def lanes(carriageway: Carriageway, zero_m: Vec3) -> Mesh:
     return Mesh(lifted.astype(np.float32), np.concatenate(faces))
 
 
-def _strip(line_m: NDArray[np.float64], width_m: float) -> NDArray[np.float64]:
-    """Left and right of each point of a line in turn, (2 n, 3); x, y alone lie at height 0."""
-    line = np.column_stack([line_m, np.zeros((len(line_m), 3 - line_m.shape[1]))])
+def _strip(line: NDArray[np.float64], width_m: float) -> NDArray[np.float64]:
+    """Left and right of each point of a line (n, 3) in turn, (2 n, 3)."""
     along = np.gradient(line[:, :2], axis=0)
     along /= np.maximum(np.hypot(*along.T), np.finfo(np.float64).tiny)[:, None]
     aside = np.column_stack([-along[:, 1], along[:, 0], np.zeros(len(line))]) * (width_m / 2.0)

@@ -1,0 +1,154 @@
+"""A session gives the numbers of `egvs score` for any pose, and keeps poses without spoiling a user's file."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import pipeline
+from pipeline.artefacts.readers import read_scores
+from pipeline.core.errors import InputError
+from pipeline.explore.opening import open_session
+from pipeline.explore.session import KEPT, Session
+from pipeline.sensing import sites
+from pipeline.sensing.sites import Pose
+from tests.conftest import write_mini
+
+EVERY = "score.others=['expected_detections','points_on_target','seen_well','coverage','expected_visibility']"
+MOVED = Pose(9.125, 12.5, 3.75, 20.25, -4.5, 1.0)
+
+
+@pytest.fixture(scope="module")
+def opened(tmp_path_factory: pytest.TempPathFactory) -> Session:
+    """A session over the small scenario."""
+    folder = tmp_path_factory.mktemp("explore")
+    return open_session(write_mini(folder / "mini"), [EVERY], folder / "run")
+
+
+def scored(folder: Path, *settings: str) -> dict[str, dict]:
+    """What `egvs run` makes of a scenario, by site."""
+    out = folder / "scored"
+    pipeline.run(pipeline.load(folder, list(settings)), out)
+    return {row["site"]: row for row in read_scores(out / "scores.parquet").to_pylist()}
+
+
+def write_site(folder: Path, name: str, pose: Pose) -> None:
+    """Move one site in the sites file."""
+    rows = {"pole_a": Pose(10, 12, 3), "pole_b": Pose(30.5, -12, 3), name: pose}
+    lines = [",".join(map(str, (site, *its.position_m, *its.angles_deg))) for site, its in rows.items()]
+    (folder / "sites.csv").write_text("\n".join(["site,x_m,y_m,z_m,yaw_deg,pitch_deg,roll_deg", *lines]) + "\n")
+
+
+def test_candidates_are_those_of_the_artefact_and_score_so_again(opened: Session) -> None:
+    assert [its.site.name for its in opened.ranked] == ["pole_b", "pole_a"]
+    for name, candidate in opened.candidates.items():
+        again = opened.rate(name, candidate.site.pose)
+        assert again.scores == candidate.scores
+        assert (again.rank, again.findings) == (candidate.rank, ())
+
+
+EFFECTS = (None, "effects.divergence={}", "effects.moving_occlusion={}", "effects.rain.rate_mm_h=20")
+
+
+@pytest.mark.parametrize("effect", EFFECTS)
+def test_a_moved_sensor_has_the_score_of_a_run_with_its_site_there(tmp_path: Path, effect: str | None) -> None:
+    settings = [EVERY, *([effect] if effect else [])]
+    folder = write_mini(tmp_path / "mini")
+    moved = open_session(folder, settings, tmp_path / "run").rate("pole_a", MOVED)
+    write_site(folder, "pole_a", MOVED)
+    row = scored(folder, *settings)["pole_a"]
+    assert moved.scores == {name: row[name] for name in moved.scores}
+    assert set(moved.scores) >= {"egvs", "entropy_seen", "expected_detections", "points_on_target", "coverage"}
+    assert moved.rank == row["rank"]
+
+
+def test_the_rank_is_among_the_others(opened: Session) -> None:
+    best, last = opened.ranked
+    as_best = opened.rate(last.site.name, replace(best.site.pose, x_m=30.4))  # nearly where the best one hangs
+    assert as_best.scores["egvs"] != best.scores["egvs"]
+    assert as_best.rank == (1 if as_best.scores["egvs"] > best.scores["egvs"] else 2)
+    assert opened.rate(last.site.name, best.site.pose).rank == 1  # equal scores share a rank
+    assert opened.rate(best.site.name, last.site.pose).rank == 1  # its own candidate is no rival
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"x_m": 16.0, "y_m": 6.0}, "(16, 6, 3) stands inside house (building); a free place"),
+        ({"z_m": -1.0}, "z_m = -1 is not above the ground (z = 0); a height above 0 m"),
+        ({"x_m": 500.0}, "stands 460.0 m from the region of interest; within the 100 m of small"),
+    ],
+)
+def test_where_none_can_stand_the_reason_is_told(opened: Session, change: dict[str, float], message: str) -> None:
+    refused = opened.rate("pole_a", replace(Pose(10, 12, 3), **change))
+    assert not refused.stands
+    assert (refused.rank, dict(refused.scores)) == (0, {})
+    assert [str(finding) for finding in refused.findings] == [f"site pole_a: {message}"]
+
+
+def test_a_sensor_that_looks_away_is_warned_of(opened: Session) -> None:
+    away = opened.rate("pole_a", Pose(10, 60, 40))
+    assert [finding.rule for finding in away.findings] == ["beams beside the region"]
+    assert (away.scores["egvs"], away.rank) == (0.0, 2)
+
+
+def test_a_measured_scan_cannot_be_moved(tmp_path: Path) -> None:
+    folder = write_mini(tmp_path / "mini")
+    (folder / "sites.csv").write_text("site,x_m,y_m,z_m,points\npole_a,10,12,3,scan.csv\npole_b,30.5,-12,3,\n")
+    (folder / "scan.csv").write_text("x_m,y_m,z_m\n12,2,0.5\n20,-2,1.0\n30,0,0.0\n")
+    session = open_session(folder, (), tmp_path / "run")
+    there = session.candidates["pole_a"]
+    assert session.rate("pole_a", there.site.pose).scores == there.scores
+    moved = session.rate("pole_a", replace(there.site.pose, z_m=4.0))
+    assert not moved.stands
+    assert "its empty scan was measured" in str(moved.findings[0])
+
+
+def test_kept_poses_are_a_file_of_sites(opened: Session) -> None:
+    folder = opened.scenario.folder
+    first = opened.keep(opened.rate("pole_a", MOVED))
+    second = opened.keep(opened.rate("pole_a", replace(MOVED, z_m=1 / 3)))
+    assert [first, second] == [(folder / KEPT, "pole_a-1"), (folder / KEPT, "pole_a-2")]
+    kept = sites.of(pipeline.load(folder, [f"sites.file='{KEPT}'"]))
+    assert [site.name for site in kept] == ["pole_a-1", "pole_a-2"]
+    assert [site.pose for site in kept] == [MOVED, replace(MOVED, z_m=1 / 3)]
+    assert {site.sensor for site in kept} == {"small"}
+
+
+@pytest.mark.parametrize("content", ["site,x_m,y_m,z_m\nmine,1,2,3\n", "", "\x00\xff", '"site'])
+def test_a_file_of_the_users_own_stays(mini: Path, tmp_path: Path, content: str) -> None:
+    (mini / KEPT).write_text(content)
+    session = open_session(mini, (), tmp_path / "run")
+    with pytest.raises(InputError, match="was not written by egvs explore, and stays as it is"):
+        session.keep(session.rate("pole_a", MOVED))
+    assert (mini / KEPT).read_text() == content
+
+
+def test_what_cannot_stand_is_not_kept(opened: Session) -> None:
+    refused = opened.rate("pole_a", replace(MOVED, z_m=-1.0))
+    with pytest.raises(InputError, match="no sensor can stand there"):
+        opened.keep(refused)
+
+
+def test_a_run_is_opened_as_it_was_run(mini: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    first = open_session(mini, ["score.gamma=2"], out)
+    again = open_session(out)
+    assert again.scenario.gamma == 2
+    assert again.candidates == first.candidates
+    with pytest.raises(InputError, match="--set: with the folder of a run"):
+        open_session(out, ["score.gamma=3"])
+    with pytest.raises(InputError, match="--out: with the folder of a run"):
+        open_session(out, out=tmp_path / "other")
+    mini.rename(tmp_path / "gone")
+    with pytest.raises(InputError, match=r"the scenario's folder .* is not there; name the scenario"):
+        open_session(out)
+
+
+def test_an_altered_artefact_is_made_again(mini: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    before = open_session(mini, (), out).candidates
+    (out / "scores.parquet").write_bytes(b"no table")
+    assert open_session(mini, (), out).candidates == before

@@ -1,0 +1,83 @@
+"""What the page draws: the right triangles, near a zero of its own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+import pipeline
+from pipeline.artefacts.readers import Tpog
+from pipeline.core.grid import Grid, Roi
+from pipeline.explore import shapes, wording
+from pipeline.explore.session import Rating
+from pipeline.sensing.sites import Pose, Site
+from pipeline.traffic.network import Lane, Permission
+from pipeline.world import static_world
+from pipeline.world.carriageway import Carriageway
+
+FAR = Roi((400_000.25, 3_900_000.0, 0.0), (40.0, 20.0, 5.0))
+
+
+def test_the_zero_is_near_the_region_and_whole() -> None:
+    assert shapes.zero_of(FAR) == (400_020.0, 3_900_010.0, 0.0)
+
+
+def test_solids_keep_their_triangles(mini: Path) -> None:
+    world = static_world.build(pipeline.load(mini), None)[0]
+    meshes = shapes.solids(world, (20.0, 0.0, 0.0))
+    assert set(meshes) == {kind for _, kind in world.solids}
+    assert sum(len(mesh.faces) for mesh in meshes.values()) == len(world.faces)
+    house = meshes["building"]
+    assert house.points.dtype == np.float32
+    assert (house.points.min(axis=0).tolist(), house.points.max(axis=0).tolist()) == ([-6, 5, 0], [-2, 8, 6])
+
+
+def test_a_region_has_twelve_edges() -> None:
+    found = shapes.edges(FAR, shapes.zero_of(FAR))
+    lengths = np.abs(np.diff(found, axis=1)).sum(axis=(1, 2))
+    assert sorted(lengths.tolist()) == [5.0] * 4 + [20.0] * 4 + [40.0] * 4
+
+
+def test_a_lane_is_a_strip_of_its_width_that_climbs_with_it() -> None:
+    lane = Lane("0,0,1 10,0,2 20,0,2", "lane", 3.0, 20.0, Permission(None, frozenset()))
+    strip = shapes.lanes(Carriageway(("lane",), (lane,)), (0.0, 0.0, 0.0))
+    corners = strip.points[strip.faces].astype(np.float64)
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2.0
+    assert np.isclose(areas.sum(), 3.0 * (np.hypot(10.0, 1.0) + 10.0))
+    assert sorted({round(float(y), 3) for y in strip.points[:, 1]}) == [-1.5, 1.5]
+    assert np.allclose(strip.points[::2, 2], (1.03, 2.03, 2.03))
+
+
+def test_two_lanes_share_no_corner() -> None:
+    lane = Lane("0,0 10,0", "lane", 3.0, 10.0, Permission(None, frozenset()))
+    both = shapes.lanes(Carriageway(("a", "b"), (lane, Lane("0,9 10,9", "b", None, 10.0, lane.permission))), (0, 0, 0))
+    assert both.faces.max() == 7
+    assert len(both.faces) == 4
+
+
+def test_columns_add_up_what_is_over_them() -> None:
+    counts = np.zeros((2, 2, 3), dtype=np.int64)
+    counts[0, 1] = (1, 1, 2)
+    counts[1, 0, 2] = 1
+    tpog = Tpog(Grid((10.0, 20.0, 0.0), 0.5, (2, 2, 3)), 4, counts)
+    points, colours = shapes.columns(tpog, tpog.p, (10.0, 20.0, 0.0))
+    assert points[:, :2].tolist() == [[0.25, 0.75], [0.75, 0.25]]
+    assert colours.tolist() == [[0x44, 0x01, 0x54], shapes.scale([0.25, 1.0], 0.0)[0].tolist()]
+
+
+def test_the_scale_is_dark_for_the_best_and_bears_equal_scores() -> None:
+    assert shapes.scale([1.0, 3.0]).tolist() == [[0xFD, 0xE7, 0x25], [0x44, 0x01, 0x54]]
+    assert len(set(map(tuple, shapes.scale([2.0, 2.0]).tolist()))) == 1
+    assert shapes.scale([]).shape == (0, 3)
+
+
+def test_a_rating_is_told_in_words() -> None:
+    site = Site("a_b", Pose(0, 0, 3), "small")
+    candidate = Rating(site, {"egvs": 200.0, "entropy_seen": 0.5}, 2)
+    moved = Rating(Site("a_b", Pose(0, 0, 4), "small"), {"egvs": 250.0, "entropy_seen": 0.6}, 1)
+    text = wording.in_words(moved, "egvs", candidate, 7)
+    assert text.startswith("## 250.0 (+25.0%)\n\nrank 1 of 7\n")
+    assert "| entropy\\_seen | 60.00% |" in text
+    assert "a\\_b" in wording.ranking([candidate], "egvs")
+    assert wording.in_words(candidate, "egvs", candidate, 7).startswith("## 200.0\n")
