@@ -1,0 +1,163 @@
+"""The page: served to this machine alone, shows what `Session` says, and ends when it is told to."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import threading
+import urllib.request
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from pipeline.core.errors import InputError
+from pipeline.explore.opening import open_session
+from pipeline.explore.session import Session
+from pipeline.sensing.sites import Pose
+from tests.conftest import write_mini
+
+viser = pytest.importorskip("viser", reason="the page needs viser: pip install 'egvs[explore]'")
+
+from pipeline.explore.page import HOST, Page  # noqa: E402 - needs viser
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+in_a_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine: apt-get install chromium")
+GRAPHICS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+READY_MS = 30_000
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
+    """Over the small scenario."""
+    folder = tmp_path_factory.mktemp("page")
+    return open_session(write_mini(folder / "mini"), (), folder / "run")
+
+
+@pytest.fixture
+def page(session: Session) -> Iterator[Page]:
+    """Served, with its loop in a thread."""
+    served = Page(session)
+    loop = threading.Thread(target=served.run)
+    loop.start()
+    try:
+        yield served
+    finally:
+        served.end()
+        loop.join()
+        served.stop()
+
+
+def settled(page: Page, name: str, pose: Pose) -> None:
+    """Wait until a pose is shown."""
+    done = threading.Event()
+    show = page._show
+
+    def shown(rating: Any) -> None:
+        show(rating)
+        if (rating.site.name, rating.site.pose) == (name, pose):
+            done.set()
+
+    page._show = shown  # type: ignore[method-assign]
+    page.want(name, pose)
+    assert done.wait(30)
+    page._show = show  # type: ignore[method-assign]
+
+
+def test_it_serves_this_machine_alone(page: Page) -> None:
+    assert page.address.startswith("http://127.0.0.1:")
+    with urllib.request.urlopen(page.address) as answer:
+        assert answer.status == 200
+    assert page._server.get_host() == HOST
+    assert page._server.request_share_url() is None
+
+
+def test_what_rests_is_what_was_wanted_last(page: Page, session: Session) -> None:
+    poses = [Pose(10 + i / 8, 12, 3 + i / 16, 3.0 * i) for i in range(40)]
+    for pose in poses[:-1]:
+        page.want("pole_a", pose)
+    settled(page, "pole_a", poses[-1])
+    expected = session.rate("pole_a", poses[-1])
+    assert page.rating == expected
+    assert f"## {expected.scores['egvs']:,.1f}" in page._told.content
+
+
+def test_controls_and_gizmo_follow(page: Page) -> None:
+    pose = Pose(10.5, 12.25, 4.125, 33.0, -7.5, 2.0)
+    settled(page, "pole_a", pose)
+    assert {name: number.value for name, number in page._numbers.items()} == pose.__dict__
+    assert page._site.value.endswith("pole_a: 993.0")
+    assert (page._gizmo.position + page.zero_m).tolist() == [10.5, 12.25, 4.125]
+    assert page._label.text == f"pole_a  rank {page.rating.rank}"
+
+
+def test_where_none_can_stand_no_score_is_left(page: Page) -> None:
+    settled(page, "pole_a", Pose(16, 6, 3))
+    assert page._told.content.startswith("## no score")
+    assert "stands inside house" in page._told.content
+    assert page._label.text == "pole_a: cannot stand"
+
+
+def test_a_port_that_is_taken_is_refused(session: Session) -> None:
+    with socket.socket() as other:
+        other.bind((HOST, 0))
+        other.listen()
+        port = other.getsockname()[1]
+        with pytest.raises(InputError, match=f"--port: {port} is taken; another one, or 0 for any that is free"):
+            Page(session, port)
+
+
+def test_nothing_is_served_after_the_end(session: Session) -> None:
+    served = Page(session)
+    address = served.address
+    served.end()
+    served.run()
+    served.stop()
+    with pytest.raises(OSError):
+        urllib.request.urlopen(address)
+
+
+# ---- in a browser
+
+
+@pytest.fixture
+def browser() -> Iterator[Any]:
+    """Chromium, with software rendering."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        opened = playwright.chromium.launch(executable_path=CHROMIUM, args=GRAPHICS)
+        yield opened
+        opened.close()
+
+
+def look(browser: Any, page: Page) -> tuple[Any, list[str]]:
+    """A browser's view of the page, and the errors that it will have."""
+    tab = browser.new_page(viewport={"width": 1200, "height": 800})
+    errors: list[str] = []
+    tab.on("pageerror", lambda error: errors.append(str(error)))
+    tab.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+    tab.goto(page.address)
+    tab.get_by_text("rank 1 of 2").wait_for(timeout=READY_MS)
+    return tab, errors
+
+
+@in_a_browser
+@pytest.mark.system
+@pytest.mark.slow
+def test_two_browsers_see_the_score_of_a_pose_that_one_types(browser: Any, page: Page, session: Session) -> None:
+    (first, wrong), (second, other_wrong) = look(browser, page), look(browser, page)
+    height = first.locator("input").filter(visible=True)
+    field = first.get_by_label("z m")
+    assert height.count() >= 6
+    field.fill("4.5")
+    field.press("Enter")
+    best = session.ranked[0].site
+    pose = Pose(best.pose.x_m, best.pose.y_m, 4.5)
+    expected = f"{session.rate(best.name, pose).scores['egvs']:,.1f}"
+    for tab in (first, second):
+        tab.get_by_text(expected).first.wait_for(timeout=READY_MS)
+    first.reload()
+    first.get_by_text(expected).first.wait_for(timeout=READY_MS)
+    assert page.rating.site.pose == pose
+    assert (wrong, other_wrong) == ([], [])
