@@ -24,10 +24,14 @@ def resolve(scenario: Scenario, world: World) -> Scene:
     InputError
         When the sites are wrong, or none is left.
     """
-    plain = without_effects(scenario, world)
-    if not scenario.effects.named:
+    return with_effects(without_effects(scenario, world))
+
+
+def with_effects(plain: Scene) -> Scene:
+    """A scene without effects, and those of scan and score that its scenario names and that can change a result."""
+    if not plain.scenario.effects.named:
         return plain
-    effects = registry.named(scenario, "scan", "score")
+    effects = registry.named(plain.scenario, "scan", "score")
     reasons = [effect.why_idle(plain) for effect in effects]
     live = tuple(effect for effect, why in zip(effects, reasons, strict=True) if why is None)
     idle = (IdleEffect(effect.NAME, effect.STAGE, why) for effect, why in zip(effects, reasons, strict=True) if why)

@@ -10,22 +10,31 @@ from __future__ import annotations
 import io
 import threading
 from contextlib import redirect_stdout
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from typing import Any
 
 import numpy as np
 import trimesh
 import viser
+from numpy.typing import NDArray
 
 from pipeline.core.errors import InputError
 from pipeline.explore import shapes, turning, wording
 from pipeline.explore.session import Rating, Session
-from pipeline.sensing.sites import Pose
+from pipeline.sensing.sensors import CATALOGUE
+from pipeline.sensing.sites import Pose, Site
 
 HOST = "127.0.0.1"
 """Nobody else's machine can reach it."""
 
+NO_LAYER, TRAFFIC, SEEN, MISSED, SCAN = LAYERS = (
+    "none", "traffic (TPOG)", "entropy seen", "entropy missed", "empty scan"
+)  # fmt: skip
+"""What may be laid over the scene."""
+
 _COLOURS = {"building": (205, 208, 216), "ground": (225, 222, 214), "vegetation": (150, 190, 165)}
 _OTHER_SOLID, _LANE, _ROI = (150, 154, 166), (112, 118, 130), (232, 89, 12)
+_SCAN, _RETURN_M = (200, 30, 80), 0.12
 _SITE_RADIUS_M, _GIZMO_M = 0.6, 5.0
 _LABELS = {
     "x_m": "x m",
@@ -66,7 +75,7 @@ class Page:
         best = session.ranked[0]
         self.rating = session.rate(best.site.name, best.site.pose)  # compiles what is needed before anybody waits
         self._changed = threading.Condition()
-        self._wanted: tuple[str, Pose] | None = None
+        self._wanted: Site | None = None
         self._ended = self._is_dragged = False
         with redirect_stdout(io.StringIO()):  # it greets in its own words
             self._server = _Server(host=HOST, port=port, label="egvs explore", verbose=False)
@@ -82,10 +91,11 @@ class Page:
         """What a browser opens."""
         return f"http://{HOST}:{self._server.get_port()}"
 
-    def want(self, name: str, pose: Pose) -> None:
-        """Ask for a candidate's sensor in a pose; what was asked for before and not yet scored is let go."""
+    def want(self, site: Site) -> None:
+        """Ask for a candidate in another pose, or with another sensor; what was asked for before and not yet scored is
+        let go."""
         with self._changed:
-            self._wanted = name, pose
+            self._wanted = site
             self._changed.notify_all()
 
     def run(self) -> None:
@@ -97,7 +107,7 @@ class Page:
                     return
                 wanted, self._wanted = self._wanted, None
             if wanted is not None:
-                self._show(self.session.rate(*wanted))
+                self._show(self.session.rate(wanted.name, wanted.pose, wanted.sensor))
 
     def end(self) -> None:
         """Let :meth:`run` return."""
@@ -123,9 +133,6 @@ class Page:
             self._lanes = scene.add_mesh_simple("/lanes", road.points, road.faces, color=_LANE, side="double",
                                                 cast_shadow=False)  # fmt: skip
         scene.add_line_segments("/roi", shapes.edges(session.scene.roi, self.zero_m), _ROI, thickness=0.15)
-        points, colours = shapes.columns(session.tpog, session.tpog.p, self.zero_m)
-        self._tpog = scene.add_point_cloud("/tpog", points, colours, point_size=session.tpog.grid.voxel_m / 2.0,
-                                           precision="float32", visible=False)  # fmt: skip
         self._draw_sites()
         self._gizmo = scene.add_transform_controls("/sensor", scale=_GIZMO_M, depth_test=False)
         self._label = scene.add_label("/sensor/label", "")
@@ -148,7 +155,7 @@ class Page:
         def _(event: viser.SceneNodePointerEvent[viser.BatchedMeshHandle]) -> None:
             if event.instance_index is not None:
                 site = ranked[event.instance_index].site
-                self.want(site.name, site.pose)
+                self.want(site)
 
     def _draw_controls(self) -> None:
         gui, session = self._server.gui, self.session
@@ -164,13 +171,15 @@ class Page:
                 name: gui.add_number(label, 0.0, step=_ANGLE_STEP if name.endswith("_deg") else _LENGTH_STEP)
                 for name, label in _LABELS.items()
             }
-        for number in self._numbers.values():
-            number.on_update(self._typed)
+            known = dict.fromkeys((*session.scene.used_sensors, *session.scenario.sensors, *CATALOGUE))
+            self._sensor = gui.add_dropdown("sensor", tuple(known))
+        for control in (*self._numbers.values(), self._sensor):
+            control.on_update(self._typed)
         gui.add_button("Back to the candidate").on_click(lambda _: self._back())
         gui.add_button("Keep this pose").on_click(self._keep)
         with gui.add_folder("show"):
-            shown = gui.add_checkbox("traffic (TPOG) from above", False)
-            shown.on_update(lambda _: setattr(self._tpog, "visible", shown.value))
+            self._layer = gui.add_dropdown("layer", LAYERS, hint="What lies on the road, added up along z.")
+            self._layer.on_update(lambda _: self.want(self.rating.site))
             dark = gui.add_checkbox("dark", False)
             dark.on_update(
                 lambda _: gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=dark.value)
@@ -185,21 +194,21 @@ class Page:
         self._is_dragged = event.phase != "end"
         own = self.rating.site
         position_m = np.asarray(event.target.position, dtype=np.float64) + self.zero_m
-        self.want(own.name, turning.moved(own.pose, position_m.tolist(), event.target.wxyz.tolist()))
+        self.want(replace(own, pose=turning.moved(own.pose, position_m.tolist(), event.target.wxyz.tolist())))
 
     def _chosen(self, event: viser.GuiEvent[viser.GuiDropdownHandle[str]]) -> None:
         if event.client is not None:
             site = self._choices[event.target.value]
-            self.want(site.name, site.pose)
+            self.want(site)
 
-    def _typed(self, event: viser.GuiEvent[viser.GuiNumberHandle[float]]) -> None:
+    def _typed(self, event: viser.GuiEvent[Any]) -> None:
         if event.client is not None:
             values = {name: float(number.value) for name, number in self._numbers.items()}
-            self.want(self.rating.site.name, Pose(**values))
+            self.want(replace(self.rating.site, pose=Pose(**values), sensor=self._sensor.value))
 
     def _back(self) -> None:
         site = self.session.candidates[self.rating.site.name].site
-        self.want(site.name, site.pose)
+        self.want(site)
 
     def _keep(self, event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
         try:
@@ -218,6 +227,7 @@ class Page:
         candidate = self.session.candidates[site.name]
         with self._server.atomic():
             self._told.content = wording.in_words(rating, self.session.rank_by, candidate, len(self.session.candidates))
+            self._sensor.value = site.sensor
             self._site.value = self._of_site[site.name]
             for name, value in asdict(site.pose).items():
                 self._numbers[name].value = value
@@ -225,3 +235,23 @@ class Page:
             if not self._is_dragged:  # else it would be pulled out of a hand
                 self._gizmo.position = np.subtract(site.pose.position_m, self.zero_m)
                 self._gizmo.wxyz = np.array(turning.quaternion(site.pose))
+                self._show_layer()
+
+    def _show_layer(self) -> None:
+        """Lay over the scene what is chosen, of the sensor as it is now; nothing where it cannot stand."""
+        session, layer, site = self.session, self._layer.value, self.rating.site
+        tpog, points = session.tpog, np.empty((0, 3), dtype=np.float32)
+        colours: NDArray[np.uint8] = np.empty((0, 3), dtype=np.uint8)
+        if layer == TRAFFIC:
+            points, colours = shapes.columns(tpog, tpog.p, self.zero_m)
+        elif layer in (SEEN, MISSED) and self.rating.stands:
+            crossed = session.hits(site) > 0.0
+            part = np.where(crossed == (layer == SEEN), session.entropy_bit, 0.0)
+            peak = float(session.entropy_bit.sum(axis=2).max())
+            points, colours = shapes.columns(tpog, part, self.zero_m, peak)
+        elif layer == SCAN and self.rating.stands:
+            points = (session.returns_m(site) - self.zero_m).astype(np.float32)
+            colours = np.full(points.shape, _SCAN, dtype=np.uint8)
+        size_m = _RETURN_M if layer == SCAN else tpog.grid.voxel_m
+        self._server.scene.add_point_cloud("/layer", points, colours, point_size=size_m, precision="float32",
+                                           point_shading="flat")  # fmt: skip

@@ -24,9 +24,12 @@ from pipeline.checks.subject import Subject
 from pipeline.core import files
 from pipeline.core.errors import InputError
 from pipeline.core.findings import Finding
+from pipeline.effects import scene_resolving
 from pipeline.scenario.models import Scenario
+from pipeline.scoring.egvs import EntropyField
 from pipeline.scoring.scorer import Scorer
 from pipeline.scoring.targets.named import WORTHS
+from pipeline.scoring.targets.seen import noticed_in, see
 from pipeline.scoring.visibility import Beams
 from pipeline.sensing.scanner import Scanner
 from pipeline.sensing.scene import Scene
@@ -72,6 +75,15 @@ class Rating:
         return bool(self.scores)
 
 
+@dataclass(frozen=True)
+class _Engine:
+    """What scans and scores with certain effects."""
+
+    scene: Scene
+    scanner: Scanner
+    scorer: Scorer
+
+
 class Session:
     """A run that is being explored. It changes nothing in the run's folder.
 
@@ -86,9 +98,8 @@ class Session:
         self.scene: Scene = scene_of(work)
         self.tpog: Tpog = read_tpog(work.path(TPOG))
         self.candidates: dict[str, Rating] = self._rated(work)
-        # Without sites: one caster serves every pose.
-        self._scanner = Scanner(replace(self.scene, sites=()))
-        self._scorer = Scorer(self.scene, self.tpog, work.path(TRAJECTORIES))
+        self._trajectories = work.path(TRAJECTORIES)
+        self._engines: dict[tuple[str, ...], _Engine] = {}
         asked = any(name in WORTHS for name in self.scenario.score.asked)
         self._targets = Targets(_without_blindspots(work), self.tpog.grid) if asked else None
 
@@ -113,22 +124,41 @@ class Session:
         found = None if self.network is None else Carriageway.of(self.network)
         return found if found is not None and found.lanes else None
 
-    def rate(self, name: str, pose: Pose) -> Rating:
-        """What the sensor of a candidate is worth in a pose; KeyError where there is no such candidate."""
-        site = replace(self.candidates[name].site, pose=pose)
-        if site.points is not None and pose != self.candidates[name].site.pose:
+    def rate(self, name: str, pose: Pose, sensor: str | None = None) -> Rating:
+        """What a candidate's sensor, or another one, is worth in a pose; KeyError where there is no such candidate.
+
+        InputError where there is no such sensor.
+        """
+        own = self.candidates[name].site
+        site = replace(own, pose=pose, sensor=sensor or own.sensor)
+        self.scene.sensor(site.sensor)
+        if site.points is not None and site != own:
             finding = Finding("measured scan", f"site {name}", "its empty scan was measured",
                               "its own pose: what would be measured elsewhere is not known", is_error=True)  # fmt: skip
             return Rating(site, {}, 0, (finding,))
         findings = self._findings(site)
         if any(finding.is_error for finding in findings):
             return Rating(site, {}, 0, findings)
-        scores = self._scores(Beams.of(self._scanner.scan_site(site)))
+        scores = self._scores(site)
         return Rating(site, scores, self._rank(name, scores[self.rank_by]), findings)
 
     def hits(self, site: Site) -> NDArray[np.float64]:
         """The beams of a sensor that cross each voxel, (nx, ny, nz) float64; InputError where it cannot stand."""
-        return self._scorer.hits(Beams.of(self._scanner.scan_site(site)))
+        engine = self._engine(site)
+        return engine.scorer.hits(engine.scanner.scan_site(site))
+
+    def returns_m(self, site: Site) -> NDArray[np.float64]:
+        """Where the empty scan of a sensor met something, (n, 3) float64, world frame; InputError as above."""
+        rows = self._engine(site).scanner.scan_site(site).rows
+        return rows.ends_m[rows.returned] + site.pose.position_m
+
+    @cached_property
+    def entropy_bit(self) -> NDArray[np.float64]:
+        """Entropy of each voxel, (nx, ny, nz) float64."""
+        field = EntropyField.of(self.tpog.counts, self.tpog.frames, self.tpog.grid)
+        found = np.zeros(self.tpog.counts.size)
+        found[field.cells] = field.per_cell_bit
+        return found.reshape(self.tpog.grid.shape)
 
     def keep(self, rating: Rating) -> tuple[Path, str]:
         """Add a pose to the file of kept sites; the file, and the name that it has there.
@@ -171,13 +201,26 @@ class Session:
         subject = Subject(scenario, self.network, self.carriageway, self.scene.world, (site,), self.scene)
         return (*rules.poses(subject), *rules.on_lanes(subject))
 
-    def _scores(self, beams: Beams) -> dict[str, float]:
-        found = self._scorer.score(beams)
+    def _engine(self, site: Site) -> _Engine:
+        """What scans and scores while a site is as it is now: an effect that changes nothing for the candidates as they
+        are given may do so then, and the other way round."""
+        sites = tuple(site if its.name == site.name else its for its in self.scene.sites)
+        scene = scene_resolving.with_effects(replace(self.scene, sites=sites, effects=(), idle=()))
+        key = tuple(effect.NAME for effect in scene.effects)
+        if key not in self._engines:
+            scene = replace(scene, sites=())  # one caster serves every pose
+            self._engines[key] = _Engine(scene, Scanner(scene), Scorer(scene, self.tpog, self._trajectories))
+        return self._engines[key]
+
+    def _scores(self, site: Site) -> dict[str, float]:
+        engine = self._engine(site)
+        beams = Beams.of(engine.scanner.scan_site(site))
+        found = engine.scorer.score(beams)
         scores = {"egvs": found.egvs, "entropy_seen": found.entropy_seen}
         scores |= {name: float(value[0]) for name, value in found.shares.items()}
         if self._targets is not None:
-            its = self._targets.scores(self._targets.see(beams)).scores
-            scores |= {name: float(value[0]) for name, value in its.items()}
+            seen = see(self._targets.record, beams, noticed_in(engine.scene, beams.sensor))
+            scores |= {name: float(value[0]) for name, value in self._targets.scores(seen).scores.items()}
         return scores
 
     def _rank(self, name: str, score: float) -> int:

@@ -83,21 +83,26 @@ def edges(roi: Roi, zero_m: Vec3) -> NDArray[np.float32]:
     return corners[pairs].astype(np.float32)
 
 
-def columns(tpog: Tpog, values: NDArray[np.float64], zero_m: Vec3) -> tuple[Points, NDArray[np.uint8]]:
+def columns(
+    tpog: Tpog, values: NDArray[np.float64], zero_m: Vec3, peak: float | None = None
+) -> tuple[Points, NDArray[np.uint8]]:
     """Values of voxels (nx, ny, nz) added up along z, as points over the middle of each column that has some, and
-    their colours (n, 3)."""
+    their colours (n, 3) on a scale up to ``peak``, or to the largest."""
     grid, total = tpog.grid, values.sum(axis=2)
     ix, iy = np.nonzero(total > 0.0)
     middle = np.column_stack([ix + 0.5, iy + 0.5, np.zeros(len(ix))]) * grid.voxel_m
     points = middle + grid.origin_m - zero_m + (0.0, 0.0, 2.0 * _ABOVE_ROAD_M)
-    return points.astype(np.float32), scale(total[ix, iy], 0.0)
+    return points.astype(np.float32), scale(total[ix, iy], 0.0, peak)
 
 
-def scale(values: NDArray[np.float64] | Sequence[float], low: float | None = None) -> NDArray[np.uint8]:
-    """Colours (n, 3) of values, from the lowest (or ``low``) to the highest of them; as in the report, on light."""
+def scale(
+    values: NDArray[np.float64] | Sequence[float], low: float | None = None, high: float | None = None
+) -> NDArray[np.uint8]:
+    """Colours (n, 3) of values, from the lowest (or ``low``) to the highest of them (or ``high``); as in the report, on
+    light."""
     known = np.asarray(values, dtype=np.float64)
     low = float(np.min(known, initial=np.inf)) if low is None else low
-    span = float(np.max(known, initial=-np.inf)) - low
+    span = (float(np.max(known, initial=-np.inf)) if high is None else high) - low
     share = (known - low) / span if span > 0.0 else np.ones(len(known))
     at = np.rint(np.nan_to_num(share) * _SCALE_STEPS).astype(np.int64)
     table = [tuple(colours.mixed(step, _SCALE_STEPS, colours.ON_LIGHT)) for step in range(_SCALE_STEPS + 1)]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import socket
 import threading
 import urllib.request
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -19,7 +21,7 @@ from tests.conftest import write_mini
 
 viser = pytest.importorskip("viser", reason="the page needs viser: pip install 'egvs[explore]'")
 
-from pipeline.explore.page import HOST, Page  # noqa: E402 - needs viser
+from pipeline.explore.page import HOST, LAYERS, Page  # noqa: E402 - needs viser
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 in_a_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine: apt-get install chromium")
@@ -48,18 +50,18 @@ def page(session: Session) -> Iterator[Page]:
         served.stop()
 
 
-def settled(page: Page, name: str, pose: Pose) -> None:
+def settled(page: Page, name: str, pose: Pose, sensor: str = "small") -> None:
     """Wait until a pose is shown."""
-    done = threading.Event()
+    done, wanted = threading.Event(), replace(page.session.candidates[name].site, pose=pose, sensor=sensor)
     show = page._show
 
     def shown(rating: Any) -> None:
         show(rating)
-        if (rating.site.name, rating.site.pose) == (name, pose):
+        if rating.site == wanted:
             done.set()
 
     page._show = shown  # type: ignore[method-assign]
-    page.want(name, pose)
+    page.want(wanted)
     assert done.wait(30)
     page._show = show  # type: ignore[method-assign]
 
@@ -75,7 +77,7 @@ def test_it_serves_this_machine_alone(page: Page) -> None:
 def test_what_rests_is_what_was_wanted_last(page: Page, session: Session) -> None:
     poses = [Pose(10 + i / 8, 12, 3 + i / 16, 3.0 * i) for i in range(40)]
     for pose in poses[:-1]:
-        page.want("pole_a", pose)
+        page.want(replace(session.candidates["pole_a"].site, pose=pose))
     settled(page, "pole_a", poses[-1])
     expected = session.rate("pole_a", poses[-1])
     assert page.rating == expected
@@ -96,6 +98,33 @@ def test_where_none_can_stand_no_score_is_left(page: Page) -> None:
     assert page._told.content.startswith("## no score")
     assert "stands inside house" in page._told.content
     assert page._label.text == "pole_a: cannot stand"
+
+
+def test_another_sensor_is_that_of_the_catalogue(page: Page, session: Session) -> None:
+    pose = session.candidates["pole_a"].site.pose
+    settled(page, "pole_a", pose, "VLP-16")
+    assert page._sensor.value == "VLP-16"
+    assert page.rating.scores["egvs"] > session.candidates["pole_a"].scores["egvs"]
+
+
+@pytest.mark.parametrize("layer", LAYERS)
+def test_layers_show_what_their_names_say(page: Page, session: Session, layer: str) -> None:
+    pose = Pose(11, 12, 3)
+    page._layer.value = layer
+    settled(page, "pole_a", pose)
+    drawn = page._server.scene.get_handle_by_name("/layer")
+    hits = session.hits(page.rating.site)
+    total = session.entropy_bit.sum()
+    expected = {
+        "none": 0,
+        "traffic (TPOG)": (session.tpog.counts.sum(axis=2) > 0).sum(),
+        "entropy seen": (session.entropy_bit * (hits > 0)).any(axis=2).sum(),
+        "entropy missed": (session.entropy_bit * (hits == 0)).any(axis=2).sum(),
+        "empty scan": len(session.returns_m(page.rating.site)),
+    }
+    assert drawn is not None
+    assert len(drawn.points) == expected[layer]
+    assert math.isclose((session.entropy_bit * (hits > 0)).sum() / total, page.rating.scores["entropy_seen"])
 
 
 def test_a_port_that_is_taken_is_refused(session: Session) -> None:
