@@ -63,7 +63,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	@$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11) and 'egvs needs Python 3.11 or newer; name one with: make PYTHON=...')"
 	$(PYTHON) -m venv $(VENV)
 	$(INSTALL) hatchling editables
-	$(INSTALL) --no-build-isolation --editable .
+	$(INSTALL) --no-build-isolation --editable '.[explore]'
 	@touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from pipeline.explore.opening import open_session
 from pipeline.explore.session import KEPT, Session
 from pipeline.sensing import sites
 from pipeline.sensing.sites import Pose
-from tests.conftest import write_mini
+from tests.conftest import feature, write_mini
 
 EVERY = "score.others=['expected_detections','points_on_target','seen_well','coverage','expected_visibility']"
 MOVED = Pose(9.125, 12.5, 3.75, 20.25, -4.5, 1.0)
@@ -62,6 +63,30 @@ def test_a_moved_sensor_has_the_score_of_a_run_with_its_site_there(tmp_path: Pat
     assert moved.scores == {name: row[name] for name in moved.scores}
     assert set(moved.scores) >= {"egvs", "entropy_seen", "expected_detections", "points_on_target", "coverage"}
     assert moved.rank == row["rank"]
+
+
+def test_an_effect_that_is_idle_until_a_sensor_moves_acts_then(tmp_path: Path) -> None:
+    folder = write_mini(tmp_path / "mini")
+    world = json.loads((folder / "statics.geojson").read_text())
+    ring = [[[10, 14], [13, 14], [13, 17], [10, 17], [10, 14]]]  # no candidate looks through it at the region
+    crown = feature({"type": "Polygon", "coordinates": ring}, name="leaves", kind="tree_crown", height_m=6)
+    world["features"].append(crown)
+    (folder / "statics.geojson").write_text(json.dumps(world))
+    behind = Pose(11.5, 18.0, 3.0)
+    session = open_session(folder, ["effects.foliage={}"], tmp_path / "run")
+    assert session.scene.effects == ()
+    moved = session.rate("pole_a", behind)
+    assert moved.scores["egvs"] > open_session(folder, (), tmp_path / "opaque").rate("pole_a", behind).scores["egvs"]
+    write_site(folder, "pole_a", behind)
+    row = scored(folder, "effects.foliage={}")["pole_a"]
+    assert (moved.scores["egvs"], moved.scores["entropy_seen"], moved.rank) == (
+        row["egvs"], row["entropy_seen"], row["rank"]
+    )  # fmt: skip
+
+
+def test_a_sensor_that_no_catalogue_has_is_refused(opened: Session) -> None:
+    with pytest.raises(InputError, match="XX"):
+        opened.rate("pole_a", MOVED, "nothing")
 
 
 def test_the_rank_is_among_the_others(opened: Session) -> None:
