@@ -85,7 +85,7 @@ def test_an_effect_that_is_idle_until_a_sensor_moves_acts_then(tmp_path: Path) -
 
 
 def test_a_sensor_that_no_catalogue_has_is_refused(opened: Session) -> None:
-    with pytest.raises(InputError, match="XX"):
+    with pytest.raises(InputError, match="unknown sensor 'nothing'"):
         opened.rate("pole_a", MOVED, "nothing")
 
 

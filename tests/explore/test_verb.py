@@ -1,0 +1,79 @@
+"""`egvs explore` on the command line: what it prints, how it ends, what it refuses."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import urllib.request
+import webbrowser
+from pathlib import Path
+
+import pytest
+
+from pipeline.explore import page as pages
+from tests.processes import EGVS
+
+
+@pytest.mark.system
+@pytest.mark.slow
+def test_it_serves_until_an_interrupt_and_leaves_nothing(mini: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    command = [sys.executable, "-c", EGVS, "explore", mini, "--no-browser", "--out", out]
+    started = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    assert started.stdout is not None
+    address = next(line.split()[0] for line in started.stdout if line.startswith("http"))
+    before = {path: path.read_bytes() for path in out.iterdir()}
+    assert urllib.request.urlopen(address).status == 200
+    os.kill(started.pid, signal.SIGINT)
+    printed, said = started.communicate()
+    assert (started.returncode, printed.strip()) == (0, "")
+    assert said.splitlines()[-1].startswith("score")  # no word of an interrupt
+    with pytest.raises(ProcessLookupError):
+        os.killpg(started.pid, 0)  # nobody is left of all that it started
+    with pytest.raises(OSError):
+        urllib.request.urlopen(address)
+    assert {path: path.read_bytes() for path in out.iterdir()} == before
+
+
+def test_the_address_is_printed_and_opened(egvs, mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr(webbrowser, "open", opened.append)
+    monkeypatch.setattr(pages.Page, "run", lambda page: opened.append(page.address))
+    code, out, err = egvs("explore", mini, "--out", tmp_path / "run")
+    assert (code, err.splitlines()[-1].partition(" ")[0]) == (0, "score")
+    assert opened[0] == opened[1]
+    assert out.splitlines()[-1] == f"{opened[0]}  (Ctrl-C ends it)"
+    egvs("explore", tmp_path / "run", "--no-browser")
+    assert len(opened) == 3
+
+
+def test_without_the_extra_it_says_how_to_install_it(egvs, mini: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(mini.parent)
+    monkeypatch.setitem(sys.modules, "viser", None)
+    code, out, err = egvs("explore", mini)
+    assert (code, out) == (2, "")
+    assert err == "egvs: egvs explore needs viser, which is not installed: pip install 'egvs[explore]'\n"
+    assert not Path("runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("nowhere", "--no-browser"), "nowhere"),
+        (("mini", "--port", "70000"), "less than or equal to 65535"),
+        (("mini", "--set", "score.gamma=-1"), "score.gamma"),
+    ],
+)
+def test_what_is_wrong_is_one_message(
+    egvs, mini: Path, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], message: str
+) -> None:
+    monkeypatch.chdir(mini.parent)
+    code, out, err = egvs("explore", *options)
+    assert (code, out) == (2, "")
+    assert message in err
+    assert "Traceback" not in err
+    assert not Path("runs").exists()
