@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import trimesh
 import viser
+from matplotlib import image
 from numpy.typing import NDArray
 
 from pipeline.core.errors import InputError
@@ -35,7 +36,7 @@ NO_LAYER, TRAFFIC, SEEN, MISSED, SCAN = LAYERS = (
 _COLOURS = {"building": (205, 208, 216), "ground": (225, 222, 214), "vegetation": (150, 190, 165)}
 _OTHER_SOLID, _LANE, _ROI = (150, 154, 166), (112, 118, 130), (232, 89, 12)
 _SCAN, _RETURN_M = (200, 30, 80), 0.12
-_SITE_RADIUS_M, _GIZMO_M = 0.6, 5.0
+_SITE_RADIUS_M, GIZMO_M = 0.6, 5.0
 _LABELS = {
     "x_m": "x m",
     "y_m": "y m",
@@ -44,6 +45,7 @@ _LABELS = {
     "pitch_deg": "tilt deg",
     "roll_deg": "roll deg",
 }
+_LAYER = "/layer"
 _LENGTH_STEP, _ANGLE_STEP = 0.001, 0.01
 
 
@@ -76,7 +78,7 @@ class Page:
         self.rating = session.rate(best.site.name, best.site.pose)  # compiles what is needed before anybody waits
         self._changed = threading.Condition()
         self._wanted: Site | None = None
-        self._ended = self._is_dragged = False
+        self._ended = self._is_dragged = self._is_busy = False
         with redirect_stdout(io.StringIO()):  # it greets in its own words
             self._server = _Server(host=HOST, port=port, label="egvs explore", verbose=False)
         if port and self._server.get_port() != port:
@@ -106,8 +108,17 @@ class Page:
                 if self._ended:
                     return
                 wanted, self._wanted = self._wanted, None
+                self._is_busy = True
             if wanted is not None:
                 self._show(self.session.rate(wanted.name, wanted.pose, wanted.sensor))
+            with self._changed:
+                self._is_busy = False
+                self._changed.notify_all()
+
+    def rest(self, timeout_s: float) -> bool:
+        """Wait until all that was wanted is shown; whether that came in time."""
+        with self._changed:
+            return self._changed.wait_for(lambda: self._wanted is None and not self._is_busy, timeout_s)
 
     def end(self) -> None:
         """Let :meth:`run` return."""
@@ -134,7 +145,7 @@ class Page:
                                                 cast_shadow=False)  # fmt: skip
         scene.add_line_segments("/roi", shapes.edges(session.scene.roi, self.zero_m), _ROI, thickness=0.15)
         self._draw_sites()
-        self._gizmo = scene.add_transform_controls("/sensor", scale=_GIZMO_M, depth_test=False)
+        self._gizmo = scene.add_transform_controls("/sensor", scale=GIZMO_M, depth_test=False)
         self._label = scene.add_label("/sensor/label", "")
         self._gizmo.on_update(self._dragged)
         reach_m = max(session.scene.roi.size_m)
@@ -177,6 +188,7 @@ class Page:
             control.on_update(self._typed)
         gui.add_button("Back to the candidate").on_click(lambda _: self._back())
         gui.add_button("Keep this pose").on_click(self._keep)
+        gui.add_button("Picture (PNG)").on_click(self._picture)
         with gui.add_folder("show"):
             self._layer = gui.add_dropdown("layer", LAYERS, hint="What lies on the road, added up along z.")
             self._layer.on_update(lambda _: self.want(self.rating.site))
@@ -219,6 +231,13 @@ class Page:
         if event.client is not None:
             event.client.add_notification(title, text)
 
+    def _picture(self, event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
+        if event.client is not None:
+            camera, file = event.client.camera, io.BytesIO()
+            drawn = event.client.get_render(camera.image_height, camera.image_width, transport_format="png")
+            image.imsave(file, drawn, format="png", metadata={"Software": None})
+            event.client.send_file_download(f"{self.session.scenario.name}.png", file.getvalue())
+
     # ---- what changes
 
     def _show(self, rating: Rating) -> None:
@@ -252,6 +271,9 @@ class Page:
         elif layer == SCAN and self.rating.stands:
             points = (session.returns_m(site) - self.zero_m).astype(np.float32)
             colours = np.full(points.shape, _SCAN, dtype=np.uint8)
+        if not len(points):
+            self._server.scene.remove_by_name(_LAYER)
+            return
         size_m = _RETURN_M if layer == SCAN else tpog.grid.voxel_m
-        self._server.scene.add_point_cloud("/layer", points, colours, point_size=size_m, precision="float32",
+        self._server.scene.add_point_cloud(_LAYER, points, colours, point_size=size_m, precision="float32",
                                            point_shading="flat")  # fmt: skip
