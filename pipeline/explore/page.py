@@ -17,10 +17,9 @@ import numpy as np
 import trimesh
 import viser
 from matplotlib import image
-from numpy.typing import NDArray
 
 from pipeline.core.errors import InputError
-from pipeline.explore import shapes, turning, wording
+from pipeline.explore import layers, shapes, turning, wording
 from pipeline.explore.session import Rating, Session
 from pipeline.sensing.sensors import CATALOGUE
 from pipeline.sensing.sites import Pose, Site
@@ -28,14 +27,8 @@ from pipeline.sensing.sites import Pose, Site
 HOST = "127.0.0.1"
 """Nobody else's machine can reach it."""
 
-NO_LAYER, TRAFFIC, SEEN, MISSED, SCAN = LAYERS = (
-    "none", "traffic (TPOG)", "entropy seen", "entropy missed", "empty scan"
-)  # fmt: skip
-"""What may be laid over the scene."""
-
 _COLOURS = {"building": (205, 208, 216), "ground": (225, 222, 214), "vegetation": (150, 190, 165)}
 _OTHER_SOLID, _LANE, _ROI = (150, 154, 166), (112, 118, 130), (232, 89, 12)
-_SCAN, _RETURN_M = (200, 30, 80), 0.12
 _SITE_RADIUS_M, GIZMO_M = 0.6, 5.0
 _LABELS = {
     "x_m": "x m",
@@ -45,7 +38,6 @@ _LABELS = {
     "pitch_deg": "tilt deg",
     "roll_deg": "roll deg",
 }
-_LAYER = "/layer"
 _LENGTH_STEP, _ANGLE_STEP = 0.001, 0.01
 
 
@@ -190,8 +182,10 @@ class Page:
         gui.add_button("Keep this pose").on_click(self._keep)
         gui.add_button("Picture (PNG)").on_click(self._picture)
         with gui.add_folder("show"):
-            self._layer = gui.add_dropdown("layer", LAYERS, hint="What lies on the road, added up along z.")
-            self._layer.on_update(lambda _: self.want(self.rating.site))
+            self._layer = gui.add_dropdown("layer", layers.LAYERS, hint="What lies on the road, added up along z.")
+            self._ring = gui.add_number("ring", 0, min=0, step=1, hint="Whose beams the last layer shows.")
+            for control in (self._layer, self._ring):
+                control.on_update(lambda _: self.want(self.rating.site))
             dark = gui.add_checkbox("dark", False)
             dark.on_update(
                 lambda _: gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=dark.value)
@@ -254,26 +248,5 @@ class Page:
             if not self._is_dragged:  # else it would be pulled out of a hand
                 self._gizmo.position = np.subtract(site.pose.position_m, self.zero_m)
                 self._gizmo.wxyz = np.array(turning.quaternion(site.pose))
-                self._show_layer()
-
-    def _show_layer(self) -> None:
-        """Lay over the scene what is chosen, of the sensor as it is now; nothing where it cannot stand."""
-        session, layer, site = self.session, self._layer.value, self.rating.site
-        tpog, points = session.tpog, np.empty((0, 3), dtype=np.float32)
-        colours: NDArray[np.uint8] = np.empty((0, 3), dtype=np.uint8)
-        if layer == TRAFFIC:
-            points, colours = shapes.columns(tpog, tpog.p, self.zero_m)
-        elif layer in (SEEN, MISSED) and self.rating.stands:
-            crossed = session.hits(site) > 0.0
-            part = np.where(crossed == (layer == SEEN), session.entropy_bit, 0.0)
-            peak = float(session.entropy_bit.sum(axis=2).max())
-            points, colours = shapes.columns(tpog, part, self.zero_m, peak)
-        elif layer == SCAN and self.rating.stands:
-            points = (session.returns_m(site) - self.zero_m).astype(np.float32)
-            colours = np.full(points.shape, _SCAN, dtype=np.uint8)
-        if not len(points):
-            self._server.scene.remove_by_name(_LAYER)
-            return
-        size_m = _RETURN_M if layer == SCAN else tpog.grid.voxel_m
-        self._server.scene.add_point_cloud(_LAYER, points, colours, point_size=size_m, precision="float32",
-                                           point_shading="flat")  # fmt: skip
+                layer, ring = self._layer.value, int(self._ring.value)
+                layers.draw(self._server.scene, self.session, rating, layer, ring, self.zero_m)

@@ -152,6 +152,16 @@ class Session:
         rows = self._engine(site).scanner.scan_site(site).rows
         return rows.ends_m[rows.returned] + site.pose.position_m
 
+    def beams_m(self, site: Site, ring: int) -> NDArray[np.float64]:
+        """The beams of one ring that can meet the region, (n, 2, 3) float64: from the sensor to where each ends, world
+        frame. None of a sensor without rings; the last ring for a higher number. InputError as above."""
+        scan = self._engine(site).scanner.scan_site(site)
+        channels = scan.sensor.channels
+        has_rings = channels > 0 and site.points is None
+        of_ring = scan.rows.beam % channels == min(ring, channels - 1) if has_rings else slice(0)
+        ends = scan.rows.ends_m[of_ring] + site.pose.position_m
+        return np.stack([np.broadcast_to(site.pose.position_m, ends.shape), ends], axis=1)
+
     @cached_property
     def entropy_bit(self) -> NDArray[np.float64]:
         """Entropy of each voxel, (nx, ny, nz) float64."""

@@ -22,7 +22,8 @@ from tests.conftest import write_mini
 
 viser = pytest.importorskip("viser", reason="the page needs viser: pip install 'egvs[explore]'")
 
-from pipeline.explore.page import GIZMO_M, HOST, LAYERS, Page  # noqa: E402 - needs viser
+from pipeline.explore.layers import LAYERS  # noqa: E402 - needs viser
+from pipeline.explore.page import GIZMO_M, HOST, Page  # noqa: E402
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 in_a_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine: apt-get install chromium")
@@ -112,6 +113,7 @@ def test_layers_show_what_their_names_say(page: Page, session: Session, layer: s
         "entropy seen": (session.entropy_bit * (hits > 0)).any(axis=2).sum(),
         "entropy missed": (session.entropy_bit * (hits == 0)).any(axis=2).sum(),
         "empty scan": len(session.returns_m(page.rating.site)),
+        "beams of a ring": len(session.beams_m(page.rating.site, 0)),
     }
     assert (0 if drawn is None else len(drawn.points)) == expected[layer]
     assert math.isclose((session.entropy_bit * (hits > 0)).sum() / total, page.rating.scores["entropy_seen"])

@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import pipeline
@@ -87,6 +88,16 @@ def test_an_effect_that_is_idle_until_a_sensor_moves_acts_then(tmp_path: Path) -
 def test_a_sensor_that_no_catalogue_has_is_refused(opened: Session) -> None:
     with pytest.raises(InputError, match="unknown sensor 'nothing'"):
         opened.rate("pole_a", MOVED, "nothing")
+
+
+def test_beams_of_a_ring_lie_on_its_cone(opened: Session) -> None:
+    site = opened.candidates["pole_a"].site
+    for ring, elevation in ((0, -15.0), (2, -15.0 + 2 * 20.0 / 7), (99, 5.0)):
+        lines = opened.beams_m(site, ring)
+        along = np.diff(lines, axis=1)[:, 0]
+        assert len(lines) > 0
+        assert (lines[:, 0] == site.pose.position_m).all()
+        assert np.allclose(np.degrees(np.arcsin(along[:, 2] / np.linalg.norm(along, axis=1))), elevation)
 
 
 def test_the_rank_is_among_the_others(opened: Session) -> None:
