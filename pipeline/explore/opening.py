@@ -54,7 +54,8 @@ def open_session(
         folder = out or workflow.default_folder(scenario)
     record = workflow.run(scenario, folder, only=NEEDED, jobs=jobs, progress=progress, listener=listener)
     with alone(folder):
-        return Session(Workspace(scenario, folder, jobs=jobs, recorded=stages.recorded(record)))
+        work = Workspace(scenario, folder, jobs=jobs, recorded=stages.recorded(record))
+        return Session(work, {name: stage.inputs for name, stage in record.stages.items()})
 
 
 def _recorded(folder: Path) -> Scenario:

@@ -68,6 +68,7 @@ class Page:
         self.zero_m = shapes.zero_of(session.scene.roi)
         best = session.ranked[0]
         self.rating = session.rate(best.site.name, best.site.pose)  # compiles what is needed before anybody waits
+        self.plan = session.plan
         self._changed = threading.Condition()
         self._wanted: Site | None = None
         self._ended = self._is_dragged = self._is_busy = False
@@ -157,8 +158,7 @@ class Page:
         @balls.on_click
         def _(event: viser.SceneNodePointerEvent[viser.BatchedMeshHandle]) -> None:
             if event.instance_index is not None:
-                site = ranked[event.instance_index].site
-                self.want(site)
+                self.want(self._present(ranked[event.instance_index].site))
 
     def _draw_controls(self) -> None:
         gui, session = self._server.gui, self.session
@@ -204,13 +204,16 @@ class Page:
 
     def _chosen(self, event: viser.GuiEvent[viser.GuiDropdownHandle[str]]) -> None:
         if event.client is not None:
-            site = self._choices[event.target.value]
-            self.want(site)
+            self.want(self._present(self._choices[event.target.value]))
 
     def _typed(self, event: viser.GuiEvent[Any]) -> None:
         if event.client is not None:
             values = {name: float(number.value) for name, number in self._numbers.items()}
             self.want(replace(self.rating.site, pose=Pose(**values), sensor=self._sensor.value))
+
+    def _present(self, candidate: Site) -> Site:
+        """Where a candidate's sensor is in the plan now; the candidate itself where it is in none."""
+        return candidate if self.plan is None else self.plan.sites.get(candidate.name, candidate)
 
     def _back(self) -> None:
         site = self.session.candidates[self.rating.site.name].site
@@ -239,7 +242,8 @@ class Page:
         self.rating, site = rating, rating.site
         candidate = self.session.candidates[site.name]
         with self._server.atomic():
-            self._told.content = wording.in_words(rating, self.session.rank_by, candidate, len(self.session.candidates))
+            told = wording.in_words(rating, self.session.rank_by, candidate, len(self.session.candidates))
+            self._told.content = told + ("" if self._is_dragged else self._plan_in_words(rating))
             self._sensor.value = site.sensor
             self._site.value = self._of_site[site.name]
             for name, value in asdict(site.pose).items():
@@ -250,3 +254,11 @@ class Page:
                 self._gizmo.wxyz = np.array(turning.quaternion(site.pose))
                 layer, ring = self._layer.value, int(self._ring.value)
                 layers.draw(self._server.scene, self.session, rating, layer, ring, self.zero_m)
+
+    def _plan_in_words(self, rating: Rating) -> str:
+        """The plan with this sensor as it is now, where it belongs to it; nothing where there is no plan."""
+        if self.plan is None or not rating.stands:
+            return ""
+        if rating.site.name in self.plan.sites and rating.site != self.plan.sites[rating.site.name]:
+            self.plan = self.plan.moved(rating.site, self.session.beams(rating.site))
+        return wording.plan(self.plan)

@@ -25,6 +25,7 @@ from pipeline.core import files
 from pipeline.core.errors import InputError
 from pipeline.core.findings import Finding
 from pipeline.effects import scene_resolving
+from pipeline.explore.plan import MovingPlan
 from pipeline.scenario.models import Scenario
 from pipeline.scoring.egvs import EntropyField
 from pipeline.scoring.scorer import Scorer
@@ -91,9 +92,11 @@ class Session:
     ----------
     work
         A folder in which all stages up to ``score`` are done.
+    stages
+        Their keys, by name: a plan in the folder is taken only where it was made from them.
     """
 
-    def __init__(self, work: Workspace) -> None:
+    def __init__(self, work: Workspace, stages: Mapping[str, str]) -> None:
         self.scenario: Scenario = work.scenario
         self.scene: Scene = scene_of(work)
         self.tpog: Tpog = read_tpog(work.path(TPOG))
@@ -101,6 +104,7 @@ class Session:
         self._trajectories = work.path(TRAJECTORIES)
         self._engines: dict[tuple[str, ...], _Engine] = {}
         asked = any(name in WORTHS for name in self.scenario.score.asked)
+        self.plan = MovingPlan.of(work, stages)
         self._targets = Targets(_without_blindspots(work), self.tpog.grid) if asked else None
 
     @property
@@ -146,6 +150,10 @@ class Session:
         """The beams of a sensor that cross each voxel, (nx, ny, nz) float64; InputError where it cannot stand."""
         engine = self._engine(site)
         return engine.scorer.hits(engine.scanner.scan_site(site))
+
+    def beams(self, site: Site) -> Beams:
+        """The empty scan of a sensor as scores take it; InputError as above."""
+        return Beams.of(self._engine(site).scanner.scan_site(site))
 
     def returns_m(self, site: Site) -> NDArray[np.float64]:
         """Where the empty scan of a sensor met something, (n, 3) float64, world frame; InputError as above."""

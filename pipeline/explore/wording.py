@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from pipeline.explore.plan import MovingPlan
 from pipeline.explore.session import Rating
 
 MOST_LISTED = 20
@@ -26,6 +27,16 @@ def in_words(rating: Rating, rank_by: str, candidate: Rating, candidates: int) -
     rows = "\n".join(f"| {plain(name)} | {value_in_words(name, value)} |" for name, value in rating.scores.items())
     head = f"## {value_in_words(rank_by, score)}{more}\n\nrank {rating.rank} of {candidates}"
     return f"{head}\n\n| score | value |\n|---|---|\n{rows}\n\n{told}"
+
+
+def plan(its: MovingPlan) -> str:
+    """What the sensors of a plan are worth together as they are now, and where one more would be best."""
+    names, value = ", ".join(map(plain, its.sites)), value_in_words(its.poses.asked.score, its.joint)
+    more = ""
+    if its.best_next is not None:
+        name, gain = its.best_next
+        more = f"; best for one more: {plain(name)} (+{gain:,.4g})"
+    return f"\n\n**plan** {names}: together {value}{more}"
 
 
 def ranking(ranked: Sequence[Rating], rank_by: str) -> str:
