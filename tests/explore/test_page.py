@@ -9,11 +9,13 @@ import threading
 import urllib.request
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+import pipeline
 from pipeline.core.errors import InputError
 from pipeline.explore.opening import open_session
 from pipeline.explore.session import Session
@@ -117,6 +119,24 @@ def test_layers_show_what_their_names_say(page: Page, session: Session, layer: s
     }
     assert (0 if drawn is None else len(drawn.points)) == expected[layer]
     assert math.isclose((session.entropy_bit * (hits > 0)).sum() / total, page.rating.scores["entropy_seen"])
+
+
+def test_a_plan_moves_with_its_sensors(mini: Path, tmp_path: Path) -> None:
+    placed = pipeline.place(pipeline.load(mini, ["placement.count=1"]), tmp_path / "run")
+    served = Page(open_session(mini, (), tmp_path / "run"))
+    try:
+        site = served.rating.site
+        assert f"**plan** pole\\_b: together {placed.joint:,.1f}; best for one more: pole\\_a" in served._told.content
+        there = replace(site, pose=replace(site.pose, z_m=4.5))
+        served._show(served.session.rate(there.name, there.pose))
+        assert served.plan is not None
+        assert served.plan.sites["pole_b"] == there
+        assert served.plan.joint == served.rating.scores["egvs"]  # of one sensor, the joint score is the score
+        other = served.session.candidates["pole_a"].site
+        served._show(served.session.rate(other.name, other.pose))
+        assert served.plan.sites["pole_b"] == there
+    finally:
+        served.stop()
 
 
 def test_a_port_that_is_taken_is_refused(session: Session) -> None:
