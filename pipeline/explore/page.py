@@ -27,7 +27,7 @@ from pipeline.sensing.sites import Pose, Site
 HOST = "127.0.0.1"
 """Nobody else's machine can reach it."""
 
-_COLOURS = {"building": (205, 208, 216), "ground": (225, 222, 214), "vegetation": (150, 190, 165)}
+_COLOURS = {"building": (205, 208, 216), "ground": (225, 222, 214), "tree_crown": (150, 190, 165)}
 _OTHER_SOLID, _LANE, _ROI = (150, 154, 166), (112, 118, 130), (232, 89, 12)
 _SITE_RADIUS_M, GIZMO_M = 0.6, 5.0
 _LABELS = {
@@ -141,6 +141,7 @@ class Page:
         self._gizmo = scene.add_transform_controls("/sensor", scale=GIZMO_M, depth_test=False)
         self._label = scene.add_label("/sensor/label", "")
         self._gizmo.on_update(self._dragged)
+        self._server.on_client_disconnect(self._lost)
         reach_m = max(session.scene.roi.size_m)
         self._server.initial_camera.position = (0.0, -0.9 * reach_m, 0.8 * reach_m)
         self._server.initial_camera.look_at = (0.0, 0.0, 0.0)
@@ -201,6 +202,11 @@ class Page:
         own = self.rating.site
         position_m = np.asarray(event.target.position, dtype=np.float64) + self.zero_m
         self.want(replace(own, pose=turning.moved(own.pose, position_m.tolist(), event.target.wxyz.tolist())))
+
+    def _lost(self, _client: viser.ClientHandle) -> None:
+        """Who is gone holds nothing any more."""
+        self._is_dragged = False
+        self.want(self.rating.site)
 
     def _chosen(self, event: viser.GuiEvent[viser.GuiDropdownHandle[str]]) -> None:
         if event.client is not None:

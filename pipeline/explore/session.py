@@ -143,7 +143,10 @@ class Session:
         findings = self._findings(site)
         if any(finding.is_error for finding in findings):
             return Rating(site, {}, 0, findings)
-        scores = self._scores(site)
+        try:
+            scores = self._scores(site)
+        except InputError as error:  # an effect that has to know of the sensor what nobody has said
+            return Rating(site, {}, 0, (*findings, Finding.of("score", error)))
         return Rating(site, scores, self._rank(name, scores[self.rank_by]), findings)
 
     def hits(self, site: Site) -> NDArray[np.float64]:

@@ -85,6 +85,17 @@ def test_an_effect_that_is_idle_until_a_sensor_moves_acts_then(tmp_path: Path) -
     )  # fmt: skip
 
 
+def test_a_sensor_of_which_an_effect_must_know_more_has_no_score(tmp_path: Path) -> None:
+    other = "sensors.other={elevations_deg=[-15,5],channels=8,azimuth_step_deg=1.0,range_m=100}"
+    settings = ["sensors.small.rated_range_m=40", other, "effects.range_limit={}"]
+    session = open_session(write_mini(tmp_path / "mini"), settings, tmp_path / "run")
+    there = session.candidates["pole_a"]
+    assert session.rate("pole_a", there.site.pose).scores == there.scores
+    unknown = session.rate("pole_a", there.site.pose, "other")
+    assert not unknown.stands
+    assert "rated_range_m" in str(unknown.findings[-1])
+
+
 def test_a_sensor_that_no_catalogue_has_is_refused(opened: Session) -> None:
     with pytest.raises(InputError, match="unknown sensor 'nothing'"):
         opened.rate("pole_a", MOVED, "nothing")
