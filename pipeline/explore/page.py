@@ -128,6 +128,7 @@ class Page:
 
     def _draw_scene(self) -> None:
         scene, session = self._server.scene, self.session
+        scene.configure_default_lights(cast_shadow=False)  # a graphics card in software has no time for it
         for kind, mesh in shapes.solids(session.scene.world, self.zero_m).items():
             colour = _COLOURS.get(kind, _OTHER_SOLID)
             scene.add_mesh_simple(f"/world/{kind}", mesh.points, mesh.faces, color=colour, flat_shading=True,
@@ -238,7 +239,7 @@ class Page:
         if event.client is not None:
             camera, file = event.client.camera, io.BytesIO()
             drawn = event.client.get_render(camera.image_height, camera.image_width, transport_format="png")
-            image.imsave(file, drawn, format="png", metadata={"Software": None})
+            image.imsave(file, drawn, format="png")
             event.client.send_file_download(f"{self.session.scenario.name}.png", file.getvalue())
 
     # ---- what changes
