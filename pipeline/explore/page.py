@@ -178,8 +178,9 @@ class Page:
             }
             known = dict.fromkeys((*session.scene.used_sensors, *session.scenario.sensors, *CATALOGUE))
             self._sensor = gui.add_dropdown("sensor", tuple(known))
-        for control in (*self._numbers.values(), self._sensor):
-            control.on_update(self._typed)
+        for number in self._numbers.values():
+            number.on_update(self._typed)
+        self._sensor.on_update(self._typed)
         gui.add_button("Back to the candidate").on_click(lambda _: self._back())
         gui.add_button("Keep this pose").on_click(self._keep)
         gui.add_button("Picture (PNG)").on_click(self._picture)
@@ -251,10 +252,10 @@ class Page:
         with self._server.atomic():
             told = wording.in_words(rating, self.session.rank_by, candidate, len(self.session.candidates))
             self._told.content = told + ("" if self._is_dragged else self._plan_in_words(rating))
-            self._sensor.value = site.sensor
-            self._site.value = self._of_site[site.name]
+            _set(self._sensor, site.sensor)
+            _set(self._site, self._of_site[site.name])
             for name, value in asdict(site.pose).items():
-                self._numbers[name].value = value
+                _set(self._numbers[name], value)
             self._label.text = f"{site.name}  rank {rating.rank}" if rating.stands else f"{site.name}: cannot stand"
             if not self._is_dragged:  # else it would be pulled out of a hand
                 self._gizmo.position = np.subtract(site.pose.position_m, self.zero_m)
@@ -269,3 +270,8 @@ class Page:
         if rating.site.name in self.plan.sites and rating.site != self.plan.sites[rating.site.name]:
             self.plan = self.plan.moved(rating.site, self.session.beams(rating.site))
         return wording.plan(self.plan)
+
+
+def _set(control: Any, value: str | float) -> None:
+    """Show another value; viser's types have it that nobody may."""
+    control.value = value
