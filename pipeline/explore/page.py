@@ -29,7 +29,7 @@ HOST = "127.0.0.1"
 
 _COLOURS = {"building": (205, 208, 216), "ground": (225, 222, 214), "tree_crown": (150, 190, 165)}
 _OTHER_SOLID, _LANE, _ROI = (150, 154, 166), (112, 118, 130), (232, 89, 12)
-_SITE_RADIUS_M, GIZMO_M = 0.6, 5.0
+_SITE_RADIUS_M, GIZMO_M = 0.9, 6.0
 _LABELS = {
     "x_m": "x m",
     "y_m": "y m",
@@ -144,7 +144,7 @@ class Page:
         self._gizmo.on_update(self._dragged)
         self._server.on_client_disconnect(self._lost)
         reach_m = max(session.scene.roi.size_m)
-        self._server.initial_camera.position = (0.0, -0.9 * reach_m, 0.8 * reach_m)
+        self._server.initial_camera.position = (0.0, -0.45 * reach_m, 0.85 * reach_m)
         self._server.initial_camera.look_at = (0.0, 0.0, 0.0)
 
     def _draw_sites(self) -> None:
