@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.cli import arguments, ending, interrupts, placement, validation_verbs
+from pipeline.cli import arguments, ending, export, interrupts, placement, validation_verbs
 from pipeline.cli.arguments import Audit, Jobs, Out, ScenarioPath, Set, Top
 from pipeline.core.errors import InputError
 from pipeline.core.version import __version__
@@ -300,7 +300,8 @@ def effects(
         tables.print_ablation(changes)
 
 
-for verb in (placement.place, *validation_verbs.VERBS):  # which poles together? does a score foretell detection?
+# which poles together? does a score foretell detection? and a run taken along
+for verb in (placement.place, *validation_verbs.VERBS, export.export):
     app.command()(verb)
 
 

@@ -13,6 +13,7 @@ import typer
 from pipeline.core.errors import InputError
 
 ScenarioPath = Annotated[Path, typer.Argument(metavar="SCENARIO", help="A folder with a scenario.toml, or the file.")]
+Run = Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a finished run.")]
 Out = Annotated[
     Path | None, typer.Option("--out", metavar="DIR", help="The run's folder; runs/<scenario name> by default.")
 ]
