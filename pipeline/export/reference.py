@@ -60,7 +60,9 @@ class Reference:
         if choice == DEGREES:
             if frame is None:
                 found = "has no degrees: nothing says where the scenario's world frame lies on the Earth"
-                right = "[crs] with epsg in the scenario, or a network with a <location>; or another format in local metres"
+                right = (
+                    "[crs] with epsg in the scenario, or a network with a <location>; or another format in local metres"
+                )
                 raise InputError(place, found, f"{right} (--crs scenario)")
             return cls("EPSG:4326", "longitude and latitude (WGS 84)", frame, is_degrees=True)
         if frame is None:

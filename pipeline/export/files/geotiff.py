@@ -125,18 +125,18 @@ def _write(
 ) -> Path:
     import rasterio
     from rasterio.crs import CRS
-    from rasterio.transform import from_origin
+    from rasterio.transform import Affine
 
     rows, columns = values.shape
-    transform = from_origin(its.west, its.north, its.width, its.height)
+    transform = Affine(its.width, 0.0, its.west, 0.0, -its.height, its.north)
     with rasterio.open(
         path, "w", driver="GTiff", width=columns, height=rows, count=1, dtype=values.dtype.name, nodata=nodata,
         crs=CRS.from_user_input(reference.crs), transform=transform, **_TILE,
     ) as file:  # fmt: skip
-        file.write(values, 1)
         file.update_tags(**tags)
-        if colour_table is not None:
+        if colour_table is not None:  # before the values: what comes later does not get into the file's head
             file.write_colormap(1, dict(colour_table))
         if scale is not None:
             file.scales, file.offsets = (scale[0],), (scale[1],)
+        file.write(values, 1)
     return path
