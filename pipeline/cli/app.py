@@ -301,7 +301,7 @@ def effects(
 
 
 # which poles together? does a score foretell detection? and a run taken along
-for verb in (placement.place, *validation_verbs.VERBS, export.export):
+for verb in (placement.place, *validation_verbs.VERBS, export.export, export.figure):
     app.command()(verb)
 
 

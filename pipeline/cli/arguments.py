@@ -81,6 +81,16 @@ def latitude_and_longitude(text: str) -> tuple[float, float]:
     return lat, lon
 
 
+def width_mm(text: str, least: float, most: float) -> float:
+    """``--size``: millimetres on paper, from 85mm or 8.5cm."""
+    units = {"mm": 1.0, "cm": 10.0, "": 1.0}
+    match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)(mm|cm)?", text)
+    value = float(match[1]) * units[match[2] or ""] if match else math.nan
+    if not least <= value <= most:
+        raise InputError("--size", repr(text)[:80], f"a width of {least:g} to {most:g} mm, for example 85mm")
+    return value
+
+
 def radius_m(text: str) -> float | None:
     """``--surroundings``: metres, or None for all."""
     from pipeline.scenario.types import FARTHEST_M

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from pipeline.cli import arguments
 from pipeline.cli.arguments import Run
 
 
@@ -41,3 +42,25 @@ def export(
     print(f"positions in {done.reference}")
     for path in done.paths:
         print(path)
+
+
+def figure(
+    run: Run,
+    what: Annotated[str, typer.Option(metavar="FIGURE", help="ranking, map, tpog, seen or missed.")],
+    site: Annotated[
+        str | None, typer.Option(metavar="SITE", help="Of seen and missed: whose; the best site's by default.")
+    ] = None,
+    kind: Annotated[str, typer.Option("--format", metavar="FORMAT", help="pdf, png or svg.")] = "pdf",
+    size: Annotated[str, typer.Option(metavar="WIDTH", help="On paper: 85mm is a column, 170mm a page.")] = "85mm",
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="RUN/export/FIGURE.FORMAT by default.")
+    ] = None,
+) -> None:
+    """Draw a figure of a run for a paper or a slide."""
+    from pipeline.cli.progress import Screen
+    from pipeline.export.paper import figure as figures
+
+    width_mm = arguments.width_mm(size, figures.NARROWEST_MM, figures.WIDEST_MM)
+    with Screen("figure") as screen:
+        path = figures.draw(run, what, site=site, kind=kind, width_mm=width_mm, out=out, progress=screen.progress)
+    print(path)

@@ -94,7 +94,7 @@ def export(
     run = FinishedRun.open(folder)
     reference = _reference(run, its, crs)
     chosen = _chosen(run, sites)
-    target = out or folder / FOLDER / (f"{_file_name(run.scenario.name)}{its.suffix}" if its.is_one_file else to)
+    target = out or folder / FOLDER / (f"{file_name(run.scenario.name)}{its.suffix}" if its.is_one_file else to)
     _check_target(target, its)
     with files.scratch() as aside:
         made, notes = _made(run, its, reference, aside, target.name, chosen, progress)
@@ -197,7 +197,7 @@ def _rasters(
 
     taken: set[str] = set()
     for number, raster in enumerate(rasters_of(run, sites), start=1):
-        name = _file_name(raster.name)
+        name = file_name(raster.name)
         while name.lower() in taken:  # two sites whose names differ in signs that no file can have
             name += "_"
         taken.add(name.lower())
@@ -205,6 +205,6 @@ def _rasters(
         progress(f"{raster.name} written", number, 1 + 3 * len(sites))
 
 
-def _file_name(name: str) -> str:
+def file_name(name: str) -> str:
     """A name that every disk takes."""
     return re.sub(r'[\s\x00-\x1f\x7f/\\:*?"<>|.]+', "_", name)[:80] or "_"
