@@ -38,6 +38,10 @@ class Figures:
     backdrop: Backdrop
 
 
+_WIDE = 680.0
+"""A figure so wide has room for more words."""
+
+
 def draw(work: Workspace, ranking: Ranking, choosable: Sequence[ScoredSite], tpog: Tpog) -> Figures:
     """Draw the figures of the run in a workspace; views of the ``choosable`` sites."""
     backdrop = backdrop_of(work, ranking, tpog)
@@ -68,7 +72,9 @@ def occupancy_map(tpog: Tpog, ranking: Ranking, backdrop: Backdrop, width: float
         f"{np.count_nonzero(occupied) / occupied.size:.0%} of its area is used by vehicles; "
         f"the busiest place is near x = {x:.0f} m, y = {y:.0f} m."
     )
-    label = "Occupied voxels in the column, on average: probabilities summed along z"
+    label = "Occupied voxels in the column"
+    if width >= _WIDE:
+        label += ", on average: probabilities summed along z"
     return maps.occupancy(tpog.grid, occupied, label, backdrop, ranking.sites, alt, width)
 
 

@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from pipeline.artefacts.readers import read_scores
+from pipeline.core import plugins
 from pipeline.core.grid import Roi
 from pipeline.export.exporting import FORMATS, export
 from pipeline.formats.crs import WorldFrame
@@ -239,6 +240,16 @@ def test_what_cannot_be_done_is_one_message(local: Path, egvs: Call, options: tu
     assert said in err
     assert err.count("\n") == 1
     assert sorted(local.rglob("*")) == before
+
+
+@pytest.mark.parametrize(("to", "library"), [("gpkg", "pyogrio"), ("geoparquet", "geopandas"), ("geotiff", "rasterio")])
+def test_without_the_extra_it_is_named(
+    local: Path, egvs: Call, monkeypatch: pytest.MonkeyPatch, to: str, library: str
+) -> None:
+    monkeypatch.setattr(plugins, "find_spec", lambda name: None)
+    code, _, err = egvs("export", local, "--to", to)
+    told = f"egvs: export to {to} needs {library}, which is not installed: pip install 'egvs[gis]'\n"
+    assert (code, err) == (2, told)
 
 
 def test_a_run_that_is_not_there_or_not_done(tmp_path: Path, egvs: Call) -> None:

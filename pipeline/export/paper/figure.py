@@ -6,13 +6,15 @@ not shrunk to it. Colours are those of light pages, viridis, which reads the sam
 
 from __future__ import annotations
 
+import io
+import re
 from pathlib import Path
 
 import numpy as np
 
 from pipeline.artefacts.readers import Tpog, read_tpog
 from pipeline.core import files, plugins
-from pipeline.core.errors import InputError
+from pipeline.core.errors import InputError, MissingBackendError
 from pipeline.core.progress import Progress, silent
 from pipeline.export.exporting import FOLDER, file_name
 from pipeline.export.finished_run import FinishedRun
@@ -93,7 +95,7 @@ def _check(what: str, site: str | None, kind: str, out: Path | None) -> None:
     if out is not None and out.suffix != f".{kind}":
         raise InputError("--out", repr(str(out)), f"a file that ends in .{kind} for --format {kind}")
     if kind != "svg":
-        plugins.require(f"a figure as {kind}", "gis", "cairosvg")
+        plugins.require(f"a figure as {kind}", "figure", "cairosvg")
 
 
 def _site(ranking: Ranking, name: str | None) -> ScoredSite:
@@ -152,13 +154,24 @@ def ranking_chart(ranking: Ranking, units: float) -> str:
 
 
 def _converted(svg: str, kind: str) -> bytes:
-    """A figure as a file's content."""
+    """A figure as a file's content; it depends on no clock."""
     if kind == "svg":
         return svg.encode("utf-8")
-    import cairosvg
-
+    try:
+        import cairosvg
+    except OSError:  # the package is there, and the library that it calls is not
+        told = f"a figure as {kind} needs the library cairo of the system (libcairo2); --format svg needs none"
+        raise MissingBackendError(told) from None
     if kind == "png":
-        png: bytes = cairosvg.svg2png(svg.encode("utf-8"), scale=DOTS_PER_INCH / 96.0, background_color="white")
-        return png
+        return _with_size(cairosvg.svg2png(svg.encode("utf-8"), scale=DOTS_PER_INCH / 96.0, background_color="white"))
     pdf: bytes = cairosvg.svg2pdf(svg.encode("utf-8"))
-    return pdf
+    return re.sub(rb"(/CreationDate \(D:)[0-9]{14}", rb"\g<1>20000101000000", pdf)
+
+
+def _with_size(png: bytes) -> bytes:
+    """A PNG that says how large it is on paper."""
+    from PIL import Image
+
+    with Image.open(io.BytesIO(png)) as image:
+        image.save(out := io.BytesIO(), "PNG", dpi=(DOTS_PER_INCH, DOTS_PER_INCH), optimize=True)
+    return out.getvalue()

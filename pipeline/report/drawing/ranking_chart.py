@@ -68,4 +68,5 @@ def _error(bar: Bar, left: float, y: float, scale: float) -> str:
     start, end = (left + max(0.0, bar.value + side * bar.se) * scale for side in (-1.0, 1.0))
     middle = y + _EACH / 2
     ends = "".join(f"M{x:.1f} {middle - 3:.1f}v6" for x in (start, end))
-    return f'<path class="lead" d="M{start:.1f} {middle:.1f}H{end:.1f}{ends}"/>'
+    line = f'd="M{start:.1f} {middle:.1f}H{end:.1f}{ends}"/>'
+    return f'<path style="stroke:#ffffff;stroke-width:2.8;fill:none" {line}<path class="lead" {line}'
