@@ -6,6 +6,9 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
+from pipeline.artefacts import tables
 from pipeline.artefacts.run_record import RECORD, RunRecord
 from pipeline.core.errors import InputError
 from pipeline.formats.crs import WorldFrame
@@ -17,6 +20,9 @@ from pipeline.world import world_frame
 
 _READ = ("statics", "tpog", "score")
 """Stages whose artefacts are exported."""
+
+_SAME_DEG = 1e-8
+"""A millimetre."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +60,24 @@ class FinishedRun:
             raise InputError(folder / RECORD, found, "the folder where it was when the run was made")
         scenario = from_values(record.scenario, source, str(folder / RECORD))
         work = Workspace(scenario, folder, recorded=stages.recorded(record))
-        return cls(record, scenario, work, world_frame.of(scenario).frame)
+        run = cls(record, scenario, work, world_frame.of(scenario).frame)
+        run._check_place()
+        return run
+
+    def _check_place(self) -> None:
+        """InputError where the scenario's files put the world frame elsewhere by now than when the run was made."""
+        path = self.artefact("scores.parquet")
+        scores = tables.read(path, "scores")[0]
+        if "longitude_deg" in scores.column_names:
+            then = np.column_stack([scores.column(name).to_numpy() for name in ("longitude_deg", "latitude_deg")])
+            xy_m = np.column_stack([scores.column(name).to_numpy() for name in ("x_m", "y_m")])
+            now = None if self.frame is None else self.frame.to_degrees(xy_m)
+            if now is not None and np.allclose(then, now, rtol=0.0, atol=_SAME_DEG):
+                return
+        elif self.frame is None:
+            return
+        found = "its sites lie elsewhere on the Earth than the scenario, or its network, says by now"
+        raise InputError(path, found, "egvs run makes it anew")
 
     def artefact(self, name: str) -> Path:
         """The path of an artefact that is the one that ``run.json`` names; InputError where it is not."""

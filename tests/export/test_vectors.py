@@ -18,6 +18,7 @@ from pipeline.core.grid import Roi
 from pipeline.export.exporting import FORMATS, export
 from pipeline.formats.crs import WorldFrame
 from pipeline.formats.georeference import Georeference
+from pipeline.world import world_frame
 from pipeline.world.footprints import read_geojson
 from tests.conftest import BUILDING
 from tests.export.conftest import EPSG, OFFSET_M
@@ -257,6 +258,17 @@ def test_a_run_that_is_not_there_or_not_done(tmp_path: Path, egvs: Call) -> None
     assert (code, err) == (2, f"egvs: {tmp_path / 'none'}: no such folder; the folder of a run, which egvs run makes\n")
     code, _, err = egvs("export", tmp_path, "--to", "csv")
     assert (code, err) == (2, f"egvs: {tmp_path / 'run.json'}: no such file; a folder that egvs run has written\n")
+
+
+def test_a_scenario_that_lies_elsewhere_by_now_is_refused(
+    located: Path, tmp_path: Path, egvs: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    moved = Georeference(WorldFrame(f"EPSG:{EPSG}", (-550000.0, -5630001.0)), Roi.around((0, 0, 0), (1, 1, 1)), "")
+    for now in (moved, Georeference(None, moved.roi, "")):
+        monkeypatch.setattr(world_frame, "of", lambda scenario, now=now: now)
+        code, _, err = egvs("export", located, "--to", "csv", "--out", tmp_path / "out")
+        assert code == 2
+        assert "scores.parquet: its sites lie elsewhere on the Earth than the scenario, or its network, says by" in err
 
 
 @pytest.mark.parametrize("artefact", ["scores.parquet", "blindspots.parquet", "statics.ply"])
