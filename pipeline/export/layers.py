@@ -156,7 +156,8 @@ def _footprints(run: FinishedRun, notes: list[str]) -> Iterator[Layer]:
     if not len(world.faces):
         return
     low, high = world.bounds_xy_m
-    box = (*(low.min(axis=0) - 1.0).tolist(), *(high.max(axis=0) + 1.0).tolist())
+    (x0, y0), (x1, y1) = (low.min(axis=0) - 1.0).tolist(), (high.max(axis=0) + 1.0).tolist()
+    box = x0, y0, x1, y1
     order = np.argsort(world.solid_of_face, kind="stable")
     starts = np.flatnonzero(np.diff(world.solid_of_face[order], prepend=-1))
     rows, shapes = [], []
