@@ -99,6 +99,7 @@ def export(
     with files.scratch() as aside:
         made, notes = _made(run, its, reference, aside, target.name, chosen, progress)
         paths = [target if its.is_one_file else target / path.name for path in made]
+        _check_free(paths, out, its)
         for path in paths:
             files.make_room(path)
         for path, done in zip(paths, made, strict=True):
@@ -148,6 +149,14 @@ def _check_target(target: Path, its: Format) -> None:
     if target.exists() and not target.is_dir():
         raise InputError("--out", f"{target} is a file", f"a folder: --to {its.name} writes several files")
     files.make_room(target / f"any{its.suffix}")
+
+
+def _check_free(paths: Sequence[Path], out: Path | None, its: Format) -> None:
+    """InputError where a file of a folder that the user names would be replaced: it may be a scenario's ``sites.csv``."""
+    if out is None or its.is_one_file:
+        return
+    if there := [path for path in paths if path.exists()]:
+        raise InputError("--out", f"{there[0]} is there already", "a new folder, or one without such files")
 
 
 def _made(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 import sqlite3
 from collections.abc import Callable
 from pathlib import Path
@@ -302,3 +303,24 @@ def test_a_user_s_file_is_no_folder(located: Path, tmp_path: Path, egvs: Call) -
     code, _, err = egvs("export", located, "--to", "csv", "--out", tmp_path / "file")
     assert (code, (tmp_path / "file").read_text()) == (2, "mine")
     assert "is a file; a folder: --to csv writes several files" in err
+
+
+def test_no_file_in_a_user_s_folder_is_replaced(local: Path, egvs: Call) -> None:
+    """Of a scenario its sites, of a run its blind spots."""
+    for to, folder, name in (("csv", local.parent / "mini", "sites.csv"), ("geoparquet", local, "blindspots.parquet")):
+        kept, before = (folder / name).read_bytes(), sorted(folder.rglob("*"))
+        code, _, err = egvs("export", local, "--to", to, "--out", folder)
+        assert (code, err) == (
+            2,
+            f"egvs: --out: {folder / name} is there already; a new folder, or one without such files\n",
+        )
+        assert ((folder / name).read_bytes(), sorted(folder.rglob("*"))) == (kept, before)
+
+
+def test_by_default_it_goes_into_the_run_and_again(local: Path, egvs: Call) -> None:
+    told = [egvs("export", local, "--to", "csv") for _ in range(2)]
+    assert told[0] == told[1]
+    paths = [Path(line) for line in told[0][1].splitlines()[1:]]
+    assert [path.name for path in paths] == ["sites.csv", "blindspots.csv", "footprints.csv", "region.csv"]
+    assert {path.parent for path in paths} == {local / "export" / "csv"}
+    shutil.rmtree(local / "export")
