@@ -152,7 +152,7 @@ def _check_target(target: Path, its: Format) -> None:
 
 
 def _check_free(paths: Sequence[Path], out: Path | None, its: Format) -> None:
-    """InputError where a file of a folder that the user names would be replaced: it may be a scenario's ``sites.csv``."""
+    """InputError where a file in a folder that the user names would be replaced: a scenario has a ``sites.csv`` too."""
     if out is None or its.is_one_file:
         return
     if there := [path for path in paths if path.exists()]:
