@@ -57,8 +57,10 @@ def write_csv(path: Path, layer: Layer, reference: Reference) -> None:
 
     shapes = reference.geometries(layer.geometries)
     if layer.is_of_points:
-        names = ("longitude_deg", "latitude_deg") if reference.is_degrees else ("easting_m", "northing_m")
-        places = [tuple(map(repr, pair)) for pair in shapely.get_coordinates(shapes).tolist()]
+        names: tuple[str, ...] = (
+            ("longitude_deg", "latitude_deg") if reference.is_degrees else ("easting_m", "northing_m")
+        )
+        places: list[tuple[str, ...]] = [tuple(map(repr, pair)) for pair in shapely.get_coordinates(shapes).tolist()]
     else:
         names = ("wkt",)
         places = [(text,) for text in shapely.to_wkt(shapes, rounding_precision=9 if reference.is_degrees else 6)]
