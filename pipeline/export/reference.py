@@ -82,7 +82,8 @@ class Reference:
             return xy_m
         if self.is_degrees:
             return np.round(self.frame.to_degrees(xy_m), _DIGITS_DEG)
-        return np.round(np.subtract(xy_m, self.frame.offset_m, dtype=np.float64), _DIGITS_M)
+        eastings: Floats = np.subtract(xy_m, self.frame.offset_m, dtype=np.float64)
+        return np.round(eastings, _DIGITS_M)
 
     def to_world(self, xy: Floats) -> Floats:
         """World-frame positions (n, 2) in metres of coordinates (n, 2)."""
