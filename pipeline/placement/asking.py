@@ -87,9 +87,6 @@ def ask(work: Workspace, heard: Callable[[int], None]) -> Asked:
     names = [period.name for period in read_periods(work.path(TPOG)) if period.name]
     tpogs = [read_tpog(work.path(TPOG)), *(read_tpog(work.path(TPOG), name) for name in names)]
     wanted, zones = scenario.placement, scenario.placement.zones
-    if wanted.objective == "worst" and not names:
-        found = '"worst", but the traffic has no periods'
-        raise InputError(f"{scenario.file}: placement.objective", found, '"mean", or [[traffic.periods]]')
     score = scenario.score.rank_by
     by_voxel = score in terms.VOXEL_SCORES
     voxels = VoxelView(work, tpogs, scenario.gamma if score == "egvs" else 1.0) if by_voxel or zones else None
@@ -111,7 +108,8 @@ def ask(work: Workspace, heard: Callable[[int], None]) -> Asked:
         demands = [_zone(scenario, name, zone, sights[0], tpogs[0], voxels.voxels) for name, zone in zones.items()]
     objective: tuple[Term, ...] = (every[0],)
     if wanted.objective == "worst":
-        objective = tuple(_as_share(scenario, term, rules) for term in every[1:])
+        chosen = wanted.periods or names
+        objective = tuple(_as_share(scenario, term, rules) for term in every if term.name in chosen)
     problem = Problem(every[0], objective, tuple(demands), rules, wanted.survives, work.threads)
     whole = problem.together(problem.candidates.tolist())
     for demand in demands:
@@ -167,7 +165,23 @@ def check(scenario: Scenario) -> None:
     if wanted.count is None and wanted.budget is None and wanted.reach is None:
         right = "--count 3, --budget 120000 or --reach 0.95, or one of them in [placement]"
         raise InputError(f"{scenario.file}: placement", "nothing says how many sensors", right)
+    _check_periods(scenario)
     rules_of(scenario, sites_of(scenario))
+
+
+def _check_periods(scenario: Scenario) -> None:
+    """InputError where periods are asked for that the traffic does not have, or that nothing looks at."""
+    wanted, names = scenario.placement, [period.name for period in scenario.traffic.periods]
+    if wanted.objective == "worst" and not names:
+        found = '"worst", but the traffic has no periods'
+        raise InputError(f"{scenario.file}: placement.objective", found, '"mean", or [[traffic.periods]]')
+    for name in wanted.periods:
+        if name not in names:
+            right = f"one of {', '.join(names)}" if names else "none, or [[traffic.periods]]"
+            raise InputError(f"{scenario.file}: placement.periods", f"no period {name!r}", right)
+    if wanted.periods and wanted.objective == "mean":
+        found = f'{", ".join(wanted.periods)} with objective = "mean", which is the mix of all'
+        raise InputError(f"{scenario.file}: placement.periods", found, 'objective = "worst"')
 
 
 def rules_of(scenario: Scenario, sites: Sequence[Site]) -> Rules:

@@ -169,6 +169,22 @@ def test_what_is_left_when_the_sensor_that_is_missed_most_fails(many: Path, out:
     assert plan["value"] == curve[-1]["value"] == best == left(tuple(row["site"] for row in rows))
 
 
+HALVES = 'traffic.periods=[{name="a",length_s=12},{name="b",begin_s=12,length_s=8}]'
+
+
+def test_the_worst_of_the_periods_that_are_named(many: Path, out: Path, egvs) -> None:
+    """Of one period alone, the worst is what it has: a share of what all candidates would have in it."""
+    worst = {}
+    for periods in ("a", "b", "a,b"):
+        names = [f"'{name}'" for name in periods.split(",")]
+        sets = [HALVES, "placement.objective='worst'", f"placement.periods=[{','.join(names)}]"]
+        arguments = [word for one in sets for word in ("--set", one)]
+        code, _, error = egvs("place", many, "--out", out, "--count", 2, "--exact", *arguments)
+        assert code == 0, error
+        worst[periods] = read(out)[2]["value"]
+    assert 0.0 < worst["a,b"] <= min(worst["a"], worst["b"]) <= 1.0
+
+
 REFUSED = {
     "nothing asked": ([], "placement: nothing says how many sensors; --count 3, --budget 120000 or --reach 0.95"),
     "count above candidates": (["--count", "6"], "placement.count: 6 sensors of 5 candidates; at most 5"),
@@ -204,6 +220,14 @@ REFUSED = {
     "the worst of no periods": (
         ["--count", "2", "--set", "placement.objective='worst'"],
         'placement.objective: "worst", but the traffic has no periods',
+    ),
+    "a period that is not there": (
+        ["--count", "2", "--set", "placement.periods=['noon']"],
+        "placement.periods: no period 'noon'; none, or [[traffic.periods]]",
+    ),
+    "a period of the mix": (
+        ["--count", "2", "--set", "placement.periods=['a']", "--set", HALVES],
+        'placement.periods: a with objective = "mean", which is the mix of all; objective = "worst"',
     ),
     "too much of a zone": (
         ["--count", "2", "--set", ZONE % (1.0, 5)],
