@@ -100,7 +100,7 @@ def print_placement(placed: Placement) -> None:
 def in_words(placed: Placement) -> str:
     """The plan and its certificate in one sentence."""
     solution, point = placed.solution, placed.solution.point
-    joint, sites = point.worth.joint, ", ".join(pick.site.name for pick in placed.picks)
+    joint, sites = point.worth.joint, ", ".join(pick.site.name for pick in placed.picks) or "no sensor"
     share = (
         f"{joint / placed.together:.1%} of what all {placed.candidates} candidates together would"
         if placed.together > 0

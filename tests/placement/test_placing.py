@@ -200,6 +200,14 @@ REFUSED = {
         ["--budget", "50", "--set", "costs.pole=60"],
         "placement.budget: 50 is below the cheapest candidate; at least 60, what a costs",
     ),
+    "none left": (
+        ["--reach", "0.5", "--set", "placement.excluded=['a','b','b_high','c','d']"],
+        "placement.excluded: every candidate is excluded; fewer of them",
+    ),
+    "a zone in the way of a reach": (
+        ["--count", "1", "--reach", "0.01", "--set", ZONE % (0.5, 2)],
+        "placement.zones: no plan of 1 sensors that meets it was found",
+    ),
     "no costs": (["--budget", "50"], "placement.budget: nothing says what a costs; [costs], or a column cost"),
     "a sensor without a price": (
         ["--budget", "50", "--set", "costs.sensor.other=1"],

@@ -138,7 +138,7 @@ class Problem:
             met -= demand.unmet(reached)
         joint = seen.value(self.joint) + seen.gains(self.joint, candidates)
         if not self.survives:
-            return met, self._smallest(seen, candidates), joint
+            return met, joint if self.objective == (self.joint,) else self._smallest(seen, candidates), joint
         value = np.full(len(candidates), min(seen.value(term) for term in self.objective))
         for candidate in list(seen.chosen):
             seen.remove(candidate)
