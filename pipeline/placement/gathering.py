@@ -24,6 +24,9 @@ from pipeline.stages.shared.scans import SiteBeams, scans
 from pipeline.stages.shared.scene import scene_of
 from pipeline.stages.shared.target_scores import TRAJECTORIES, Targets
 
+_MOST = 2**32 - 1
+"""What a tally of hits holds at most."""
+
 
 class VoxelView:
     """What a pose sees of the voxels that count. Threads may share one.
@@ -41,7 +44,7 @@ class VoxelView:
         self._visibility = Visibility(scene_of(work), tpogs[0], work.path(TRAJECTORIES))
         self.unit = self._visibility.unit
         highest = most * self.unit
-        self._most = math.ceil(highest) if highest < 2.0**62 else 2**62
+        self._most = math.ceil(highest) if highest < _MOST else _MOST
 
     @property
     def number(self) -> int:

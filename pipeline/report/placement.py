@@ -115,7 +115,8 @@ class PlacementSummary:
             )
             for row in points
         )
-        steps = [CurveStep(row["count"], row["value"] / together, row["bound"] / together) for row in points]
+        whole = 1.0 if its["asked"]["objective"] == "worst" else together  # of which values are shares already
+        steps = [CurveStep(row["count"], row["value"] / whole, row["bound"] / whole) for row in points]
         occupied = tpog.counts.sum(axis=2) / tpog.frames
         names = ", ".join(pick.site for pick in picks)
         return cls(

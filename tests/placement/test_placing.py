@@ -222,7 +222,7 @@ REFUSED = {
         "placement.count: 1, but 2 are forced; at least 2",
     ),
     "a zone that nobody sees": (
-        ["--count", "2", "--set", "placement.zones.far={polygon_m=[[200,0],[201,0],[201,1]],share=0.5}"],
+        ["--count", "2", "--set", "placement.zones.far={polygon_m=[[1,8.5],[3,8.5],[3,9.5]],share=0.5}"],
         "placement.zones.far: no voxel in it has entropy: no traffic comes and goes there",
     ),
     "the worst of no periods": (
