@@ -120,7 +120,8 @@ def in_words(placed: Placement) -> str:
     cost = f" for {placed.curve_costs[-1]:g}" if placed.curve_costs[-1] else ""
     plan = f"{sites}{cost}: {placed.score} {joint:.6g}, {share}; "
     if solution.fewest_is_proved is not None:
-        fewer = len(placed.picks) - 1
+        if not (fewer := len(placed.picks) - 1):
+            return plan + "one sensor is enough"
         return plan + (f"proved: {fewer} cannot" if solution.fewest_is_proved else f"whether {fewer} can is not proved")
     if solution.is_best:
         return plan + "proved: no plan within the rules is better"

@@ -323,3 +323,10 @@ def test_the_joint_score_from_python(many: Path, out: Path) -> None:
     assert (joint.chosen, joint.value) == (("a",), joint_egvs(many, out, "a"))
     with pytest.raises(pipeline.InputError, match="candidate 'x': no such candidate; one of a, b"):
         joint.add("x")
+
+
+def test_one_sensor_that_is_enough_is_told_so(many: Path, out: Path, egvs) -> None:
+    code, text, error = egvs("place", many, "--out", out, "--reach", 0.01)
+    assert code == 0, error
+    assert "one sensor is enough" in text
+    assert "0 cannot" not in text
