@@ -259,12 +259,14 @@ def costs_of(scenario: Scenario, sites: Sequence[Site]) -> tuple[Floats, Floats]
     """What each candidate costs, and what of it is for its pole."""
     costs, has_budget = scenario.costs, scenario.placement.budget is not None
     cost, pole_cost = np.zeros(len(sites)), np.zeros(len(sites))
+    file = scenario.sites.file or scenario.file
     for i, site in enumerate(sites):
         own = site.own.get(COST)
         if own is not None:
             if isinstance(own, bool) or not isinstance(own, int | float) or not own >= 0:
-                raise InputError(f"site {site.name}: {COST}", repr(own)[:80], "a number, 0 or above")
-            _check_cost(f"site {site.name}: {COST}", float(own))
+                right = "a number, 0 or above, in digits: 8000, not 8e3"
+                raise InputError(f"{file}: site {site.name}: {COST}", repr(own)[:80], right)
+            _check_cost(f"{file}: site {site.name}: {COST}", float(own))
             cost[i] = own
             continue
         if has_budget and not costs.are_given:

@@ -265,7 +265,7 @@ def test_a_cost_that_is_no_number_is_refused(many: Path, out: Path, egvs) -> Non
     (many / "sites.csv").write_text(SITES.replace("4,70", "4,dear"))
     code, _, error = egvs("place", many, "--out", out, "--budget", 50, "--set", "costs.pole=1")
     assert code == 2
-    assert "site c: cost: 'dear'; a number, 0 or above" in error
+    assert "sites.csv: site c: cost: 'dear'; a number, 0 or above, in digits: 8000, not 8e3" in error
 
 
 def test_the_report_shows_the_plan_until_something_changes(many: Path, out: Path, egvs) -> None:
