@@ -90,6 +90,29 @@ def test_one_sensor_is_the_winner_of_the_run_by_every_score(many: Path, out: Pat
         assert placed.joint == (pytest.approx(value, rel=1e-9) if score == "expected_detections" else value)
 
 
+@pytest.mark.parametrize("effect", ["effects.rain.rate_mm_h=20", "effects.divergence={}"])
+def test_shares_of_beams_count_up_to_gamma(effect: str, many: Path, out: Path) -> None:
+    """Where effects weigh beams, one sensor is worth what the run says, and two are by the definition."""
+    sets = [effect, "placement.count=2", "score.keep_visibility='all'"]
+    scenario = pipeline.load(many, sets)
+    pipeline.run(scenario, out)
+    scores = {row["site"]: row["egvs"] for row in read_scores(out / "scores.parquet").to_pylist()}
+    joint = pipeline.JointScore.of(scenario, out)
+    for name, egvs in scores.items():
+        joint.add(name)
+        assert joint.value == egvs
+        joint.remove(name)
+    tpog = read_tpog(out / "tpog.parquet")
+    p = tpog.p
+    entropy = np.zeros_like(p)
+    inner = (p > 0) & (p < 1)
+    entropy[inner] = -p[inner] * np.log2(p[inner]) - (1 - p[inner]) * np.log2(1 - p[inner])
+    hits = sum(pipeline.read_visibility(out / "visibility.parquet", name) for name in ("a", "b"))
+    assert hits.max() > 2 * scenario.gamma
+    joint.add("a", "b")
+    assert joint.value == pytest.approx(float((entropy * np.minimum(hits, scenario.gamma)).sum()), rel=1e-12)
+
+
 def test_what_is_written_adds_up(many: Path, out: Path, egvs) -> None:
     code, _, error = egvs("place", many, "--out", out, "--count", 3)
     assert code == 0, error
