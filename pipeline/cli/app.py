@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.cli import arguments, ending, interrupts, placement, validation_verbs
+from pipeline.cli import arguments, ending, interrupts, placement
 from pipeline.cli.arguments import Audit, Jobs, Out, ScenarioPath, Set, Top
+from pipeline.cli.validation import verbs as validation
 from pipeline.core.errors import InputError
 from pipeline.core.version import __version__
 
@@ -300,7 +301,7 @@ def effects(
         tables.print_ablation(changes)
 
 
-for verb in (placement.place, *validation_verbs.VERBS):  # which poles together? does a score foretell detection?
+for verb in (placement.place, *validation.VERBS):  # which poles together? does a score foretell detection?
     app.command()(verb)
 
 
