@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.cli import arguments, ending, export, interrupts, placement, validation_verbs
+from pipeline.cli import arguments, ending, export, interrupts, placement
 from pipeline.cli.arguments import Audit, Jobs, Out, ScenarioPath, Set, Top
+from pipeline.cli.validation import verbs as validation
 from pipeline.core.errors import InputError
 from pipeline.core.version import __version__
 
@@ -301,7 +302,7 @@ def effects(
 
 
 # which poles together? does a score foretell detection? and a run taken along
-for verb in (placement.place, *validation_verbs.VERBS, export.export, export.figure):
+for verb in (placement.place, *validation.VERBS, export.export, export.figure):
     app.command()(verb)
 
 
