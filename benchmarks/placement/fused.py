@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.cli.validation_tables import FusedLines
+from pipeline.cli.validation.tables import FusedLines
 from pipeline.core import files
 from pipeline.placement import placing
 from pipeline.scenario.loading import load

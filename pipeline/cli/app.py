@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.cli import arguments, ending, explore, interrupts, placement, validation_verbs
+from pipeline.cli import arguments, ending, explore, export, interrupts, placement
 from pipeline.cli.arguments import Audit, Jobs, Out, ScenarioPath, Set, Top
+from pipeline.cli.validation import verbs as validation
 from pipeline.core.errors import InputError
 from pipeline.core.version import __version__
 
@@ -300,7 +301,8 @@ def effects(
         tables.print_ablation(changes)
 
 
-for verb in (placement.place, explore.explore, *validation_verbs.VERBS):  # which poles together? move them; is it so?
+# which poles together? moved by hand; does a score foretell detection? and a run taken along
+for verb in (placement.place, explore.explore, *validation.VERBS, export.export, export.figure):
     app.command()(verb)
 
 

@@ -13,6 +13,7 @@ import typer
 from pipeline.core.errors import InputError
 
 ScenarioPath = Annotated[Path, typer.Argument(metavar="SCENARIO", help="A folder with a scenario.toml, or the file.")]
+Run = Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a finished run.")]
 Out = Annotated[
     Path | None, typer.Option("--out", metavar="DIR", help="The run's folder; runs/<scenario name> by default.")
 ]
@@ -78,6 +79,16 @@ def latitude_and_longitude(text: str) -> tuple[float, float]:
     except ValueError:
         raise InputError("--at", repr(text), "LAT,LON in degrees, for example 50.8704,9.7080") from None
     return lat, lon
+
+
+def width_mm(text: str, least: float, most: float) -> float:
+    """``--size``: millimetres on paper, from 85mm or 8.5cm."""
+    units = {"mm": 1.0, "cm": 10.0, "": 1.0}
+    match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)(mm|cm)?", text)
+    value = float(match[1]) * units[match[2] or ""] if match else math.nan
+    if not least <= value <= most:
+        raise InputError("--size", repr(text)[:80], f"a width of {least:g} to {most:g} mm, for example 85mm")
+    return value
 
 
 def radius_m(text: str) -> float | None:

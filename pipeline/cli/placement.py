@@ -18,7 +18,7 @@ def place(
     out: Out = None,
     count: Annotated[int | None, typer.Option(metavar="K", help="The best plan of at most K sensors.")] = None,
     budget: Annotated[
-        float | None, typer.Option(metavar="COST", help="The best plan that costs no more, see [costs].")
+        float | None, typer.Option(metavar="COST", help="The best plan that costs no more, see \\[costs].")
     ] = None,
     reach: Annotated[
         float | None,
@@ -32,7 +32,7 @@ def place(
     ] = "60s",
     refine: Annotated[
         bool,
-        typer.Option("--refine", help="Then let each sensor move within what [placement.refine] allows."),
+        typer.Option("--refine", help="Then let each sensor move within what \\[placement.refine] allows."),
     ] = False,
     set_: Set = None,
     jobs: Jobs = None,
@@ -54,6 +54,15 @@ def place(
             listener=screen.stage_event,
         )  # fmt: skip
     print_placement(placed)
+    if exact and not (placed.solution.is_best or placed.solution.fewest_is_proved):
+        _say_unfinished(time_limit)
+
+
+def _say_unfinished(time_limit: str) -> None:
+    """That the search for the best plan ended before it was done."""
+    from pipeline.cli.terminal import WIDE, console
+
+    console(WIDE).print(f"--exact ended at its --time-limit of {time_limit}, before the best plan was proved")
 
 
 def print_placement(placed: Placement) -> None:
@@ -79,13 +88,15 @@ def print_placement(placed: Placement) -> None:
     out.print(plan)
     if any(pick.is_forced for pick in placed.picks):
         out.print("* is there already")
-    curve = table(("sensors", "joint score", "of all", "at least, of the best possible", "sites"), left=("sites",))
-    points = zip(placed.solution.curve, placed.curve_sites, strict=True)
-    for point, sites in points:
+    has_costs = any(placed.curve_costs)
+    columns = ("sensors", "joint score", "of all", "at least, of the best possible", *["cost"] * has_costs, "sites")
+    curve = table(columns, left=("sites",))
+    for point, sites, cost in zip(placed.solution.curve, placed.curve_sites, placed.curve_costs, strict=True):
         share = point.worth.joint / placed.together if placed.together > 0 else 0.0
         curve.add_row(
-            str(point.count), f"{point.worth.joint:.6g}", f"{share:.1%}", _share(point.certificate), ", ".join(sites)
-        )
+            str(point.count), f"{point.worth.joint:.6g}", f"{share:.1%}", _share(point.certificate),
+            *[f"{cost:g}"] * has_costs, ", ".join(sites),
+        )  # fmt: skip
     out.print(curve)
     for zone in placed.zones:
         by = f" by {zone.by} sensors" if zone.by > 1 else ""
@@ -100,7 +111,7 @@ def print_placement(placed: Placement) -> None:
 def in_words(placed: Placement) -> str:
     """The plan and its certificate in one sentence."""
     solution, point = placed.solution, placed.solution.point
-    joint, sites = point.worth.joint, ", ".join(pick.site.name for pick in placed.picks)
+    joint, sites = point.worth.joint, ", ".join(pick.site.name for pick in placed.picks) or "no sensor"
     share = (
         f"{joint / placed.together:.1%} of what all {placed.candidates} candidates together would"
         if placed.together > 0
@@ -109,7 +120,8 @@ def in_words(placed: Placement) -> str:
     cost = f" for {placed.curve_costs[-1]:g}" if placed.curve_costs[-1] else ""
     plan = f"{sites}{cost}: {placed.score} {joint:.6g}, {share}; "
     if solution.fewest_is_proved is not None:
-        fewer = len(placed.picks) - 1
+        if not (fewer := len(placed.picks) - 1):
+            return plan + "one sensor is enough"
         return plan + (f"proved: {fewer} cannot" if solution.fewest_is_proved else f"whether {fewer} can is not proved")
     if solution.is_best:
         return plan + "proved: no plan within the rules is better"

@@ -34,6 +34,11 @@ STRETCH_MOST = 0.01
 """A projection that makes lengths longer or shorter by more than this is none to measure beams in: UTM keeps within
 0.0004 in its zone; the Web Mercator projection of map tiles stretches by 0.6 at 51 degrees."""
 
+LOCAL_METRES = 'LOCAL_CS["World frame of the scenario",UNIT["metre",1],AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
+"""Metres to the east and north of a zero that lies nobody knows where."""
+
+_SAME_M = 0.001
+
 
 @dataclass(frozen=True)
 class WorldFrame:
@@ -130,6 +135,19 @@ def height_unit_m(crs: Any, place: str) -> float:
         if axis.direction in ("up", "down"):
             return float(axis.unit_conversion_factor) * (1.0 if axis.direction == "up" else -1.0)
     return float(found.axis_info[0].unit_conversion_factor) if found.is_projected else 1.0
+
+
+def named(frame: WorldFrame, at_m: tuple[float, float]) -> str:
+    """The projection of a world frame as other programs show it: its EPSG code where one gives the same eastings and
+    northings at a place (world frame, metres) to a millimetre, else WKT."""
+    own = parsed(frame.projection, frame.projection)
+    code = own.to_epsg()
+    if code is not None:
+        eastings = np.subtract([at_m], frame.offset_m, dtype=np.float64)
+        same = _transformed(frame.projection, f"EPSG:{code}", eastings)
+        if np.abs(same - eastings).max() <= _SAME_M:
+            return f"EPSG:{code}"
+    return str(own.to_wkt())
 
 
 def utm_epsg(lon_deg: float, lat_deg: float) -> int:

@@ -34,6 +34,10 @@ COST = "cost"
 """The column of a sites file that says what a candidate costs."""
 
 
+_MOST_COST = 1e12
+"""Of one candidate: sums of such costs are right to a cent."""
+
+
 @dataclass(frozen=True, eq=False)
 class Asked:
     """A problem, and whose candidates it is about.
@@ -87,9 +91,6 @@ def ask(work: Workspace, heard: Callable[[int], None]) -> Asked:
     names = [period.name for period in read_periods(work.path(TPOG)) if period.name]
     tpogs = [read_tpog(work.path(TPOG)), *(read_tpog(work.path(TPOG), name) for name in names)]
     wanted, zones = scenario.placement, scenario.placement.zones
-    if wanted.objective == "worst" and not names:
-        found = '"worst", but the traffic has no periods'
-        raise InputError(f"{scenario.file}: placement.objective", found, '"mean", or [[traffic.periods]]')
     score = scenario.score.rank_by
     by_voxel = score in terms.VOXEL_SCORES
     voxels = VoxelView(work, tpogs, scenario.gamma if score == "egvs" else 1.0) if by_voxel or zones else None
@@ -111,11 +112,16 @@ def ask(work: Workspace, heard: Callable[[int], None]) -> Asked:
         demands = [_zone(scenario, name, zone, sights[0], tpogs[0], voxels.voxels) for name, zone in zones.items()]
     objective: tuple[Term, ...] = (every[0],)
     if wanted.objective == "worst":
-        objective = tuple(_as_share(scenario, term, rules) for term in every[1:])
+        chosen = wanted.periods or names
+        objective = tuple(_as_share(scenario, term, rules) for term in every if term.name in chosen)
     problem = Problem(every[0], objective, tuple(demands), rules, wanted.survives, work.threads)
     whole = problem.together(problem.candidates.tolist())
     for demand in demands:
         _check_zone(scenario, demand, whole.value(demand.term))
+    if not whole.value(problem.joint) > 0.0:
+        found = f"all candidates together have a joint score ({score}) of 0, so no plan is better than none"
+        right = "candidates that see traffic" + (", or a score.gamma above 0" if score == "egvs" else "")
+        raise InputError(f"{scenario.file}: placement", found, right)
     return Asked(problem, sites, score, views, sights, whole.value(problem.joint))
 
 
@@ -167,7 +173,37 @@ def check(scenario: Scenario) -> None:
     if wanted.count is None and wanted.budget is None and wanted.reach is None:
         right = "--count 3, --budget 120000 or --reach 0.95, or one of them in [placement]"
         raise InputError(f"{scenario.file}: placement", "nothing says how many sensors", right)
+    _check_periods(scenario)
+    for name, zone in wanted.zones.items():
+        _check_where(scenario, name, zone)
     rules_of(scenario, sites_of(scenario))
+
+
+def _check_periods(scenario: Scenario) -> None:
+    """InputError where periods are asked for that the traffic does not have, or that nothing looks at."""
+    wanted, names = scenario.placement, [period.name for period in scenario.traffic.periods]
+    if wanted.objective == "worst" and not names:
+        found = '"worst", but the traffic has no periods'
+        raise InputError(f"{scenario.file}: placement.objective", found, '"mean", or [[traffic.periods]]')
+    for name in wanted.periods:
+        if name not in names:
+            right = f"one of {', '.join(names)}" if names else "none, or [[traffic.periods]]"
+            raise InputError(f"{scenario.file}: placement.periods", f"no period {name!r}", right)
+    if wanted.periods and wanted.objective == "mean":
+        found = f'{", ".join(wanted.periods)} with objective = "mean", which is the mix of all'
+        raise InputError(f"{scenario.file}: placement.periods", found, 'objective = "worst"')
+
+
+def _check_where(scenario: Scenario, name: str, zone: ZoneDemand) -> None:
+    """InputError for a zone that the region of interest does not reach."""
+    import shapely
+
+    (cx, cy, _), (dx, dy, _) = scenario.roi.center_m, scenario.roi.size_m
+    ends = cx - dx / 2, cy - dy / 2, cx + dx / 2, cy + dy / 2
+    if not shapely.Polygon(zone.polygon_m).intersects(shapely.box(*ends)):
+        found = f"all of {name} is outside the region of interest"
+        right = f"corners within x {ends[0]:g} to {ends[2]:g} m and y {ends[1]:g} to {ends[3]:g} m"
+        raise InputError(f"{scenario.file}: placement.zones.{name}.polygon_m", found, right)
 
 
 def rules_of(scenario: Scenario, sites: Sequence[Site]) -> Rules:
@@ -223,11 +259,14 @@ def costs_of(scenario: Scenario, sites: Sequence[Site]) -> tuple[Floats, Floats]
     """What each candidate costs, and what of it is for its pole."""
     costs, has_budget = scenario.costs, scenario.placement.budget is not None
     cost, pole_cost = np.zeros(len(sites)), np.zeros(len(sites))
+    file = scenario.sites.file or scenario.file
     for i, site in enumerate(sites):
         own = site.own.get(COST)
         if own is not None:
             if isinstance(own, bool) or not isinstance(own, int | float) or not own >= 0:
-                raise InputError(f"site {site.name}: {COST}", repr(own)[:80], "a number, 0 or above")
+                right = "a number, 0 or above, in digits: 8000, not 8e3"
+                raise InputError(f"{file}: site {site.name}: {COST}", repr(own)[:80], right)
+            _check_cost(f"{file}: site {site.name}: {COST}", float(own))
             cost[i] = own
             continue
         if has_budget and not costs.are_given:
@@ -238,7 +277,14 @@ def costs_of(scenario: Scenario, sites: Sequence[Site]) -> tuple[Floats, Floats]
             raise InputError(f"{scenario.file}: costs.sensor", found, f'"{site.sensor}" = its price')
         cost[i] = costs.sensor.get(site.sensor, 0.0) + costs.pole + costs.metre * site.pose.z_m
         pole_cost[i] = costs.pole
+        _check_cost(f"{scenario.file}: costs ({site.name})", float(cost[i]))
     return cost, pole_cost
+
+
+def _check_cost(place: str, cost: float) -> None:
+    """InputError for a cost so large that sums of costs lose the small ones, or overflow."""
+    if not cost <= _MOST_COST:
+        raise InputError(place, f"{cost:g}", f"at most {_MOST_COST:g}, in a larger unit of money")
 
 
 def _check_forced(rules: Rules, names: list[str], place: str) -> None:

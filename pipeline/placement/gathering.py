@@ -24,6 +24,9 @@ from pipeline.stages.shared.scans import SiteBeams, scans
 from pipeline.stages.shared.scene import scene_of
 from pipeline.stages.shared.target_scores import TRAJECTORIES, Targets
 
+_MOST_BEAMS, _MOST_SHARES = 2**32 - 1, 2**62
+"""What a tally holds at most: of whole beams, and of shares of beams (in a smaller unit)."""
+
 
 class VoxelView:
     """What a pose sees of the voxels that count. Threads may share one.
@@ -40,8 +43,8 @@ class VoxelView:
         self.voxels: Ints = terms.voxels_that_count(tpogs)
         self._visibility = Visibility(scene_of(work), tpogs[0], work.path(TRAJECTORIES))
         self.unit = self._visibility.unit
-        highest = most * self.unit
-        self._most = math.ceil(highest) if highest < 2.0**62 else 2**62
+        highest, holds = most * self.unit, _MOST_BEAMS if self.unit == 1 else _MOST_SHARES
+        self._most = math.ceil(highest) if highest < holds else holds
 
     @property
     def number(self) -> int:

@@ -26,12 +26,11 @@ class JointScore:
 
     A gain takes about 2.5 ns for each cell that the candidate hits: well below a millisecond at 0.5 m voxels.
 
-    Examples
-    --------
-    >>> joint = pipeline.JointScore.of(scenario, "runs/trial")  # doctest: +SKIP
-    >>> joint.add("c03")  # doctest: +SKIP
-    >>> joint.gain("c10")  # doctest: +SKIP
-    133821.1
+    ::
+
+        joint = pipeline.JointScore.of(scenario, "runs/trial")
+        joint.add("c03")
+        joint.gain("c10")
     """
 
     def __init__(self, asked: Asked) -> None:

@@ -184,6 +184,7 @@ def place(
         placement = scenario.placement.model_copy(update={"refine": RefineModel()})
         scenario = scenario.model_copy(update={"placement": placement})
     asking.check(scenario)
+    writing.check(folder)
     if scenario.placement.refine is not None:
         freedom.check(scenario, scenario.placement.refine)
     record = workflow.run(scenario, folder, only=NEEDED, jobs=jobs, progress=progress, listener=listener)

@@ -14,12 +14,20 @@ import numpy as np
 from pipeline.artefacts import checksums, schemas, tables
 from pipeline.artefacts.readers import PLACEMENT_SUMS
 from pipeline.core import files
+from pipeline.core.errors import InputError
 from pipeline.scenario.models import Scenario
 
 if TYPE_CHECKING:
     from pipeline.placement.placing import Placement
 
 PLACEMENT, CURVE = "placement.parquet", "curve.parquet"
+
+
+def check(folder: Path) -> None:
+    """InputError where a folder stands in the place of a file that is written."""
+    for name in (PLACEMENT, CURVE):
+        if (folder / name).is_dir():
+            raise InputError(folder / name, "is a folder", "a file, or nothing, where a plan is written")
 
 
 def write(folder: Path, scenario: Scenario, placed: Placement, stages: Mapping[str, str]) -> tuple[Path, Path]:

@@ -38,18 +38,33 @@ class Figures:
     backdrop: Backdrop
 
 
+_WIDE = 680.0
+"""A figure so wide has room for more words."""
+
+
 def draw(work: Workspace, ranking: Ranking, choosable: Sequence[ScoredSite], tpog: Tpog) -> Figures:
     """Draw the figures of the run in a workspace; views of the ``choosable`` sites."""
-    box = extent(tpog.grid, ranking.sites)
-    backdrop = Backdrop(outlines_of(world_of(work), box), roads_within(network_file(work.folder), box))
-    occupied = tpog.counts.sum(axis=2) / tpog.frames
+    backdrop = backdrop_of(work, ranking, tpog)
     scorer = Scorer(scene_of(work), tpog, work.path("trajectories.parquet"))
-    occupancy = _occupancy(tpog, occupied, ranking, backdrop) if tpog.counts.any() else ""
+    occupancy = occupancy_map(tpog, ranking, backdrop) if tpog.counts.any() else ""
     views = site_views(work, ranking, choosable, scorer, backdrop) if len(scorer.field.cells) else None
-    return Figures(occupancy, _sites(tpog, occupied, ranking, backdrop), views, backdrop)
+    return Figures(occupancy, sites_map(tpog, ranking, backdrop), views, backdrop)
 
 
-def _occupancy(tpog: Tpog, occupied: ColumnValues, ranking: Ranking, backdrop: Backdrop) -> str:
+def backdrop_of(work: Workspace, ranking: Ranking, tpog: Tpog) -> Backdrop:
+    """What lies under the maps of a run."""
+    box = extent(tpog.grid, ranking.sites)
+    return Backdrop(outlines_of(world_of(work), box), roads_within(network_file(work.folder), box))
+
+
+def _occupied(tpog: Tpog) -> ColumnValues:
+    found: ColumnValues = tpog.counts.sum(axis=2) / tpog.frames
+    return found
+
+
+def occupancy_map(tpog: Tpog, ranking: Ranking, backdrop: Backdrop, width: float = maps.WIDTH) -> str:
+    """Where traffic is, seen from above, SVG text; ``width`` in the figure's units."""
+    occupied = _occupied(tpog)
     busiest = np.unravel_index(int(occupied.argmax()), occupied.shape)
     x, y = (o + (i + 0.5) * tpog.grid.voxel_m for o, i in zip(tpog.grid.origin_m, busiest, strict=False))
     alt = (
@@ -57,15 +72,18 @@ def _occupancy(tpog: Tpog, occupied: ColumnValues, ranking: Ranking, backdrop: B
         f"{np.count_nonzero(occupied) / occupied.size:.0%} of its area is used by vehicles; "
         f"the busiest place is near x = {x:.0f} m, y = {y:.0f} m."
     )
-    label = "Occupied voxels in the column, on average: probabilities summed along z"
-    return maps.occupancy(tpog.grid, occupied, label, backdrop, ranking.sites, alt)
+    label = "Occupied voxels in the column"
+    if width >= _WIDE:
+        label += ", on average: probabilities summed along z"
+    return maps.occupancy(tpog.grid, occupied, label, backdrop, ranking.sites, alt, width)
 
 
-def _sites(tpog: Tpog, occupied: ColumnValues, ranking: Ranking, backdrop: Backdrop) -> str:
+def sites_map(tpog: Tpog, ranking: Ranking, backdrop: Backdrop, width: float = maps.WIDTH) -> str:
+    """The candidate sites by score, SVG text; ``width`` in the figure's units."""
     best, last = ranking.best[0], ranking.last
     alt = (
         f"Map of {len(ranking.sites)} candidate sites by score. "
         f"Best: {best.site} at x = {best.x_m:g} m, y = {best.y_m:g} m; "
         f"last: {last.site} at x = {last.x_m:g} m, y = {last.y_m:g} m."
     )
-    return maps.site_map(tpog.grid, occupied, backdrop, ranking.sites, alt)
+    return maps.site_map(tpog.grid, _occupied(tpog), backdrop, ranking.sites, alt, width)

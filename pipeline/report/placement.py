@@ -115,7 +115,8 @@ class PlacementSummary:
             )
             for row in points
         )
-        steps = [CurveStep(row["count"], row["value"] / together, row["bound"] / together) for row in points]
+        whole = 1.0 if its["asked"]["objective"] == "worst" else together  # of which values are shares already
+        steps = [CurveStep(row["count"], row["value"] / whole, row["bound"] / whole) for row in points]
         occupied = tpog.counts.sum(axis=2) / tpog.frames
         names = ", ".join(pick.site for pick in picks)
         return cls(
@@ -161,6 +162,8 @@ def _certificate(value: float, bound: float) -> float:
 def _proof(its: Mapping[str, Any], sensors: int) -> str:
     proved = f"at least {math.floor(1e4 * its['certificate']) / 1e2:.2f} % of the best possible is proved"
     if its["fewest_is_proved"] is not None:
+        if sensors == 1:
+            return "one is enough"
         fewer = f"{sensors - 1} sensor{'' if sensors == 2 else 's'}"
         return f"that {fewer} cannot reach it is {'proved' if its['fewest_is_proved'] else 'not proved'}"
     return "that no plan within the rules is better is proved" if its["is_best"] else proved

@@ -87,7 +87,7 @@ def site_views(
 ) -> SiteViews:
     """Figures and data of the ``choosable`` sites; those of the best and of the last site are drawn."""
     grid, box, is_coarse = scorer.field.grid, extent(scorer.field.grid, choosable), len(choosable) > MANY
-    peak = float(_columns(scorer.field, np.ones(len(scorer.field.cells), dtype=np.bool_)).max())
+    peak = float(columns_of(scorer.field, np.ones(len(scorer.field.cells), dtype=np.bool_)).max())
     missed, panels = blindspots.read(work, choosable), dict[str, SitePanel]()
     choices: dict[str, dict[str, Any]] = {}
     for seen in _seen(work, choosable, scorer):
@@ -126,7 +126,7 @@ def _seen(work: Workspace, choosable: Sequence[ScoredSite], scorer: Scorer) -> I
         scored, crossed = by_name[scan.site.name], scorer.hits(scan.beams) > 0
         here = crossed.ravel()[field.cells]
         caption = wording.site_caption(scored, int(here.sum()), len(here))
-        yield _Seen(scored, crossed, _columns(field, here), _columns(field, ~here), caption, _ends_m(scan.beams))
+        yield _Seen(scored, crossed, columns_of(field, here), columns_of(field, ~here), caption, _ends_m(scan.beams))
 
 
 def _ends_m(beams: Beams) -> NDArray[np.float64]:
@@ -179,7 +179,7 @@ def _panel(
     return SitePanel(site, *drawn, ends, seen.caption, vehicles)
 
 
-def _columns(field: EntropyField, which: NDArray[np.bool_]) -> ColumnValues:
+def columns_of(field: EntropyField, which: NDArray[np.bool_]) -> ColumnValues:
     """Entropy summed along z over some of the voxels, (nx, ny) bits; added up in the order of the voxels."""
     nx, ny, nz = field.grid.shape
     summed = np.bincount(field.cells[which] // nz, weights=field.per_cell_bit[which], minlength=nx * ny)

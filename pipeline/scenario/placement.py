@@ -86,6 +86,9 @@ class PlacementModel(StrictModel):
         description="Of traffic with periods: their mix, or the period of which the least is seen, as a share of what "
         "all candidates together would",
     )
+    periods: tuple[str, ...] = Field(
+        (), description='Those of which objective = "worst" takes the worst; all by default'
+    )
     survives: int = Field(
         0, ge=0, le=1, description="1: what counts is what is left when the sensor that is missed most has failed"
     )
@@ -95,7 +98,7 @@ class PlacementModel(StrictModel):
 
     @model_validator(mode="after")
     def _no_name_in_both(self) -> PlacementModel:
-        for key in ("forced", "excluded"):
+        for key in ("forced", "excluded", "periods"):
             names = getattr(self, key)
             if twice := sorted({name for name in names if names.count(name) > 1}):
                 raise ValueError(f"{key} names {twice[0]} twice")

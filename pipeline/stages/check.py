@@ -51,7 +51,7 @@ def _world(scenario: Scenario) -> dict[str, Any]:
         return {}
 
 
-UNREAD = ("description", "extends", "seed", "tpog", "scan", "score", "validation")
+UNREAD = ("description", "extends", "seed", "tpog", "scan", "score", "validation", "placement", "costs")
 
 
 def run(work: Workspace, inputs: StageInputs) -> Summary:

@@ -101,8 +101,8 @@ def read(path: Path, who: str = "vehicle") -> Iterator[pa.Table]:
 def _csv(path: Path, who: str) -> Iterator[pa.RecordBatch]:
     from pyarrow import csv
 
-    with safe_xml.opened(path) as file:
-        header = safe_xml.line_of(file, path).decode("utf-8", "replace").lstrip("\ufeff").strip()
+    with refusing.reading(path, _WHOLE, "its first line cannot be read"), safe_xml.opened(path) as file:
+        header = safe_xml.line_of(file, path).decode("utf-8").lstrip("\ufeff").strip()
     delimiter = ";" if ";" in header else ","
     columns = _columns([name.strip('"') for name in header.split(delimiter)], path, who)
     convert = csv.ConvertOptions(

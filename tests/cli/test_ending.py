@@ -119,3 +119,16 @@ def test_a_folder_that_may_not_be_entered_is_wrong_input(mini: Path, tmp_path: P
         mini.chmod(0o700)
     assert (done.returncode, "Traceback" in done.stderr) == (2, False), done.stderr
     assert str(mini) in done.stderr
+
+
+def test_no_memory_is_one_message(mini: Path, egvs, monkeypatch: pytest.MonkeyPatch) -> None:
+    from pipeline.runs import workflow
+
+    def run(*_: object, **__: object) -> None:
+        raise MemoryError("Unable to allocate 7 TiB")
+
+    monkeypatch.setattr(workflow, "run", run)
+    code, _, error = egvs("run", mini)
+    assert code == 1
+    assert error.startswith("egvs: there is not enough memory for this (Unable to allocate 7 TiB); larger voxels")
+    assert "Traceback" not in error

@@ -90,6 +90,29 @@ def test_one_sensor_is_the_winner_of_the_run_by_every_score(many: Path, out: Pat
         assert placed.joint == (pytest.approx(value, rel=1e-9) if score == "expected_detections" else value)
 
 
+@pytest.mark.parametrize("effect", ["effects.rain.rate_mm_h=20", "effects.divergence={}"])
+def test_shares_of_beams_count_up_to_gamma(effect: str, many: Path, out: Path) -> None:
+    """Where effects weigh beams, one sensor is worth what the run says, and two are by the definition."""
+    sets = [effect, "placement.count=2", "score.keep_visibility='all'"]
+    scenario = pipeline.load(many, sets)
+    pipeline.run(scenario, out)
+    scores = {row["site"]: row["egvs"] for row in read_scores(out / "scores.parquet").to_pylist()}
+    joint = pipeline.JointScore.of(scenario, out)
+    for name, egvs in scores.items():
+        joint.add(name)
+        assert joint.value == egvs
+        joint.remove(name)
+    tpog = read_tpog(out / "tpog.parquet")
+    p = tpog.p
+    entropy = np.zeros_like(p)
+    inner = (p > 0) & (p < 1)
+    entropy[inner] = -p[inner] * np.log2(p[inner]) - (1 - p[inner]) * np.log2(1 - p[inner])
+    hits = sum(pipeline.read_visibility(out / "visibility.parquet", name) for name in ("a", "b"))
+    assert hits.max() > 2 * scenario.gamma
+    joint.add("a", "b")
+    assert joint.value == pytest.approx(float((entropy * np.minimum(hits, scenario.gamma)).sum()), rel=1e-12)
+
+
 def test_what_is_written_adds_up(many: Path, out: Path, egvs) -> None:
     code, _, error = egvs("place", many, "--out", out, "--count", 3)
     assert code == 0, error
@@ -169,6 +192,22 @@ def test_what_is_left_when_the_sensor_that_is_missed_most_fails(many: Path, out:
     assert plan["value"] == curve[-1]["value"] == best == left(tuple(row["site"] for row in rows))
 
 
+HALVES = 'traffic.periods=[{name="a",length_s=12},{name="b",begin_s=12,length_s=8}]'
+
+
+def test_the_worst_of_the_periods_that_are_named(many: Path, out: Path, egvs) -> None:
+    """Of one period alone, the worst is what it has: a share of what all candidates would have in it."""
+    worst = {}
+    for periods in ("a", "b", "a,b"):
+        names = [f"'{name}'" for name in periods.split(",")]
+        sets = [HALVES, "placement.objective='worst'", f"placement.periods=[{','.join(names)}]"]
+        arguments = [word for one in sets for word in ("--set", one)]
+        code, _, error = egvs("place", many, "--out", out, "--count", 2, "--exact", *arguments)
+        assert code == 0, error
+        worst[periods] = read(out)[2]["value"]
+    assert 0.0 < worst["a,b"] <= min(worst["a"], worst["b"]) <= 1.0
+
+
 REFUSED = {
     "nothing asked": ([], "placement: nothing says how many sensors; --count 3, --budget 120000 or --reach 0.95"),
     "count above candidates": (["--count", "6"], "placement.count: 6 sensors of 5 candidates; at most 5"),
@@ -184,6 +223,14 @@ REFUSED = {
         ["--budget", "50", "--set", "costs.pole=60"],
         "placement.budget: 50 is below the cheapest candidate; at least 60, what a costs",
     ),
+    "none left": (
+        ["--reach", "0.5", "--set", "placement.excluded=['a','b','b_high','c','d']"],
+        "placement.excluded: every candidate is excluded; fewer of them",
+    ),
+    "a zone in the way of a reach": (
+        ["--count", "1", "--reach", "0.01", "--set", ZONE % (0.5, 2)],
+        "placement.zones: no plan of 1 sensors that meets it was found",
+    ),
     "no costs": (["--budget", "50"], "placement.budget: nothing says what a costs; [costs], or a column cost"),
     "a sensor without a price": (
         ["--budget", "50", "--set", "costs.sensor.other=1"],
@@ -198,12 +245,20 @@ REFUSED = {
         "placement.count: 1, but 2 are forced; at least 2",
     ),
     "a zone that nobody sees": (
-        ["--count", "2", "--set", "placement.zones.far={polygon_m=[[200,0],[201,0],[201,1]],share=0.5}"],
+        ["--count", "2", "--set", "placement.zones.far={polygon_m=[[1,8.5],[3,8.5],[3,9.5]],share=0.5}"],
         "placement.zones.far: no voxel in it has entropy: no traffic comes and goes there",
     ),
     "the worst of no periods": (
         ["--count", "2", "--set", "placement.objective='worst'"],
         'placement.objective: "worst", but the traffic has no periods',
+    ),
+    "a period that is not there": (
+        ["--count", "2", "--set", "placement.periods=['noon']"],
+        "placement.periods: no period 'noon'; none, or [[traffic.periods]]",
+    ),
+    "a period of the mix": (
+        ["--count", "2", "--set", "placement.periods=['a']", "--set", HALVES],
+        'placement.periods: a with objective = "mean", which is the mix of all; objective = "worst"',
     ),
     "too much of a zone": (
         ["--count", "2", "--set", ZONE % (1.0, 5)],
@@ -233,7 +288,7 @@ def test_a_cost_that_is_no_number_is_refused(many: Path, out: Path, egvs) -> Non
     (many / "sites.csv").write_text(SITES.replace("4,70", "4,dear"))
     code, _, error = egvs("place", many, "--out", out, "--budget", 50, "--set", "costs.pole=1")
     assert code == 2
-    assert "site c: cost: 'dear'; a number, 0 or above" in error
+    assert "sites.csv: site c: cost: 'dear'; a number, 0 or above, in digits: 8000, not 8e3" in error
 
 
 def test_the_report_shows_the_plan_until_something_changes(many: Path, out: Path, egvs) -> None:
@@ -291,3 +346,10 @@ def test_the_joint_score_from_python(many: Path, out: Path) -> None:
     assert (joint.chosen, joint.value) == (("a",), joint_egvs(many, out, "a"))
     with pytest.raises(pipeline.InputError, match="candidate 'x': no such candidate; one of a, b"):
         joint.add("x")
+
+
+def test_one_sensor_that_is_enough_is_told_so(many: Path, out: Path, egvs) -> None:
+    code, text, error = egvs("place", many, "--out", out, "--reach", 0.01)
+    assert code == 0, error
+    assert "one sensor is enough" in text
+    assert "0 cannot" not in text

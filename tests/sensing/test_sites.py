@@ -102,7 +102,7 @@ def test_a_run_from_geojson_scores_what_a_run_from_csv_does(mini: Path, tmp_path
         (collection(point(0, "195", 3, name="a")), "feature 0: y_m: the coordinate '195'; a number, not text"),
         (collection(point(0, True, 3, name="a")), "feature 0: y_m: True; a finite number"),
         (collection(point(0, None, 3, name="a")), "feature 0: y_m is missing"),
-        (collection(point(0, 0, 10**400, name="a")), "feature 0: z_m: 1000.*; a finite number"),
+        (collection(point(0, 0, 10**400, name="a")), "is not valid JSON: a number has too many digits"),
         (collection(point(0, 0, 3, name="a", z_m=4)), "feature 0: z_m: 4 there, but 3 as well; one of them"),
         (collection(point(0, 0, 3, name="a", site="b")), "feature 0: site: 'b' there, but 'a' as well"),
         *((collection(point(0, 0, 3, **{"name": "a", key: value})), f"feature 0: {found}: .*; a text")

@@ -7,6 +7,7 @@ never asserted.
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 import shutil
@@ -23,7 +24,9 @@ import pipeline
 from pipeline.artefacts import tables
 from pipeline.artefacts.readers import read_accuracy
 from pipeline.cli.studies import accuracy_tables
+from pipeline.core import files
 from pipeline.core.errors import InputError, RunError
+from pipeline.core.reading import seals
 from pipeline.runs import stages
 from pipeline.runs.locking import alone
 from pipeline.runs.store import Store
@@ -316,7 +319,8 @@ def test_a_repeat_that_writes_other_bytes_is_an_error(mini: Path, tmp_path: Path
     own = study_settings.Setting("scenario", "scenario", "")
     trial = runner.run(own)
     cost = tmp_path / "accuracy" / "times" / f"tpog-{trial.stages['tpog'][:16]}.json"
-    cost.write_text(cost.read_text().replace('"tpog.parquet": "', '"tpog.parquet": "0'))
+    kept = json.loads(cost.read_text().replace('"tpog.parquet": "', '"tpog.parquet": "0'))
+    cost.write_text(files.json_text(seals.sealed(kept)))
     with pytest.raises(RunError, match="other bytes"):
         runner.again("tpog", own, trial)
 

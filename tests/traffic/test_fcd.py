@@ -261,3 +261,12 @@ def test_a_row_group_of_more_than_the_bound_is_not_unpacked(tmp_path, monkeypatc
         InputError, match=r"f.parquet: has a row group of 1 MB, unpacked; at most 1 MB; EGVS_MAX_UNPACKED"
     ):
         read_all(tmp_path / "f.parquet")
+
+
+def test_a_header_that_is_no_text_is_refused(tmp_path):
+    """The name of a column that is not needed is damaged: who knows what else is."""
+    path = tmp_path / "fcd.csv"
+    head = b"timestep_time;vehicle_id;vehicle_x;vehicle_y;vehicle_angle;vehicle_type;vehic\xff\xffpeed\n"
+    path.write_bytes(head + b"0.00;east;1.0;-2.0;90.0;car;2.0\n")
+    with pytest.raises(InputError, match=r"fcd\.csv: its first line cannot be read"):
+        list(fcd.read(path))

@@ -35,13 +35,10 @@ class Tangent:
     ----------
     slope
         Of all candidates, (n,) float64; 0 for those that it says nothing of.
-    candidates
-        Those that it holds for, beside those that a plan holds already.
     """
 
     constant: float
     slope: Floats
-    candidates: Ints
 
     def room(self, rules: Rules, chosen: Sequence[int], candidates: Ints) -> tuple[float, Floats, Ints, Floats]:
         """Of plans that hold ``chosen`` and otherwise some of ``candidates``: what none exceeds; what none exceeds that
@@ -116,7 +113,7 @@ def bounded(
 
         rises = np.zeros(len(sight))
         rises[alive], rises[mine] = spread(rise, alive, threads), rise(mine)
-        tangent = Tangent(constant, rises, alive)
+        tangent = Tangent(constant, rises)
         top, room, picked, share = tangent.room(rules, chosen, alive)
         alive = alive[room > known]
         stalled = 0 if best is None or top < value * (1.0 - _WORTHWHILE) else stalled + 1

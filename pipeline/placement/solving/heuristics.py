@@ -25,8 +25,11 @@ Guide = Callable[[Together, Ints, Each], tuple[Floats, ...]]
 
 Plan = tuple[int, ...]
 
-_STARTS = 150
+_STARTS = 40
 """Candidates up to which a plan is begun with each of them, where costs differ."""
+
+_SWAPPED = 20
+"""Plans that swaps are tried on, the best ones."""
 
 _LEVELS = 12
 """Levels that are tried for the worst of several records."""
@@ -35,7 +38,8 @@ _LEVELS = 12
 def best_found(problem: Problem) -> tuple[Plan, Worth]:
     """The best plan of all heuristics, sorted."""
     plans = {tuple(sorted(plan)) for plan in _starts(problem)}
-    improved = {swapped(problem, plan) for plan in sorted(plans)}
+    promising = sorted(sorted(plans, key=shorter), key=problem.worth, reverse=True)[:_SWAPPED]
+    improved = {swapped(problem, plan) for plan in promising}
     return best_of(problem, sorted(improved))
 
 

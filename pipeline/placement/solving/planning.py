@@ -207,12 +207,15 @@ def bounds_of(problem: Problem, known: Worth) -> Bounds:
     free = np.setdiff1d(problem.candidates, rules.forced).astype(np.int64)
     least = known.value if known.met >= 0.0 else -np.inf
     chosen, candidates = (rules.forced, free) if not problem.survives else ((), problem.candidates)
-    return tuple(
-        bounds.bounded(
+    seen, found = problem.together(chosen), []
+    for term in problem.objective:
+        its = bounds.bounded(
             term, rules, chosen, candidates, known=least, steps=STEPS, threads=problem.threads, enough=ENOUGH
         )
-        for term in problem.objective
-    )
+        most = rules.most(seen.gains(term, candidates), candidates, chosen)[0]  # exact for one sensor more
+        top = (seen.value(term) + most) * (1.0 + bounds.ROUNDING)
+        found.append(replace(its, value=max(min(its.value, top), least)))
+    return tuple(found)
 
 
 def in_order(problem: Problem, plan: Plan) -> Plan:

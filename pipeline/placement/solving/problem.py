@@ -117,15 +117,15 @@ class Problem:
         met = -sum(float(demand.unmet(seen.value(demand.term))) for demand in self.demands)
         value = min(seen.value(term) for term in self.objective)
         if self.survives:
-            value = min((value_ for _, value_ in self.without_each(seen)), default=0.0)
+            value = min(self._without_each(seen), default=0.0)
         return Worth(met, value, seen.value(self.joint))
 
-    def without_each(self, seen: Together) -> list[tuple[int, float]]:
+    def _without_each(self, seen: Together) -> list[float]:
         """What is left of the objective without each sensor of a plan."""
         left = []
         for candidate in list(seen.chosen):
             seen.remove(candidate)
-            left.append((candidate, min(seen.value(term) for term in self.objective)))
+            left.append(min(seen.value(term) for term in self.objective))
             seen.add(candidate)
         return left
 
@@ -138,7 +138,7 @@ class Problem:
             met -= demand.unmet(reached)
         joint = seen.value(self.joint) + seen.gains(self.joint, candidates)
         if not self.survives:
-            return met, self._smallest(seen, candidates), joint
+            return met, joint if self.objective == (self.joint,) else self._smallest(seen, candidates), joint
         value = np.full(len(candidates), min(seen.value(term) for term in self.objective))
         for candidate in list(seen.chosen):
             seen.remove(candidate)

@@ -33,6 +33,8 @@ from pipeline.report.drawing.roads import Roads, StreetName
 Place = list[MapSite]
 """Sites that stand above one another, the best first."""
 
+WIDTH, _TALLEST = 760.0, 560.0
+"""Of the maps of a page, in their own units."""
 _LONGEST = 18
 """Letters of a name; longer ones are cut."""
 _CROWDED = 40
@@ -62,10 +64,16 @@ class SiteView:
 
 
 def occupancy(
-    grid: Grid, values: ColumnValues, label: str, backdrop: Backdrop, sites: Sequence[MapSite], alt: str
+    grid: Grid,
+    values: ColumnValues,
+    label: str,
+    backdrop: Backdrop,
+    sites: Sequence[MapSite],
+    alt: str,
+    width: float = WIDTH,
 ) -> str:
     """A field over the region of interest, with the roads, the static outlines and the sites."""
-    plan = Plan(extent(grid, sites), "tpog", north=True)
+    plan = _plan_of(extent(grid, sites), "tpog", width)
     peak = float(values.max(initial=0.0))
     parts = [
         _road_paths(plan, backdrop.roads),
@@ -80,13 +88,15 @@ def occupancy(
     return plan.svg(parts, alt, bar=ColourBar(0.0, peak, label))
 
 
-def site_map(grid: Grid, values: ColumnValues, backdrop: Backdrop, sites: Sequence[MapSite], alt: str) -> str:
+def site_map(
+    grid: Grid, values: ColumnValues, backdrop: Backdrop, sites: Sequence[MapSite], alt: str, width: float = WIDTH
+) -> str:
     """The sites over roads and static outlines: colour by score, number by rank, name beside it; traffic faint below.
 
     Of sites that share a place, the best is in the middle of its rings. Where many sites stand, only the first ten and
     the last keep a name; every site tells its own under the pointer.
     """
-    plan = Plan(extent(grid, sites), "sites", north=True)
+    plan = _plan_of(extent(grid, sites), "sites", width)
     places = _places(sites)
     crowded, low, high = is_crowded(sites), min(s.score for s in sites), max(s.score for s in sites)
     streets, street_boxes = _street_names(plan, backdrop.roads.names, sites)
@@ -99,6 +109,11 @@ def site_map(grid: Grid, values: ColumnValues, backdrop: Backdrop, sites: Sequen
     return plan.svg(parts, alt, bar=bar)
 
 
+def _plan_of(box: Box, prefix: str, width: float) -> Plan:
+    """The frame of a map of all sites; as tall as it needs to be where it is narrow."""
+    return Plan(box, prefix, width=width, tallest=max(_TALLEST, width), north=True)
+
+
 def ground(plan: Plan, grid: Grid, values: ColumnValues, backdrop: Backdrop) -> list[str]:
     """What lies under sites: roads, faint traffic, static outlines, the region."""
     return [
@@ -109,7 +124,16 @@ def ground(plan: Plan, grid: Grid, values: ColumnValues, backdrop: Backdrop) -> 
     ]
 
 
-def site_view(grid: Grid, values: ColumnValues, peak: float, view: SiteView, prefix: str, alt: str) -> str:
+def site_view(
+    grid: Grid,
+    values: ColumnValues,
+    peak: float,
+    view: SiteView,
+    prefix: str,
+    alt: str,
+    width: float | None = None,
+    label: str = "",
+) -> str:
     """Entropy from above that one site sees, or misses; columns of voxels that no beam crosses at any height are
     shaded. Its images carry classes (``shade``, ``field``) by which a page may exchange them.
 
@@ -121,8 +145,12 @@ def site_view(grid: Grid, values: ColumnValues, peak: float, view: SiteView, pre
         The value at the end of the colour scale.
     prefix
         Makes ids unique on a page.
+    width
+        Of the figure, in its own units; that of a page's panels for None.
+    label
+        Of a colour scale below it; none without.
     """
-    plan = view_plan(view.box, prefix)
+    plan = view_plan(view.box, prefix) if width is None else _plan_of(view.box, prefix, width)
     shade = raster.shade_image(np.logical_not(view.crossed.any(axis=2)))
     parts = [
         _road_paths(plan, view.backdrop.roads),
@@ -132,7 +160,7 @@ def site_view(grid: Grid, values: ColumnValues, peak: float, view: SiteView, pre
         plan.roi(grid),
         _sensor(plan, view.site),
     ]
-    return plan.svg(parts, alt)
+    return plan.svg(parts, alt, ColourBar(0.0, peak, label) if label else None)
 
 
 def scan_view(grid: Grid, image: IndexedImage, view: SiteView, prefix: str, alt: str) -> str:

@@ -52,7 +52,7 @@ def outlines_of(world: World, box: Box) -> tuple[Outlines, ...]:
     by_look: dict[str, tuple[list[str], list[Any]]] = {look: ([], []) for look in ("large", "small", "green")}
     for kind in sorted(set(kinds[shown].tolist()) - {"ground"}):
         of_kind = shown & (kinds == kind)
-        shape = _united(corners[of_kind], box)
+        shape = united(corners[of_kind], box)
         names, shapes = by_look[_look(kind, shape.area / len(np.unique(world.solid_of_face[of_kind])))]
         names.append(kind.replace("_", " "))
         shapes.append(shape)
@@ -64,9 +64,9 @@ def outlines_of(world: World, box: Box) -> tuple[Outlines, ...]:
     )
 
 
-def _united(triangles: NDArray[np.float64], box: Box) -> Any:
-    """The area of triangles (n, 3, 2). Of very many, those that are small are drawn as squares: to unite hundreds of
-    thousands that lie over one another takes minutes."""
+def united(triangles: NDArray[np.float64], box: Box) -> Any:
+    """The area of triangles (n, 3, 2), a shapely geometry. Of very many, those that are small are drawn as squares: to
+    unite hundreds of thousands that lie over one another takes minutes."""
     import shapely
 
     low, high = triangles.min(axis=1), triangles.max(axis=1)

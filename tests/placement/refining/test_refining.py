@@ -146,14 +146,14 @@ def test_a_budget_holds_while_sensors_move(mini: Path) -> None:
     assert scarce.moves.before == ample.moves.before < scarce.joint < ample.joint
 
 
-def test_a_plan_of_no_sensor_stays_one(mini: Path) -> None:
-    """The only candidate looks up into the sky: nothing is put up, so nothing moves."""
+def test_a_candidate_that_sees_nothing_is_refused_before_it_moves(mini: Path) -> None:
+    """The only one looks up into the sky."""
     with_sites(mini, {"a": Pose(20, 9.5, 3.0, pitch_deg=80)})
     text = (mini / "scenario.toml").read_text()
     narrow = text.replace("channels = 8", "channels = 1").replace("[-15, 5]", "[80, 80]")
     (mini / "scenario.toml").write_text(narrow)
-    placed = plan(mini, "placement.count=1")
-    assert placed.picks == () and placed.moves is None
+    with pytest.raises(pipeline.InputError, match=r"all candidates together have a joint score .egvs. of 0"):
+        plan(mini, "placement.count=1")
 
 
 @pytest.mark.parametrize(("setting", "least_m"), [("placement.least_distance_m=2.5", 2.5), ("seed=7", 1.0)])

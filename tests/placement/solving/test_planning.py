@@ -153,3 +153,18 @@ def test_a_second_sensor_is_put_up_for_a_zone_that_two_must_see_though_the_score
     problem = Problem(term, (term,), (Demand(zone, 1.0),), rules_for(5, [0.0] * 5))
     found = planning.best(problem, search_all=False, time_limit_s=0.0, heard=unheard)
     assert (found.order, found.point.worth.met) == ((0, 1, 2), 0.0)
+
+
+def test_of_one_sensor_the_best_is_proved_without_a_search() -> None:
+    """By the gains alone, whatever the curve: no plan of one exceeds the largest."""
+    proved = 0
+    for seed in range(150):
+        its = drawn(seed)
+        problem = its.problem.with_count(1)
+        if not problem.is_plain or problem.rules.forced or np.isfinite(problem.rules.budget):
+            continue
+        found = planning.best(problem, search_all=False, time_limit_s=0.0, heard=unheard)
+        assert found.point.certificate == 1.0, seed
+        assert found.is_best
+        proved += 1
+    assert proved > 20

@@ -34,23 +34,23 @@ def clouds(
     jobs: Jobs = None,
 ) -> None:
     """Write labelled point clouds with traffic, for anyone's detector."""
-    from pipeline.cli import validation_tables
     from pipeline.cli.progress import Screen
+    from pipeline.cli.validation import tables
     from pipeline.scenario.loading import load
     from pipeline.validation.exports.exporting import export
 
     resolved = load(scenario, set_ or ())
     with Screen("clouds") as screen:
         done = export(resolved, out, sites=site or (), frames=frames, kind=kind, jobs=jobs, progress=screen.progress)
-    validation_tables.print_export(done)
+    tables.print_export(done)
 
 
 def scores() -> None:
     """Print the scores that validation compares: formula, which way is better, source."""
-    from pipeline.cli import validation_tables
+    from pipeline.cli.validation import tables
     from pipeline.validation.surrogates import registry
 
-    validation_tables.print_scores(registry.catalogue())
+    tables.print_scores(registry.catalogue())
 
 
 def validate(
@@ -79,8 +79,8 @@ def validate(
     jobs: Jobs = None,
 ) -> None:
     """What would detectors find from each site, and which score foretells it? And in the fused clouds of a plan?"""
-    from pipeline.cli import validation_tables
     from pipeline.cli.progress import Screen
+    from pipeline.cli.validation import tables
     from pipeline.runs.workflow import default_folder
     from pipeline.scenario.loading import load
     from pipeline.validation import validating
@@ -97,24 +97,24 @@ def validate(
     with Screen("validate") as screen:
         done = validating.validate(
             loaded, folder, frames=frames, detectors=names, detections=detections, keep=keep, jobs=jobs,
-            progress=screen.progress, listener=validation_tables.LookLines(screen.say),
+            progress=screen.progress, listener=tables.LookLines(screen.say),
         )  # fmt: skip
-    validation_tables.print_validation(loaded, folder, done)
+    tables.print_validation(loaded, folder, done)
 
 
 def _validate_plan(
     loaded: Scenario, folder: Path, plan_folder: Path, frames: int, detectors: list[str], jobs: int | None
 ) -> None:
-    from pipeline.cli import validation_tables
     from pipeline.cli.progress import Screen
+    from pipeline.cli.validation import tables
     from pipeline.validation.fused import validating
 
     with Screen("validate") as screen:
         done = validating.validate(
             loaded, folder, plan_folder, frames=frames, detectors=detectors, jobs=jobs, progress=screen.progress,
-            listener=validation_tables.FusedLines(screen.say),
+            listener=tables.FusedLines(screen.say),
         )  # fmt: skip
-    validation_tables.print_plan_validation(done)
+    tables.print_plan_validation(done)
 
 
 def train(
@@ -133,8 +133,8 @@ def train(
     jobs: Jobs = None,
 ) -> None:
     """Train the PointPillars detector on simulated sweeps of junctions (needs the extra `train`)."""
-    from pipeline.cli import validation_tables
     from pipeline.cli.progress import Screen
+    from pipeline.cli.validation import tables
     from pipeline.core import files, plugins
     from pipeline.scenario.loading import load
 
@@ -158,7 +158,7 @@ def train(
     files.make_room(model)
     with Screen("train") as screen:
         about = training.train(loaded, model, recipe, jobs=jobs, progress=screen.progress)
-    validation_tables.print_training(model, about)
+    tables.print_training(model, about)
 
 
 VERBS = (validate, clouds, scores, train)

@@ -1,0 +1,1 @@
+"""What a finished run found, in the files of other programs: any map, a spreadsheet, paper."""

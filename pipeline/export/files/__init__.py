@@ -1,0 +1,1 @@
+"""Writers of the formats that maps, spreadsheets and rasters are exchanged in."""

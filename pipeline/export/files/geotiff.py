@@ -1,0 +1,142 @@
+"""Writes rasters as GeoTIFF: the values, and a picture of them.
+
+- ``NAME.tif`` holds the values, float32, with :data:`NODATA` where there are none, and ``NAME.qml`` the colours in
+  which QGIS shows them.
+- ``NAME_colours.tif`` holds the same in 255 steps with a colour table, for programs that show it as it is; 0 is where
+  there is no data, and its scale and offset say what value a step stands for.
+
+In degrees a raster is sampled anew, each cell from the nearest: values stay values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.export.files.qgis_style import raster_qml
+from pipeline.export.rasters import Raster
+from pipeline.export.reference import Reference
+from pipeline.report.drawing import colours
+
+NODATA = -9999.0
+_STEPS = 254
+"""Of a colour table, after 0 for no data."""
+_SMALLEST = 1e-12
+_TILE = {"compress": "deflate", "predictor": 1, "interleave": "band"}
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A raster in a reference system: rows from the north, columns from the west, not a number where there is no data;
+    the north-western corner, and the size of a cell, in the system's units."""
+
+    values: NDArray[np.float64]
+    west: float
+    north: float
+    width: float
+    height: float
+
+
+def placed(raster: Raster, reference: Reference) -> Placed:
+    """A raster in a reference system."""
+    nx, ny = raster.values.shape
+    low, cell = np.asarray(raster.origin_m), raster.cell_m
+    high = low + cell * np.array([nx, ny])
+    if not reference.is_degrees:
+        west, north = reference.of_world(np.array([[low[0], high[1]]]))[0]
+        return Placed(np.flipud(raster.values.T), float(west), float(north), cell, cell)
+    border = _border(low, high)
+    west_south, east_north = (how(reference.of_world(border), axis=0) for how in (np.min, np.max))
+    columns, rows = (max(1, round(float(n))) for n in _cells_across(reference, low, high, cell))
+    width, height = (east_north - west_south) / (columns, rows)
+    lon = west_south[0] + (np.arange(columns) + 0.5) * width
+    lat = east_north[1] - (np.arange(rows) + 0.5) * height
+    at = reference.to_world(np.stack(np.meshgrid(lon, lat), axis=-1).reshape(-1, 2))
+    index = np.floor((at - low) / cell).astype(np.int64)
+    inside = ((index >= 0) & (index < (nx, ny))).all(axis=1)
+    values = np.full(len(at), np.nan)
+    values[inside] = raster.values[tuple(index[inside].T)]
+    return Placed(
+        values.reshape(rows, columns), float(west_south[0]), float(east_north[1]), float(width), float(height)
+    )
+
+
+def _border(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points along the edge of a rectangle, (n, 2): in degrees its edges are curves."""
+    share = np.linspace(0.0, 1.0, 21)
+    x, y = low[0] + share * (high[0] - low[0]), low[1] + share * (high[1] - low[1])
+    sides = [(x, np.full(21, low[1])), (x, np.full(21, high[1])), (np.full(21, low[0]), y), (np.full(21, high[0]), y)]
+    return np.vstack([np.column_stack(side) for side in sides])
+
+
+def _cells_across(
+    reference: Reference, low: NDArray[np.float64], high: NDArray[np.float64], cell: float
+) -> NDArray[np.float64]:
+    """How many cells as large as those of the raster its box in degrees is wide and tall."""
+    degrees = reference.of_world(_border(low, high))
+    (west, south), (east, north) = degrees.min(axis=0), degrees.max(axis=0)
+    corners = np.array([[west, south], [east, south], [west, north]])
+    metres = reference.to_world(corners)
+    found: NDArray[np.float64] = np.hypot(*(metres[1:] - metres[0]).T) / cell
+    return found
+
+
+def write(folder: Path, raster: Raster, reference: Reference, name: str) -> Iterator[Path]:
+    """Write a raster's files into a folder, ``name`` in front of their ends; their paths."""
+    its = placed(raster, reference)
+    known = np.isfinite(its.values)
+    tags = {"TIFFTAG_IMAGEDESCRIPTION": f"{raster.words} ({raster.unit})", "AREA_OR_POINT": "Area"}
+    values = np.where(known, its.values, NODATA).astype(np.float32)
+    yield _write(folder / f"{name}.tif", values, NODATA, its, reference, tags)
+    style = folder / f"{name}.qml"
+    stops = [(raster.peak * step / colours.STEPS, code) for step, code in enumerate(colours.ON_LIGHT)]
+    text = raster_qml(0.0, raster.peak, [(value, code, f"{value:.4g}") for value, code in stops])
+    style.write_text(text, encoding="utf-8")
+    yield style
+    share = np.clip(np.nan_to_num(its.values) / raster.peak, 0.0, 1.0)
+    steps = np.where(known, 1 + np.round(share * (_STEPS - 1)), 0).astype(np.uint8)
+    scale = raster.peak / (_STEPS - 1)
+    yield _write(folder / f"{name}_colours.tif", steps, 0, its, reference, tags, _colour_table(), scale=(scale, -scale))
+
+
+def _colour_table() -> dict[int, tuple[int, int, int, int]]:
+    table = {0: (255, 255, 255, 0)}
+    table |= {255: (255, 255, 255, 0)}
+    for step in range(_STEPS):
+        red, green, blue = colours.mixed(step, _STEPS - 1, colours.ON_LIGHT)
+        table[step + 1] = (red, green, blue, 255)
+    return table
+
+
+def _write(
+    path: Path,
+    values: NDArray[Any],
+    nodata: float,
+    its: Placed,
+    reference: Reference,
+    tags: Mapping[str, str],
+    colour_table: Mapping[int, tuple[int, int, int, int]] | None = None,
+    scale: tuple[float, float] | None = None,
+) -> Path:
+    import rasterio
+    from rasterio.crs import CRS
+    from rasterio.transform import Affine
+
+    rows, columns = values.shape
+    transform = Affine(its.width, 0.0, its.west, 0.0, -its.height, its.north)
+    with rasterio.open(
+        path, "w", driver="GTiff", width=columns, height=rows, count=1, dtype=values.dtype.name, nodata=nodata,
+        crs=CRS.from_user_input(reference.crs), transform=transform, **_TILE,
+    ) as file:  # fmt: skip
+        file.update_tags(**tags)
+        if colour_table is not None:  # before the values: what comes later does not get into the file's head
+            file.write_colormap(1, dict(colour_table))
+        if scale is not None:
+            file.scales, file.offsets = (scale[0],), (scale[1],)
+        file.write(values, 1)
+    return path

@@ -1,0 +1,137 @@
+"""Figures say what the artefacts say, at the size that was asked for, in files that need nothing beside them."""
+
+from __future__ import annotations
+
+import re
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import pytest
+from PIL import Image
+
+from pipeline.artefacts.readers import read_scores
+from pipeline.core import plugins
+from pipeline.export.paper.figure import WHAT, draw
+from pipeline.export.paper.flat_svg import flat
+from pipeline.report.drawing.ranking_chart import Bar, chart
+
+Call = Callable[..., tuple[int, str, str]]
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+def drawn(run: Path, what: str, out: Path, **options: object) -> ET.Element:
+    return ET.parse(draw(run, what, kind="svg", out=out / f"{what}.svg", **options)).getroot()
+
+
+@pytest.mark.parametrize("what", WHAT)
+def test_a_figure_is_as_wide_as_asked_and_needs_no_style_sheet(local: Path, tmp_path: Path, what: str) -> None:
+    root = drawn(local, what, tmp_path, width_mm=120.0)
+    assert root.get("width") == "120mm"
+    _, _, wide, tall = map(float, root.get("viewBox").split())
+    assert float(root.get("height").removesuffix("mm")) == pytest.approx(120 * tall / wide, abs=0.01)
+    assert 12 / wide * 120 / 25.4 * 72 == pytest.approx(7.0, rel=0.01)  # letters of 7 pt
+    text = ET.tostring(root, encoding="unicode")
+    assert "var(" not in text
+    assert "<style" not in text
+    assert "currentColor" not in text
+    assert "night" not in text
+    assert not re.search(r'(?:href|src)="(?!data:)', text)
+
+
+def test_the_ranking_s_bars_are_as_long_as_the_scores(local: Path, tmp_path: Path) -> None:
+    root = drawn(local, "ranking", tmp_path)
+    bars = [
+        float(group.find(f"{SVG}rect").get("width")) for group in root.iter(f"{SVG}g") if group.get("class") == "bar"
+    ]
+    scores = sorted((row["egvs"] for row in read_scores(local / "scores.parquet").to_pylist()), reverse=True)
+    assert bars[1] / bars[0] == pytest.approx(scores[1] / scores[0], abs=0.002)
+    titles = [title.text for title in root.iter(f"{SVG}title")]
+    assert [title.split(":")[0] for title in titles] == ["pole_b", "pole_a"] or scores[0] == scores[1]
+
+
+def test_letters_stand_over_their_halo() -> None:
+    figure = '<svg class="plan" viewBox="0 0 100 50"><text class="label" x="1" y="2">a &amp; b</text></svg>'
+    halo, letters = ET.fromstring(flat(figure, 50.0)).findall(f"{SVG}text")
+    assert (halo.get("stroke"), halo.get("stroke-width")) == ("#ffffff", "3.5")
+    assert (letters.get("stroke"), letters.get("fill"), letters.text) == (None, "#1d2430", "a & b")
+
+
+def test_a_more_specific_rule_wins() -> None:
+    figure = '<svg class="plan" viewBox="0 0 9 9"><g class="site first"><circle class="q0"/></g></svg>'
+    circle = next(ET.fromstring(flat(figure, 50.0)).iter(f"{SVG}circle"))
+    assert (circle.get("stroke-width"), circle.get("fill"), circle.get("stroke")) == ("2.6", "#fde725", "#1d2430")
+
+
+def test_a_bar_s_error_is_one_to_either_side() -> None:
+    text = chart([Bar("a", 0.5, 0.1, ""), Bar("b", 0.4, None, "")], "share", "", 316.0, 100.0)
+    # 23 left, 16 right: 277 units for 0.6
+    assert 'd="M207.7 17.0H300.0' in text
+    assert text.count('class="lead"') == 1
+
+
+@pytest.mark.system  # loading cairo asks the system where it is
+def test_a_pdf_has_its_fonts_in_it(local: Path, tmp_path: Path) -> None:
+    pytest.importorskip("cairosvg", reason="the extra egvs[figure] is not installed")
+    made = [draw(local, "seen", site="pole_a", out=tmp_path / name) for name in ("a.pdf", "b.pdf")]
+    content = made[0].read_bytes()
+    assert content == made[1].read_bytes()
+    packed = re.findall(rb"stream\r?\n(.*?)endstream", content, flags=re.DOTALL)
+    parts = [zlib.decompressobj().decompress(part) for part in packed if part[:1] == b"\x78"]
+    whole = b"".join([content, *parts])
+    described = whole.count(b"/Type /FontDescriptor")
+    assert described > 0
+    assert len(re.findall(rb"/FontFile[23]? ", whole)) == described
+    wide, tall = map(float, re.search(rb"/MediaBox \[ 0 0 ([0-9.]+) ([0-9.]+)", whole).groups())
+    assert wide == pytest.approx(85 / 25.4 * 72, abs=0.5)
+    assert 0.3 < tall / wide < 2
+
+
+@pytest.mark.system
+def test_a_png_says_how_large_it_is(local: Path, tmp_path: Path) -> None:
+    pytest.importorskip("cairosvg", reason="the extra egvs[figure] is not installed")
+    with Image.open(draw(local, "map", kind="png", width_mm=60.0, out=tmp_path / "map.png")) as image:
+        assert image.info["dpi"] == pytest.approx((600, 600), abs=0.1)
+        assert image.width / 600 * 25.4 == pytest.approx(60.0, abs=0.1)
+        assert image.convert("RGB").getpixel((2, 2)) == (255, 255, 255)
+        assert len(image.convert("RGB").getcolors(image.width * image.height)) > 50
+
+
+def test_where_it_goes(local: Path, egvs: Call) -> None:
+    code, out, err = egvs("figure", local, "--what", "seen", "--site", "pole_b", "--format", "svg")
+    path = local / "export" / "seen_pole_b.svg"
+    assert (code, out, err) == (0, f"{path}\n", "")
+    path.unlink()
+    path.parent.rmdir()
+
+
+def test_without_the_extra_svg_is_drawn_and_pdf_refused(
+    local: Path, tmp_path: Path, egvs: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(plugins, "find_spec", lambda name: None)
+    code, _, err = egvs("figure", local, "--what", "ranking", "--out", tmp_path / "a.pdf")
+    needs = "egvs: a figure as pdf needs cairosvg, which is not installed: pip install 'egvs[figure]'\n"
+    assert (code, err) == (2, needs)
+    assert egvs("figure", local, "--what", "ranking", "--format", "svg", "--out", tmp_path / "a.svg")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--what", "ruins"), "--what: 'ruins'; one of ranking, map, tpog, seen, missed"),
+        (("--what", "map", "--format", "gif"), "--format: 'gif'; one of pdf, png, svg"),
+        (("--what", "map", "--size", "3mm"), "--size: '3mm'; a width of 50 to 1000 mm, for example 85mm"),
+        (("--what", "map", "--size", "wide"), "--size: 'wide'; a width of 50 to 1000 mm, for example 85mm"),
+        (("--what", "map", "--site", "pole_a"), "--site: with --what map; --what seen or missed"),
+        (("--what", "seen", "--site", "x"), "--site: 'x' is no site of this run; one of pole_"),
+        (("--what", "map", "--out", "a.png"), "--out: 'a.png'; a file that ends in .pdf for --format pdf"),
+    ],
+)
+def test_what_cannot_be_drawn_is_one_message(local: Path, egvs: Call, options: tuple[str, ...], said: str) -> None:
+    before = sorted(local.rglob("*"))
+    code, out, err = egvs("figure", local, *options)
+    assert (code, out) == (2, "")
+    assert said in err
+    assert err.count("\n") == 1
+    assert sorted(local.rglob("*")) == before

@@ -1,0 +1,125 @@
+"""Rasters hold the numbers of the artefacts, at their places; read by Pillow, which knows nothing of maps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from pipeline.artefacts.blindspots import read as read_blindspots
+from pipeline.artefacts.readers import read_scores, read_tpog
+from pipeline.export.exporting import export
+from pipeline.scoring.egvs import binary_entropy
+from tests.export.conftest import OFFSET_M
+from tests.export.readers import utm32
+
+pytest.importorskip("rasterio", reason="the extra egvs[gis] is not installed")
+
+SCALE, TIE, NODATA, KEYS = 33550, 33922, 42113, 34735
+"""TIFF tags of GeoTIFF 1.1: size of a cell, place of the north-western corner, GDAL's no data, the system."""
+
+
+def opened(path: Path) -> tuple[NDArray[np.float64], dict[int, object]]:
+    """Rows from the north, and the tags."""
+    with Image.open(path) as image:
+        return np.array(image, dtype=np.float64), dict(image.tag_v2)
+
+
+def test_the_tpog_from_above_is_that_of_the_artefact(located: Path, tmp_path: Path) -> None:
+    export(located, "geotiff", out=tmp_path)
+    values, tags = opened(tmp_path / "tpog.tif")
+    tpog = read_tpog(located / "tpog.parquet")
+    assert float(tags[NODATA]) == -9999
+    assert tags[SCALE][:2] == (0.5, 0.5)
+    assert tags[TIE][3:5] == pytest.approx((0 - OFFSET_M[0], 10 - OFFSET_M[1]), abs=0.01)  # x 0 to 40, y -10 to 10
+    assert 25832 in tags[KEYS]
+    for ix, iy in np.ndindex(*tpog.grid.shape[:2]):
+        column = tpog.counts[ix, iy]
+        expected = column.sum() / 40 if column.any() else -9999
+        assert values[39 - iy, ix] == pytest.approx(expected, rel=1e-6)
+
+
+def test_seen_and_missed_add_up_to_the_entropy_and_to_the_score_s_share(located: Path, tmp_path: Path) -> None:
+    name = "pole_a"
+    export(located, "geotiff", out=tmp_path, sites=[name])
+    (seen, _), (missed, _) = (opened(tmp_path / f"{word}_{name}.tif") for word in ("seen", "missed"))
+    tpog = read_tpog(located / "tpog.parquet")
+    whole = np.array([[sum(binary_entropy(int(c), 40) for c in column) for column in row] for row in tpog.counts])
+    known = np.flipud(whole.T) > 0
+    assert ((seen == -9999) == ~known).all()
+    assert (seen + missed)[known] == pytest.approx(np.flipud(whole.T)[known], rel=1e-5)
+    share = next(
+        row["entropy_seen"] for row in read_scores(located / "scores.parquet").to_pylist() if row["site"] == name
+    )
+    assert seen[known].sum() / whole.sum() == pytest.approx(share, rel=1e-5)
+    assert 0 < share < 1
+
+
+def test_vehicles_missed_are_those_of_the_blind_spots(located: Path, tmp_path: Path) -> None:
+    export(located, "geotiff", out=tmp_path, sites=["pole_a"])
+    values, tags = opened(tmp_path / "vehicles_missed_pole_a.tif")
+    its = next(read_blindspots(located / "blindspots.parquet", {"pole_a"}))
+    expected = np.flipud(np.nan_to_num(its.share_missed, nan=-9999).T)
+    assert values == pytest.approx(expected, rel=1e-6)
+    assert tags[SCALE][0] == its.cell_m
+
+
+def test_the_picture_has_a_colour_table_and_no_data_is_0(located: Path, tmp_path: Path) -> None:
+    export(located, "geotiff", out=tmp_path)
+    values, _ = opened(tmp_path / "tpog.tif")
+    with Image.open(tmp_path / "tpog_colours.tif") as image:
+        steps, palette, tags = np.array(image), image.getpalette(), dict(image.tag_v2)
+        assert image.mode == "P"
+    assert float(tags[NODATA]) == 0
+    assert ((steps == 0) == (values == -9999)).all()
+    assert steps.max() == 254
+    assert values[values != -9999] == pytest.approx(
+        (steps[steps > 0] - 1.0) * values.max() / 253, abs=values.max() / 500
+    )
+    assert palette[3:6] == [0xFD, 0xE7, 0x25]  # the least is light, the most dark: viridis
+    assert palette[254 * 3 :][:3] == [0x44, 0x01, 0x54]
+
+
+def test_its_style_spans_the_values(located: Path, tmp_path: Path) -> None:
+    export(located, "geotiff", out=tmp_path)
+    values, _ = opened(tmp_path / "tpog.tif")
+    items = list(ET.parse(tmp_path / "tpog.qml").getroot().iter("item"))
+    assert float(items[-1].get("value")) == pytest.approx(values.max(), rel=1e-6)
+    assert (items[0].get("color"), items[-1].get("color")) == ("#fde725", "#440154")
+
+
+def test_in_degrees_each_cell_has_the_value_of_its_place(located: Path, tmp_path: Path) -> None:
+    """The middle of each cell, brought into the world frame by the projection's formulas, lies in the column of voxels
+    whose value it has."""
+    export(located, "geotiff", crs="wgs84", out=tmp_path)
+    values, tags = opened(tmp_path / "tpog.tif")
+    tpog = read_tpog(located / "tpog.parquet")
+    west, north = tags[TIE][3:5]
+    wide, tall = tags[SCALE][:2]
+    assert 4326 in tags[KEYS]
+    rows, columns = values.shape
+    checked = 0
+    for row, column in np.ndindex(rows, columns):
+        easting, northing = utm32(west + (column + 0.5) * wide, north - (row + 0.5) * tall)
+        place = (easting + OFFSET_M[0]) / 0.5, (northing + OFFSET_M[1] + 10) / 0.5
+        if min(abs(at - round(at)) for at in place) < 0.01:  # on the edge of two voxels
+            continue
+        ix, iy = (int(np.floor(at)) for at in place)
+        inside = 0 <= ix < 80 and 0 <= iy < 40
+        has = inside and tpog.counts[ix, iy].any()
+        expected = tpog.counts[ix, iy].sum() / 40 if has else -9999
+        assert values[row, column] == pytest.approx(expected, rel=1e-6)
+        checked += has
+    assert checked > 300
+
+
+def test_the_same_bytes_twice(located: Path, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        export(located, "geotiff", out=tmp_path / name)
+    files = sorted(path.name for path in (tmp_path / "a").iterdir())
+    assert len(files) == 12
+    assert all((tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes() for name in files)
