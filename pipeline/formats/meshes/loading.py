@@ -31,6 +31,7 @@ _ELEMENT = re.compile(rb"(?m)^element[ \t]+(\S+)[ \t]+(\d+)[ \t\r]*$")
 _WRONG_IN_OBJ = (
     (re.compile(rb"(?m)^[ \t]*[-+.0-9][^\n]*"), "is of no kind of line"),
     (re.compile(rb"(?m)^v(?:[ \t]+[^ \t\r\n]+){0,2}[ \t\r]*$"), "has fewer than three coordinates"),
+    (re.compile(rb"(?m)^f(?:[ \t]+[^ \t\r\n]+){0,2}[ \t\r]*$"), "is a face of fewer than three corners"),
     (re.compile(rb"(?m)^f[ \t](?:[^\n]*[ \t])?0+(?=[ \t\r\n/]|\Z)"), "names vertex 0, and the first is 1"),
 )
 _HALF_UNDERSTOOD = ("failed to populate", "didn't decode")
@@ -85,7 +86,7 @@ def _check_size(path: Path, place: str, kind: str) -> None:
 
 def _check_obj(data: bytes, place: str) -> None:
     """InputError where an OBJ has a line that no reader should guess at: numbers of nothing, a vertex without three
-    coordinates, a face that names vertex 0, where counting starts at 1."""
+    coordinates, a face of fewer corners or one that names vertex 0, where counting starts at 1."""
     joined = data.replace(b"\\\n", b"  ").replace(b"\\\r\n", b"   ")  # lines that go on
     for wrong, what in _WRONG_IN_OBJ:
         if (found := wrong.search(joined)) is not None:
