@@ -10,13 +10,15 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
+
+import numpy as np
 
 from pipeline.artefacts import schemas
 from pipeline.core import code_digest, files, parallel
@@ -32,10 +34,10 @@ from pipeline.sensing.sites import Site
 from pipeline.stages.shared.scene import sensor_digests
 from pipeline.validation.clouds import bodies
 from pipeline.validation.clouds.point_clouds import CloudMaker, random_of
-from pipeline.validation.detectors.base import Detector
+from pipeline.validation.detectors.base import Detector, SiteDetector
 from pipeline.validation.metrics.matching import within
 from pipeline.validation.site_findings import POINTS, Found, FoundBoxes, FoundPoints
-from pipeline.validation.sweeps import Detections
+from pipeline.validation.sweeps import Detections, Sweep
 from pipeline.validation.unseen_record import UnseenRecord
 
 
@@ -47,6 +49,9 @@ class Place(Protocol):
         """Among the places that are looked from at once."""
         raise NotImplementedError
 
+
+Finder = Callable[[Sequence[Sweep]], Detections]
+"""Finds vehicles in the sweeps of one instant."""
 
 PlaceT = TypeVar("PlaceT", bound=Place)
 PlaceT_contra = TypeVar("PlaceT_contra", bound=Place, contravariant=True)
@@ -84,9 +89,12 @@ class LookListener:
         """A site is done, for these detectors."""
 
 
+DetectorT = TypeVar("DetectorT", bound=Detector)
+
+
 @dataclass(frozen=True)
-class Look:
-    """A record seen from its sites by some detectors.
+class RecordLook(Generic[DetectorT]):
+    """A record seen by some detectors: what looking from one site and from several has in common.
 
     Attributes
     ----------
@@ -95,7 +103,7 @@ class Look:
     """
 
     record: UnseenRecord
-    detectors: dict[str, Detector]
+    detectors: Mapping[str, DetectorT]
 
     @property
     def names(self) -> list[str]:
@@ -107,19 +115,46 @@ class Look:
         """Scans of all beams."""
         return Scanner(self.record.scene, whole=True)
 
+    def makers(self, sites: Sequence[Site]) -> list[CloudMaker]:
+        """What makes the sweeps of some sites."""
+        scene = self.record.scene
+        shapes = bodies.of_scenario(scene.scenario)
+        return [CloudMaker.of_site(scene, site, self.scanner, shapes) for site in sites]
+
+    def found(
+        self, makers: Sequence[CloudMaker], finders: Mapping[str, Finder], *, with_points: bool
+    ) -> dict[str, Found]:
+        """What is found in the sweeps of all frames, by name.
+
+        Parameters
+        ----------
+        finders
+            By name; each is given the sweeps of one instant, in the order of the makers.
+        with_points
+            Whether the points on vehicles are counted too, those of all makers together.
+        """
+        roi, seed = self.record.scene.roi, self.record.scenario.seed
+        points, boxes = [], {name: list[Detections]() for name in finders}
+        for frame in self.record.read():
+            swept = [maker.sweep(frame, random_of(seed, maker.view.site, frame.number)) for maker in makers]
+            on = np.array([its.points_on(len(frame.boxes)) for its in swept])
+            points.append(on[:, frame.wanted(roi)].sum(axis=0))
+            sweeps = [its.sweep for its in swept]
+            for name, finder in finders.items():
+                boxes[name].append(within(finder(sweeps), roi))
+        found: dict[str, Found] = {name: FoundBoxes(tuple(its)) for name, its in boxes.items()}
+        return found | ({POINTS: FoundPoints(tuple(points))} if with_points else {})
+
+
+@dataclass(frozen=True)
+class Look(RecordLook[Detector]):
+    """A record seen from its sites by some detectors."""
+
     def at(self, site: Site, names: Sequence[str]) -> dict[str, Found]:
         """What some of the detectors find from a site."""
-        maker = CloudMaker.of_site(self.record.scene, site, self.scanner)
-        roi, seed = self.record.scene.roi, self.record.scenario.seed
-        ready = {name: self.detectors[name].at(maker.view, roi) for name in names if name != POINTS}
-        points, boxes = [], {name: list[Detections]() for name in ready}
-        for frame in self.record.read():
-            swept = maker.sweep(frame, random_of(seed, site.name, frame.number))
-            points.append(swept.points_on(len(frame.boxes))[frame.wanted(roi)])
-            for name, detector in ready.items():
-                boxes[name].append(within(detector.detect(swept.sweep), roi))
-        found: dict[str, Found] = {name: FoundBoxes(tuple(its)) for name, its in boxes.items()}
-        return found | ({POINTS: FoundPoints(tuple(points))} if POINTS in names else {})
+        (maker,) = self.makers([site])
+        ready = {n: self.detectors[n].at(maker.view, self.record.scene.roi) for n in names if n != POINTS}
+        return self.found([maker], {n: _of_one(its) for n, its in ready.items()}, with_points=POINTS in names)
 
     def key(self, site: Site, name: str) -> str:
         """Hash of everything that a detector's findings from a site depend on."""
@@ -141,6 +176,10 @@ class Look:
             "schema": schemas.VERSION,
         }
         return files.hash_of(about)
+
+
+def _of_one(detector: SiteDetector) -> Finder:
+    return lambda sweeps: detector.detect(sweeps[0])
 
 
 _KIND = {FoundPoints: "points", FoundBoxes: "detections"}
