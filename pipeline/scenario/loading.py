@@ -19,7 +19,7 @@ from pipeline.core.grid import Grid
 from pipeline.core.reading import documents
 from pipeline.scenario.messages import explain
 from pipeline.scenario.models import FILE, SITE_DIRECTIONS, SITE_SOURCES, Scenario
-from pipeline.scenario.traffic import SOURCES, idle_beside
+from pipeline.scenario.traffic import SOURCES, TrafficModel, idle_beside
 
 
 def load(path: str | Path, overrides: Iterable[str] = ()) -> Scenario:
@@ -46,10 +46,15 @@ def load(path: str | Path, overrides: Iterable[str] = ()) -> Scenario:
             raise InputError(f"--set {override}", found, "extends = ... in a scenario.toml")
         values = _lay_over(values, override)
     scenario = from_values(values, file.parent, str(file))
-    for table, source, idle in scenario.traffic.idle_keys():
+    check_acting(scenario.traffic, file)
+    return scenario
+
+
+def check_acting(traffic: TrafficModel, file: Path) -> None:
+    """InputError where a file sets a key of its traffic that would act on nothing."""
+    for table, source, idle in traffic.idle_keys():
         found = f"{', '.join(sorted(idle))} would act on nothing beside {source}"
         raise InputError(f"{file}: {table}", found, "remove it")
-    return scenario
 
 
 def _read(file: Path, heirs: tuple[Path, ...]) -> dict[str, Any]:
@@ -109,7 +114,7 @@ def _bases(folder: Path, extends: str, place: str) -> Iterator[Path]:
 
 def from_values(values: dict[str, Any], folder: Path, place: str) -> Scenario:
     """Check a scenario that is at hand as nested values (as ``run.json`` holds it)."""
-    values.setdefault("name", re.sub(r'[\s\x00-\x1f\x7f/\\:*?"<>|]+', "_", folder.resolve().name)[:80] or "scenario")
+    values.setdefault("name", default_name(folder) or "scenario")
     try:
         scenario = Scenario.of(values)
     except ValidationError as error:
@@ -117,6 +122,11 @@ def from_values(values: dict[str, Any], folder: Path, place: str) -> Scenario:
     scenario._folders = tuple(_bases(folder, scenario.extends, place))
     Grid.over(scenario.roi.box, scenario.roi.voxel_m, f"{place}: roi")
     return scenario
+
+
+def default_name(folder: Path) -> str:
+    """The name that a folder stands for."""
+    return re.sub(r'[\s\x00-\x1f\x7f/\\:*?"<>|]+', "_", folder.resolve().name)[:80]
 
 
 def json_schema() -> str:

@@ -19,9 +19,9 @@ _ALTERNATIVE = re.compile(r"\.(?:(?:constrained-)?(?:float|int|str)|(?:literal|t
 _SHOULD = "input should be "
 
 
-def explain(error: ValidationError, place: str) -> InputError:
-    """One line for each thing that is wrong: key, value, what would be right."""
-    lines = list(_joined(_lines(error, Scenario, ())))
+def explain(error: ValidationError, place: str, model: type[BaseModel] = Scenario) -> InputError:
+    """One line for each thing that is wrong with a ``model``: key, value, what would be right."""
+    lines = list(_joined(_lines(error, model, ())))
     key, found, right = lines[0]
     more = "".join(f"\n{place}: {k}: {f}" + (f"; {r}" if r else "") for k, f, r in lines[1:])
     return InputError(f"{place}: {key}", found, right + more)
