@@ -42,7 +42,7 @@ _ADDRESSES = 6 << 30
 
 _MOST_WRITTEN = 1 << 30
 _LONGEST_MESSAGE = 4000
-_ROW = re.compile(r"site '?pole_|site '?c\d")
+_ROW = re.compile(r"\bsite '?[^\s:']+'?(?: and \d+ more)?:")
 """A message may name a row, a site, in place of the file that it stands in."""
 
 _SCORES = ("egvs", "egvs_limit", "rank", "entropy_seen")
