@@ -52,8 +52,8 @@ class FinishedRun:
             raise InputError(folder, "no such folder", "the folder of a run, which egvs run makes")
         record = RunRecord.read(folder)
         if missing := [name for name in _READ if name not in record.stages]:
-            found = f"the stage {missing[0]} is not done"
-            raise InputError(folder / RECORD, found, "a finished run; call egvs run first")
+            found = f"the stage {missing[0]} is not done, or another version of this program did it"
+            raise InputError(folder / RECORD, found, "a finished run; egvs run finishes it")
         source = Path(os.path.normpath(folder / record.scenario_folder))
         if not source.is_dir():
             found = f"the scenario's folder {source} is not there"
@@ -74,9 +74,11 @@ class FinishedRun:
             now = None if self.frame is None else self.frame.to_degrees(xy_m)
             if now is not None and np.allclose(then, now, rtol=0.0, atol=_SAME_DEG):
                 return
+            found = "its sites lie elsewhere on the Earth than the scenario, or its network, says by now"
         elif self.frame is None:
             return
-        found = "its sites lie elsewhere on the Earth than the scenario, or its network, says by now"
+        else:  # a run of an older version, or of before the scenario said it
+            found = "its sites have no longitude and latitude, and the scenario, or its network, has a place by now"
         raise InputError(path, found, "egvs run makes it anew")
 
     def artefact(self, name: str) -> Path:

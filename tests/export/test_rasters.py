@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -19,8 +20,9 @@ from tests.export.readers import utm32
 
 pytest.importorskip("rasterio", reason="the extra egvs[gis] is not installed")
 
-SCALE, TIE, NODATA, KEYS = 33550, 33922, 42113, 34735
-"""TIFF tags of GeoTIFF 1.1: size of a cell, place of the north-western corner, GDAL's no data, the system."""
+SCALE, TIE, NODATA, KEYS, WORDS, SCALED = 33550, 33922, 42113, 34735, 270, 42112
+"""TIFF tags of GeoTIFF 1.1: size of a cell, place of the north-western corner, GDAL's no data, the system; a
+description; GDAL's own, where it keeps a scale and an offset."""
 
 
 def opened(path: Path) -> tuple[NDArray[np.float64], dict[int, object]]:
@@ -74,12 +76,16 @@ def test_the_picture_has_a_colour_table_and_no_data_is_0(located: Path, tmp_path
     with Image.open(tmp_path / "tpog_colours.tif") as image:
         steps, palette, tags = np.array(image), image.getpalette(), dict(image.tag_v2)
         assert image.mode == "P"
+        assert SCALED not in tags  # QGIS looks for scaled values in the colour table, and shows nothing
     assert float(tags[NODATA]) == 0
     assert ((steps == 0) == (values == -9999)).all()
     assert steps.max() == 254
-    assert values[values != -9999] == pytest.approx(
-        (steps[steps > 0] - 1.0) * values.max() / 253, abs=values.max() / 500
+    told = re.fullmatch(
+        r"Occupied voxels in the column on average \(voxel\): \(step - 1\) \* ([0-9.e-]+), steps of 1 to 254;"
+        " 0 where there is no data",
+        str(tags[WORDS]),
     )
+    assert values[values != -9999] == pytest.approx((steps[steps > 0] - 1.0) * float(told[1]), abs=values.max() / 500)
     assert palette[3:6] == [0xFD, 0xE7, 0x25]  # the least is light, the most dark: viridis
     assert palette[254 * 3 :][:3] == [0x44, 0x01, 0x54]
 

@@ -14,8 +14,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from pipeline.artefacts.readers import read_scores
-from pipeline.core import plugins
+from pipeline.core import files, plugins
 from pipeline.core.grid import Roi
+from pipeline.core.reading.seals import sealed
 from pipeline.export.exporting import FORMATS, export
 from pipeline.formats.crs import WorldFrame
 from pipeline.formats.georeference import Georeference
@@ -94,6 +95,8 @@ def test_symbols_of_rules_are_there(located: Path, tmp_path: Path) -> None:
     with sqlite3.connect(tmp_path / "run.gpkg") as file:
         styles = [ET.fromstring(text) for (text,) in file.execute("SELECT styleQML FROM layer_styles")]
     for style in styles:
+        labels = style.get("labelsEnabled")
+        assert (labels == "1") == (style.find("labeling") is not None)
         symbols = {symbol.get("name"): symbol for symbol in style.iter("symbol")}
         assert [rule.get("symbol") for rule in style.iter("rule")] == list(symbols)
         assert all(symbol.find("layer/Option/Option") is not None for symbol in symbols.values())
@@ -259,6 +262,31 @@ def test_a_run_that_is_not_there_or_not_done(tmp_path: Path, egvs: Call) -> None
     assert (code, err) == (2, f"egvs: {tmp_path / 'none'}: no such folder; the folder of a run, which egvs run makes\n")
     code, _, err = egvs("export", tmp_path, "--to", "csv")
     assert (code, err) == (2, f"egvs: {tmp_path / 'run.json'}: no such file; a folder that egvs run has written\n")
+
+
+def test_a_run_that_is_not_finished_or_of_another_version(local: Path, tmp_path: Path, egvs: Call) -> None:
+    """Without its seal a record is of another version."""
+    shutil.copytree(local.parent, tmp_path / "copy")
+    path = tmp_path / "copy" / "run" / "run.json"
+    record = json.loads(path.read_text())
+    for kept, first in ((("check", "statics", "scan", "traffic", "tpog"), "score"), (None, "statics")):
+        stages = {name: its for name, its in record["stages"].items() if kept is None or name in kept}
+        value = {name: its for name, its in record.items() if name != "own_sha256"} | {"stages": stages}
+        path.write_text(files.json_text(value if kept is None else sealed(value)))
+        code, _, err = egvs("export", path.parent, "--to", "csv", "--out", tmp_path / "out")
+        found = f"the stage {first} is not done, or another version of this program did it"
+        assert (code, err) == (2, f"egvs: {path}: {found}; a finished run; egvs run finishes it\n")
+        assert not (tmp_path / "out").exists()
+
+
+def test_a_run_from_before_the_scenario_had_a_place(
+    local: Path, tmp_path: Path, egvs: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    placed = Georeference(WorldFrame(f"EPSG:{EPSG}", OFFSET_M), Roi.around((0, 0, 0), (1, 1, 1)), "")
+    monkeypatch.setattr(world_frame, "of", lambda scenario: placed)
+    code, _, err = egvs("export", local, "--to", "csv", "--out", tmp_path / "out")
+    found = "its sites have no longitude and latitude, and the scenario, or its network, has a place by now"
+    assert (code, err) == (2, f"egvs: {local / 'scores.parquet'}: {found}; egvs run makes it anew\n")
 
 
 def test_a_scenario_that_lies_elsewhere_by_now_is_refused(

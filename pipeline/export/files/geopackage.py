@@ -3,7 +3,7 @@
 GDAL (pyogrio) writes the layers; the styles are rows of the table ``layer_styles``, where QGIS looks for them. The
 bytes depend on no clock.
 
-https://www.geopackage.org/spec140/
+https://www.geopackage.org/spec120/
 """
 
 from __future__ import annotations
@@ -21,6 +21,9 @@ from pipeline.export.reference import Reference
 
 _EPOCH = "2000-01-01T00:00:00.000Z"
 """When everything is said to have been written."""
+
+_VERSION = "1.2"
+"""Programs that are some years old open this one without a warning; nothing of a later one is used."""
 
 _GEOMETRY, _NUMBER = "geom", "fid"
 _KINDS = {FOOTPRINTS: "MultiPolygon", REGION: "Polygon", MISSED_LANES: "LineString"}
@@ -47,6 +50,7 @@ def write(path: Path, layers: Sequence[Layer], reference: Reference) -> None:
             pyogrio.write_arrow(
                 table, path, layer=layer.name, driver="GPKG", geometry_name=_GEOMETRY,
                 geometry_type=_KINDS.get(layer.name, "Point"), crs=reference.crs, append=number > 0,
+                dataset_options=None if number else {"VERSION": _VERSION},
                 layer_options={"FID": _NUMBER, "GEOMETRY_NAME": _GEOMETRY, "IDENTIFIER": layer.name},
             )  # fmt: skip
     with closing(sqlite3.connect(path)) as database, database:

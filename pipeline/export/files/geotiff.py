@@ -2,8 +2,9 @@
 
 - ``NAME.tif`` holds the values, float32, with :data:`NODATA` where there are none, and ``NAME.qml`` the colours in
   which QGIS shows them.
-- ``NAME_colours.tif`` holds the same in 255 steps with a colour table, for programs that show it as it is; 0 is where
-  there is no data, and its scale and offset say what value a step stands for.
+- ``NAME_colours.tif`` holds the same in 254 steps with a colour table, for programs that show it as it is; 0 is where
+  there is no data, and its description says what value a step stands for. Scale and offset are not set: QGIS would look
+  for scaled values in the colour table, and show nothing.
 
 In degrees a raster is sampled anew, each cell from the nearest: values stay values.
 """
@@ -90,9 +91,9 @@ def write(folder: Path, raster: Raster, reference: Reference, name: str) -> Iter
     """Write a raster's files into a folder, ``name`` in front of their ends; their paths."""
     its = placed(raster, reference)
     known = np.isfinite(its.values)
-    tags = {"TIFFTAG_IMAGEDESCRIPTION": f"{raster.words} ({raster.unit})", "AREA_OR_POINT": "Area"}
+    words = f"{raster.words} ({raster.unit})"
     values = np.where(known, its.values, NODATA).astype(np.float32)
-    yield _write(folder / f"{name}.tif", values, NODATA, its, reference, tags)
+    yield _write(folder / f"{name}.tif", values, NODATA, its, reference, words)
     style = folder / f"{name}.qml"
     stops = [(raster.peak * step / colours.STEPS, code) for step, code in enumerate(colours.ON_LIGHT)]
     text = raster_qml(0.0, raster.peak, [(value, code, f"{value:.4g}") for value, code in stops])
@@ -100,8 +101,8 @@ def write(folder: Path, raster: Raster, reference: Reference, name: str) -> Iter
     yield style
     share = np.clip(np.nan_to_num(its.values) / raster.peak, 0.0, 1.0)
     steps = np.where(known, 1 + np.round(share * (_STEPS - 1)), 0).astype(np.uint8)
-    scale = raster.peak / (_STEPS - 1)
-    yield _write(folder / f"{name}_colours.tif", steps, 0, its, reference, tags, _colour_table(), scale=(scale, -scale))
+    words += f": (step - 1) * {raster.peak / (_STEPS - 1):.9g}, steps of 1 to {_STEPS}; 0 where there is no data"
+    yield _write(folder / f"{name}_colours.tif", steps, 0, its, reference, words, _colour_table())
 
 
 def _colour_table() -> dict[int, tuple[int, int, int, int]]:
@@ -119,9 +120,8 @@ def _write(
     nodata: float,
     its: Placed,
     reference: Reference,
-    tags: Mapping[str, str],
+    words: str,
     colour_table: Mapping[int, tuple[int, int, int, int]] | None = None,
-    scale: tuple[float, float] | None = None,
 ) -> Path:
     import rasterio
     from rasterio.crs import CRS
@@ -133,10 +133,8 @@ def _write(
         path, "w", driver="GTiff", width=columns, height=rows, count=1, dtype=values.dtype.name, nodata=nodata,
         crs=CRS.from_user_input(reference.crs), transform=transform, **_TILE,
     ) as file:  # fmt: skip
-        file.update_tags(**tags)
+        file.update_tags(TIFFTAG_IMAGEDESCRIPTION=words, AREA_OR_POINT="Area")
         if colour_table is not None:  # before the values: what comes later does not get into the file's head
             file.write_colormap(1, dict(colour_table))
-        if scale is not None:
-            file.scales, file.offsets = (scale[0],), (scale[1],)
         file.write(values, 1)
     return path

@@ -13,7 +13,8 @@ from xml.etree import ElementTree as ET
 from pipeline.export.colouring import OTHER, PLAIN, Shade, shades
 from pipeline.export.layers import FOOTPRINTS, MISSED_LANES, PLAN, REGION, SITES, Layer
 
-_LABELS = {SITES: "site", PLAN: "site"}
+_LABELS = {SITES: ("site", "TR,TL,R,L,T"), PLAN: ("order", "BR,BL,B")}
+"""The column that a thing is labelled with, and where, the best place first: a plan's sensor hangs where a site is."""
 _INK, _PAPER = "29,36,48,255", "255,255,255,255"
 
 
@@ -23,8 +24,9 @@ def qml(layer: Layer) -> str:
         "qgis", version="3.22", styleCategories="Symbology|Labeling", labelsEnabled=str(int(layer.name in _LABELS))
     )
     renderer = ET.SubElement(
-        root, "renderer-v2", type="RuleRenderer", symbollevels="0", forceraster="0", enableorderby="0"
-    )
+        root, "renderer-v2", type="RuleRenderer", symbollevels="0", forceraster="0",
+        enableorderby=str(int(layer.name == SITES)),
+    )  # fmt: skip
     rules = ET.SubElement(renderer, "rules", key="root")
     symbols = ET.SubElement(renderer, "symbols")
     entries = [(_filter(layer, shade), _label(shade), shade.colour) for shade in shades(layer)]
@@ -35,8 +37,11 @@ def qml(layer: Layer) -> str:
         if wanted:
             rule.set("filter", wanted)
         _symbol(symbols, str(number), layer, colour)
+    if layer.name == SITES:  # of those at one place the best is seen
+        order = ET.SubElement(ET.SubElement(renderer, "orderby"), "orderByClause", asc="0", nullsFirst="0")
+        order.text = '"rank"'
     if layer.name in _LABELS:
-        _labelling(root, _LABELS[layer.name])
+        _labelling(root, *_LABELS[layer.name])
     ET.indent(root)
     return ET.tostring(root, encoding="unicode") + "\n"
 
@@ -102,8 +107,9 @@ def _symbol(symbols: ET.Element, name: str, layer: Layer, colour: str) -> None:
         ET.SubElement(table, "Option", name=key, type="QString", value=value)
 
 
-def _labelling(root: ET.Element, column: str) -> None:
+def _labelling(root: ET.Element, column: str, places: str) -> None:
     settings = ET.SubElement(ET.SubElement(root, "labeling", type="simple"), "settings", calloutType="simple")
     text = ET.SubElement(settings, "text-style", fieldName=column, isExpression="0", fontSize="9", textColor=_INK)
     ET.SubElement(text, "text-buffer", bufferDraw="1", bufferSize="0.8", bufferSizeUnits="MM", bufferColor=_PAPER)
-    ET.SubElement(settings, "placement", placement="6", dist="1")
+    ET.SubElement(settings, "placement", placement="6", predefinedPositionOrder=places, offsetType="1", dist="0.2")
+    ET.SubElement(settings, "rendering", obstacle="0")  # else sites at one place hide the label of each other
