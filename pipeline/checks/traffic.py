@@ -16,7 +16,7 @@ from pipeline.scenario.models import Scenario
 from pipeline.traffic import fcd, network, sumo, sumo_folder
 from pipeline.traffic.demand import counts as demand
 from pipeline.traffic.demand import given, trips
-from pipeline.traffic.finished import sizes, survey
+from pipeline.traffic.finished import sizes, stated, survey
 from pipeline.traffic.guarded import copies
 from pipeline.world import world_frame
 
@@ -118,7 +118,9 @@ def recorded_places(subject: Subject) -> Iterator[Finding]:
 
 
 def _check_place(scenario: Scenario, name: str) -> None:
-    fcd.check_place(scenario.find(name, "traffic.fcd"), world_frame.of(scenario))
+    path = scenario.find(name, "traffic.fcd")
+    if stated.read(path) is None:
+        fcd.check_place(path, world_frame.of(scenario))
 
 
 @_of_each_period
@@ -128,8 +130,8 @@ def finished(subject: Subject) -> Iterator[Finding]:
     if scenario.traffic.fcd is None:
         return
     if (taken := refusals.unless_refused("traffic", lambda: survey.window(scenario))) is not None:
-        types = taken[1].types
-        refusals.unless_refused("traffic", lambda: sizes.check_types(scenario, types))
+        held = taken[1]
+        refusals.unless_refused("traffic", lambda: sizes.check_types(scenario, held.types, held.sizes))
     yield from refusals.found
 
 

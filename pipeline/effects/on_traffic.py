@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from pipeline.effects import registry
 from pipeline.effects.base import Traffic
 from pipeline.scenario.models import Scenario
 from pipeline.traffic import sumo_folder
+from pipeline.traffic.boxes import Size
 from pipeline.world.ground import GroundSource
 
 SELF_ACTING: dict[str, Callable[[Scenario], bool]] = {"slope": sumo_folder.may_have_heights}
@@ -29,6 +30,11 @@ def live(scenario: Scenario) -> tuple[tuple[Traffic[Any], ...], tuple[str, ...]]
         else:
             notes.append(f"{effect.NAME}: off, {reason}")
     return tuple(effects), tuple(notes)
+
+
+def followed_types(scenario: Scenario, sizes: Mapping[str, Size]) -> frozenset[str]:
+    """Types whose vehicles the scenario's effects must have all along their way."""
+    return frozenset[str]().union(*(effect.followed_types(scenario, sizes) for effect in _asked(scenario)))
 
 
 def ground(scenario: Scenario) -> GroundSource | None:

@@ -251,6 +251,7 @@ class Scenario(StrictModel):
 
     _folders: tuple[Path, ...] = PrivateAttr(default=(Path(),))
     _period: str = PrivateAttr(default="")
+    _file_name: str = PrivateAttr(default=FILE)
 
     @model_validator(mode="after")
     def _across(self) -> Scenario:
@@ -312,7 +313,7 @@ class Scenario(StrictModel):
     @property
     def file(self) -> Path:
         """The scenario file, for messages."""
-        return self.folder / FILE
+        return self.folder / self._file_name
 
     def with_effects(self, effects: EffectsModel) -> Scenario:
         """The same scenario with these effects instead of its own; gamma stays the number that it is."""

@@ -73,6 +73,10 @@ class TrafficExtension(Protocol):
         """Which of SUMO's types are no vehicles of the scenario."""
         return frozenset()
 
+    def followed_types(self, scenario: Scenario, sizes: Mapping[str, Size]) -> frozenset[str]:
+        """Types whose vehicles must be recorded all along their way, since a box depends on those before it."""
+        return frozenset()
+
     def plan(
         self, scenario: Scenario, roads: Network, begin_s: float, end_s: float, rng: np.random.Generator
     ) -> TrafficPlan:

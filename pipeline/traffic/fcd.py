@@ -148,6 +148,22 @@ def _seekable(path: Path) -> Iterator[Any]:
         yield path
 
 
+def stated(path: Path) -> bytes | None:
+    """What a Parquet file says of itself under the key ``egvs``; None of other files, and where it says nothing."""
+    import pyarrow.parquet as pq
+
+    with safe_xml.opened(path) as file:
+        if not file.read(4).startswith(b"PAR1"):
+            return None
+    with (
+        refusing.reading(path, _WHOLE, "cannot be read as Parquet"),
+        _seekable(path) as source,
+        pq.ParquetFile(source) as parquet,
+    ):
+        found: bytes | None = (parquet.metadata.metadata or {}).get(b"egvs")
+        return found
+
+
 def _check_rows(about: Any, path: Path) -> None:
     """InputError where a Parquet file says that it holds more than it can."""
     groups = [about.row_group(number) for number in range(about.num_row_groups)]

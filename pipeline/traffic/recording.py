@@ -129,8 +129,8 @@ def _finished(scenario: Scenario, world: Georeference) -> Iterator[Recording]:
     name, place = scenario.traffic.fcd, sumo_folder.place_of(scenario)
     assert name is not None
     when, held = survey.window(scenario)
-    path, sizes = scenario.find(name, "traffic.fcd"), finished_sizes.of_types(scenario, held.types)
-    rows = fcd.located(fcd.read(path), world, path)
+    path, sizes = scenario.find(name, "traffic.fcd"), finished_sizes.of_types(scenario, held.types, held.sizes)
+    rows = fcd.read(path) if held.stated is not None else fcd.located(fcd.read(path), world, path)
     yield Recording(rows, when, sizes, place, source=f"{place}.fcd = {name!r}")
 
 

@@ -49,7 +49,7 @@ def write(
     tally = TrafficTally(recording.window.count, on_purpose=recording.stopped_on_purpose)
     period_s = recording.window.period_ms / 1000.0
     changes: list[BoxChange] | None = None
-    for group in _groups(recording):
+    for group in groups_of(recording, GROUP_FRAMES):
         uncounted = frozenset[str]().union(*(extension.uncounted_types(recording.sizes) for extension in extensions))
         if changes is None:  # a running SUMO tells sizes with its first rows
             own = {name: size for name, size in recording.sizes.items() if name not in uncounted}
@@ -62,21 +62,21 @@ def write(
             file.write(made.columns(first_frame))
         tally.add(made)
         progress("frames written", group.first_frame + group.frames, tally.frames)
-    _check(scenario, tally, recording)
+    check(scenario, tally, recording)
     return tally, {key: value for change in changes or () for key, value in change.summary().items()}
 
 
-def _groups(recording: Recording) -> Iterator[FrameGroup]:
+def groups_of(recording: Recording, frames_each: int) -> Iterator[FrameGroup]:
     """Groups of whole frames, persons among the vehicles where they are recorded beside."""
-    groups = frames.groups(recording.rows, recording.window, GROUP_FRAMES, recording.place)
+    groups = frames.groups(recording.rows, recording.window, frames_each, recording.place)
     if recording.persons is None:
         return groups
-    persons = frames.groups(recording.persons, recording.window, GROUP_FRAMES, recording.place)
+    persons = frames.groups(recording.persons, recording.window, frames_each, recording.place)
     return (frames.together(some, others) for some, others in zip(groups, persons, strict=True))
 
 
-def _check(scenario: Scenario, tally: TrafficTally, recording: Recording) -> None:
-    """Whether a simulated recording keeps the scenario's promises."""
+def check(scenario: Scenario, tally: TrafficTally, recording: Recording) -> None:
+    """RunError where a recording holds nobody, or a simulated one does not keep the scenario's promises."""
     traffic = scenario.traffic
     if not tally.rows:
         source = traffic.fcd or traffic.sumocfg or ", ".join(traffic.routes) or traffic.network

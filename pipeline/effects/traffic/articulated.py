@@ -44,7 +44,7 @@ from pipeline.scenario.effects import ArticulatedParameters, EffectParameters, V
 from pipeline.scenario.models import Scenario
 from pipeline.sensing.scene import Scene
 from pipeline.traffic.boxes import Size, VehicleBoxes, tidy_m, tidy_rad
-from pipeline.traffic.finished.sizes import kind_sizes
+from pipeline.traffic.finished.sizes import known_sizes
 
 Floats = NDArray[np.float64]
 
@@ -81,8 +81,8 @@ class Articulated(Traffic[ArticulatedParameters]):
         Of a user's own SUMO demand the kinds are not known beforehand.
         """
         own = scenario.traffic.sumocfg is not None or scenario.traffic.routes or scenario.traffic.vtypes
-        if not own and not self.geometries(kind_sizes(scenario.traffic.kinds), self.place(scenario)):
-            longest_m = max(kind.length_m for kind in scenario.traffic.kinds)
+        if not own and not self.geometries(sizes := known_sizes(scenario), self.place(scenario)):
+            longest_m = max(size.length_m for size in sizes.values())
             return False, f"no kind of vehicle has more than one part (the longest is {longest_m:g} m)"
         return True, "named"
 
@@ -96,6 +96,10 @@ class Articulated(Traffic[ArticulatedParameters]):
     def box_change(self, scenario: Scenario, sizes: Mapping[str, Size]) -> Follower:
         """Each box of several parts becomes one box a part."""
         return Follower(self.geometries(sizes, self.place(scenario)))
+
+    def followed_types(self, scenario: Scenario, sizes: Mapping[str, Size]) -> frozenset[str]:
+        """Rear parts follow the way that the front took."""
+        return frozenset(self.geometries(sizes, self.place(scenario)))
 
     def geometries(self, sizes: Mapping[str, Size], place: str) -> dict[str, Geometry]:
         """Kind -> its parts, for kinds of more than one; InputError when one is missing, or shorter than its parts."""

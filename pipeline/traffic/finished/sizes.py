@@ -2,14 +2,14 @@
 
 Steps: read the ``<vType>``\\ s of the user's SUMO files (``traffic.vtypes``); ask SUMO for what they leave to its
 defaults, which follow from the vClass; lay the scenario's own kinds over them; name every type that is still missing.
-Metres.
+What the file itself states (:mod:`pipeline.traffic.finished.stated`) counts where neither says otherwise. Metres.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement, tostring
 
@@ -21,6 +21,7 @@ from pipeline.scenario.models import Scenario
 from pipeline.scenario.traffic import VehicleKind
 from pipeline.traffic import live, sumo, sumo_folder
 from pipeline.traffic.boxes import Size
+from pipeline.traffic.finished import stated
 
 _SIZES = ("length", "width", "height")
 _NUMBER = re.compile(r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
@@ -50,13 +51,20 @@ def kind_sizes(kinds: Collection[VehicleKind]) -> dict[str, Size]:
     return {k.name: Size(k.length_m, k.width_m, k.height_m, k.vclass) for k in kinds}
 
 
-def of_types(scenario: Scenario, types: Collection[str]) -> dict[str, Size]:
-    """The sizes of the vehicles of a finished file, which are of these ``types``.
+def known_sizes(scenario: Scenario) -> dict[str, Size]:
+    """The sizes that need no asking of SUMO: of the scenario's kinds, and those that its finished file states."""
+    traffic = scenario.traffic
+    itself = None if traffic.fcd is None else stated.read(scenario.find(traffic.fcd, "traffic.fcd"))
+    return kind_sizes(traffic.kinds) if itself is None else itself.sizes | kind_sizes(traffic.own_kinds)
+
+
+def of_types(scenario: Scenario, types: Collection[str], own: Mapping[str, Size]) -> dict[str, Size]:
+    """The sizes of the vehicles of a finished file, which are of these ``types``; ``own`` are those that it states.
 
     InputError naming all types without a known size, or what is wrong with a file of vTypes.
     """
-    traffic, vtypes = scenario.traffic, check_types(scenario, types)
-    sizes = kind_sizes(traffic.kinds)
+    traffic, vtypes = scenario.traffic, check_types(scenario, types, own)
+    sizes = kind_sizes(traffic.kinds) | dict(own) | kind_sizes(traffic.own_kinds)
     if vtypes or any(name not in sizes for name in types):
         try:
             sizes |= _asked(vtypes) | kind_sizes(traffic.own_kinds)
@@ -66,14 +74,14 @@ def of_types(scenario: Scenario, types: Collection[str]) -> dict[str, Size]:
     return sizes
 
 
-def check_types(scenario: Scenario, types: Collection[str]) -> list[Element]:
+def check_types(scenario: Scenario, types: Collection[str], own: Mapping[str, Size]) -> list[Element]:
     r"""The ``<vType>``\ s of the scenario's files.
 
-    InputError naming all ``types`` that neither these nor the scenario's kinds give a size, or what is wrong with a
-    file.
+    InputError naming all ``types`` that neither these nor the scenario's kinds give a size, and that are not the
+    file's ``own``; or what is wrong with a file.
     """
     vtypes = list(_vtypes(files(scenario)))
-    known = {kind.name for kind in scenario.traffic.kinds} | {vtype.attrib["id"] for vtype in vtypes}
+    known = {kind.name for kind in scenario.traffic.kinds} | {vtype.attrib["id"] for vtype in vtypes} | set(own)
     if missing := sorted(name for name in set(types) - known if name not in _SUMO_OWN):
         each, have = ("each", "have") if len(missing) > 1 else ("that", "has")
         raise InputError(

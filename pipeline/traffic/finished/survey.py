@@ -1,4 +1,8 @@
-"""Looks a finished file of floating car data through before its rows are taken. Times are whole milliseconds."""
+"""Looks a finished file of floating car data through before its rows are taken. Times are whole milliseconds.
+
+A file that states its frames (:mod:`pipeline.traffic.finished.stated`) need not be looked through: time steps without
+rows are frames without vehicles then.
+"""
 
 from __future__ import annotations
 
@@ -12,18 +16,27 @@ import pyarrow.compute as pc
 from pipeline.core.errors import InputError
 from pipeline.scenario.models import Scenario
 from pipeline.traffic import fcd, sumo_folder
+from pipeline.traffic.boxes import Size
+from pipeline.traffic.finished import stated
+from pipeline.traffic.finished.stated import StatedFcd
 from pipeline.traffic.frames import Window, check_span
 
 
 @dataclass(frozen=True)
 class FcdSurvey:
     """What a finished file holds: the time from its first row to its last, its time steps, and their greatest common
-    divisor; the types of its vehicles."""
+    divisor; the types of its vehicles; what it states itself, if it does."""
 
     lasts_ms: int
     time_steps: int
     step_ms: int
     types: frozenset[str]
+    stated: StatedFcd | None = None
+
+    @property
+    def sizes(self) -> dict[str, Size]:
+        """The sizes that the file itself states."""
+        return {} if self.stated is None else self.stated.sizes
 
 
 def survey(path: Path, until_ms: int | None = None) -> FcdSurvey:
@@ -31,6 +44,9 @@ def survey(path: Path, until_ms: int | None = None) -> FcdSurvey:
 
     InputError as :func:`pipeline.traffic.fcd.read`, and when it holds no vehicle.
     """
+    if (itself := stated.read(path)) is not None:
+        lasts_ms = (itself.frames - 1) * itself.period_ms
+        return FcdSurvey(lasts_ms, itself.frames, itself.period_ms, frozenset(itself.types), itself)
     first_ms, last_ms, types = None, 0, set[str]()
     time_steps, step_ms = 1, 0
     for table in fcd.read(path):
@@ -67,7 +83,10 @@ def window(scenario: Scenario) -> tuple[Window, FcdSurvey]:
     if frames < 1:
         lasts = f"{path.name} lasts {found.lasts_ms / 1000:g} s"
         raise InputError(f"{place}.warmup_s = {traffic.warmup_s:g}", lasts, "a shorter warm-up")
-    wanted = Window(frames, period_ms, skip_ms=skip_ms)
+    if found.stated is None:
+        wanted = Window(frames, period_ms, skip_ms=skip_ms)
+    else:
+        wanted = Window(frames, period_ms, first_ms=skip_ms, skip_ms=skip_ms, complete=True)
     check_span(wanted, found.lasts_ms - skip_ms, found.step_ms, found.time_steps, place, str(traffic.fcd))
     return wanted, found
 

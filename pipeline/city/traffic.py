@@ -1,0 +1,161 @@
+"""Makes a city's traffic: one simulation, cut to every junction while it is read.
+
+Steps of :func:`make`: find the region of each junction; hash all that the files depend on; where the seal beside them
+says the same and no file was altered, nothing is to be done; else record the traffic once, as any scenario's
+(:mod:`pipeline.traffic.recording`), and write all junctions' files (:mod:`pipeline.city.cutting`). Files appear whole,
+the seal last: what was killed is made again. The same city gives the same bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.city import cutting, regions
+from pipeline.city.model import FILE, TABLE, TRAFFIC, City
+from pipeline.city.regions import Region
+from pipeline.core import code_digest, files
+from pipeline.core.errors import InputError
+from pipeline.core.findings import WARNINGS, Finding
+from pipeline.core.progress import Progress, silent
+from pipeline.core.reading import documents
+from pipeline.effects import on_traffic
+from pipeline.runs import stage_keys
+from pipeline.runs.locking import alone
+from pipeline.scenario.loading import from_values
+from pipeline.scenario.models import Scenario
+from pipeline.stages import traffic as stage
+from pipeline.stages.base import Workspace
+from pipeline.traffic import recording, sumo_folder, trajectories
+from pipeline.world import world_frame
+
+SEAL, SUMO = "traffic.json", "sumo"
+"""In the folder of the traffic: what its files were made of, and the folder that opens in sumo-gui."""
+
+_HEIGHT_M = 5.0
+_LEVEL = "boxes keep the slopes that SUMO gives them, and the ground of each junction is level"
+
+
+@dataclass(frozen=True)
+class CityTraffic:
+    """A city's traffic; ``anew`` when it was made now, and what came out: of the whole, and rows of each junction."""
+
+    anew: bool
+    summary: Mapping[str, Any]
+    rows: Mapping[str, int]
+
+    @property
+    def frames(self) -> int:
+        """Frames of every junction."""
+        return int(self.summary["frames"])
+
+
+def make(city: City, progress: Progress = silent) -> CityTraffic:
+    """Make the traffic of a city's junctions, unless it is there.
+
+    Raises
+    ------
+    InputError
+        When the city, a junction's scenario, or a file that they name is wrong.
+    RunError
+        When SUMO fails, N vehicles are not held, a vehicle stands without end, or another process is at work there.
+    """
+    folder = city.folder / TRAFFIC
+    its_regions = regions.of(city)
+    scenario = scenario_of(city, its_regions)
+    with alone(folder):
+        key = _key(scenario, folder, its_regions)
+        if (known := _sealed(city, key)) is not None:
+            return known
+        paths = {junction.id: junction.traffic_file(city) for junction in city.junctions}
+        (folder / SEAL).unlink(missing_ok=True)
+        summary, rows = _record(scenario, folder, its_regions, paths, progress)
+        digests = {name: files.sha256_of(path) for name, path in paths.items()}
+        seal = {"key": key, "files": digests, "rows": rows, "summary": summary}
+        files.write_text(folder / SEAL, files.json_text(seal, indent=1) + "\n")
+    return CityTraffic(True, summary, rows)
+
+
+def scenario_of(city: City, its_regions: Mapping[str, Region]) -> Scenario:
+    """The city's traffic as a scenario, whose region of interest holds all junctions' regions."""
+    if city.traffic.periods:
+        raise InputError(f"{city.file}: traffic.periods", "a city has one period", "a city for each period")
+    low = [min(getattr(region, key) for region in its_regions.values()) for key in ("low_x_m", "low_y_m")]
+    high = [max(getattr(region, key) for region in its_regions.values()) for key in ("high_x_m", "high_y_m")]
+    middle, size = (
+        [(a + b) / 2 for a, b in zip(low, high, strict=True)],
+        [b - a for a, b in zip(low, high, strict=True)],
+    )
+    values = {
+        "name": city.name,
+        "seed": city.seed,
+        "roi": {"center_m": [*middle, _HEIGHT_M / 2], "size_m": [*size, _HEIGHT_M], "voxel_m": _HEIGHT_M},
+        "tpog": {"blocks": 1},
+        "traffic": city.traffic.model_dump(mode="json", exclude_unset=True),
+        "sites": {"file": TABLE},
+    }
+    scenario = from_values(values, city.folder, str(city.file))
+    scenario._file_name = FILE
+    return scenario
+
+
+def _key(scenario: Scenario, folder: Path, its_regions: Mapping[str, Region]) -> str:
+    """A hash of all that the files depend on: the traffic, the regions, the effects that follow ways, the program."""
+    read = stage.inputs(Workspace(scenario, folder))
+    own = {name: region.scenario.effects.model_dump(mode="json") for name, region in its_regions.items()}
+    about = {
+        "inputs": read.to_json(),
+        "regions": {name: region.to_json() for name, region in its_regions.items()},
+        "effects": own,
+        "program": stage_keys.program(stage.NAME, scenario, read.modules),
+        "cutting": code_digest.of(cutting.__name__).digest,
+    }
+    return files.hash_of(about)
+
+
+def _sealed(city: City, key: str) -> CityTraffic | None:
+    """The traffic that is there, where it is this one and whole."""
+    path = city.folder / TRAFFIC / SEAL
+    if not path.is_file():
+        return None
+    match documents.read_json(path):
+        case {"key": str(its), "files": dict(digests), "rows": dict(rows), "summary": dict(summary)} if its == key:
+            pass
+        case _:
+            return None
+    for junction in city.junctions:
+        its_file = junction.traffic_file(city)
+        if not its_file.is_file() or files.sha256_of(its_file) != digests.get(junction.id):
+            return None
+    return CityTraffic(False, summary, rows)
+
+
+def _record(
+    scenario: Scenario, folder: Path, its_regions: Mapping[str, Region], paths: Mapping[str, Path], progress: Progress
+) -> tuple[dict[str, Any], dict[str, int]]:
+    """Record the traffic and write every junction's file; what came out, and the rows of each."""
+    effects, notes = on_traffic.live(scenario)
+    world = world_frame.of(scenario)
+    with recording.record(scenario, folder / SUMO, effects, progress, None, world) as recorded:
+        tally, rows = cutting.write(scenario, recorded, its_regions, paths, effects, progress)
+        done = recorded.summary()
+        doubts = trajectories.doubts(tally, recorded, scenario.roi.box)
+    summary = tally.to_json(recorded.window.period_ms / 1000.0) | ({} if done is None else asdict(done))
+    doubts += [
+        Finding(
+            "relief", sumo_folder.place_of(scenario), f"{effect.NAME} acts on the network, but not at junctions", _LEVEL
+        )
+        for effect in effects
+        if not effect.ADDS_TRAFFIC
+    ]
+    empty = [name for name, count in rows.items() if not count]
+    if empty:
+        found = f"no vehicle comes near {', '.join(empty)} in {tally.frames} frames"
+        cure = "more traffic, or no row for these junctions in junctions.csv"
+        doubts.append(Finding("junctions without traffic", sumo_folder.place_of(scenario), found, cure))
+    summary[WARNINGS] = [*summary.get(WARNINGS, []), *(finding.to_json() for finding in doubts)]
+    if notes:
+        summary["notes"] = [*summary.get("notes", []), *notes]
+    return summary, rows
