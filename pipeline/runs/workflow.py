@@ -54,6 +54,7 @@ def run(
     progress: Progress = silent,
     listener: StageListener = unheard,
     options: dict[str, dict[str, Any]] | None = None,
+    help_from: dict[str, dict[str, Any]] | None = None,
     only: Collection[str] = STAGES,
 ) -> RunRecord:
     """Bring every stage up to date, in order.
@@ -69,6 +70,9 @@ def run(
     options
         Further keyword arguments of single stages, e.g. ``{"score": {"audit": True}}``; such a stage is always run, and
         not kept in the store.
+    help_from
+        Further keyword arguments of single stages that change no byte of what they make, but who makes it; such a stage
+        is skipped, fetched and kept as any.
     only
         These stages alone, which must read nothing of others.
 
@@ -80,7 +84,7 @@ def run(
     folder = Path(out) if out is not None else default_folder(scenario)
     keep_inputs(scenario, folder)
     with alone(folder):
-        run = _Run(Workspace(scenario, folder, jobs=jobs, progress=progress), listener)
+        run = _Run(Workspace(scenario, folder, jobs=jobs, progress=progress), listener, help_from or {})
         record = _record_so_far(scenario, folder)
         for name in (stage for stage in STAGES if stage in only):
             record = run.bring(name, record, **(options or {}).get(name, {}))
@@ -177,6 +181,7 @@ class _Run:
 
     work: Workspace
     listener: StageListener
+    help_from: dict[str, dict[str, Any]] = field(default_factory=dict)
     store: Store = field(default_factory=Store.default)
 
     def bring(self, name: str, record: RunRecord, *, again: bool = False, **options: Any) -> RunRecord:
@@ -204,7 +209,7 @@ class _Run:
 
         def make() -> Made:
             self.listener(name, "runs", None)
-            return stages.make(name, work, inputs.read, **options)
+            return stages.make(name, work, inputs.read, **self.help_from.get(name, {}), **options)
 
         if not (again or options):
             return fetch_or_make(name, work, inputs.key, self.store, make)

@@ -8,67 +8,36 @@ off because the traffic was short. Another gamma, voxel size, score or TPOG need
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from pipeline.artefacts import blindspots, schemas, tables
 from pipeline.artefacts.blindspots import BLINDSPOTS
 from pipeline.artefacts.foreign_columns import foreign_columns
 from pipeline.artefacts.period_ranking import PERIOD_SCORES
-from pipeline.artefacts.readers import read_tpog
 from pipeline.checks import recorded
 from pipeline.core.findings import WARNINGS, Finding
-from pipeline.core.grid import Grid
-from pipeline.core.parallel import in_order
 from pipeline.effects import registry
 from pipeline.effects.base import Effect
 from pipeline.formats.georeference import Georeference
-from pipeline.kernels import march
 from pipeline.scenario.models import FILE, Scenario
 from pipeline.scoring import uncertainty
 from pipeline.scoring.blindspots import table
 from pipeline.scoring.leave_out import LeaveOut
-from pipeline.scoring.scorer import Scorer, SiteScore
-from pipeline.scoring.targets.named import WORTHS
-from pipeline.scoring.visibility import Beams, in_voxels
-from pipeline.sensing.sites import ScannedSite
 from pipeline.stages.base import StageInputs, Summary, Workspace
 from pipeline.stages.shared import period_scores
 from pipeline.stages.shared.blindspots import network_digests
 from pipeline.stages.shared.judged import Judged
-from pipeline.stages.shared.scans import SiteBeams, scans
 from pipeline.stages.shared.scene import SCANS, scan_inputs, scene_of, sensor_digests, sensor_settings
-from pipeline.stages.shared.target_scores import TPOG, TRAJECTORIES, SiteTargets, Targets
+from pipeline.stages.shared.site_scoring import BeamAudit, ScoredSite, SiteScoring, asks_targets
+from pipeline.stages.shared.target_scores import TPOG, TRAJECTORIES, Targets
 from pipeline.world import world_frame
 
 NAME = "score"
 ARTEFACTS = ("scores.parquet", "visibility.parquet", PERIOD_SCORES, BLINDSPOTS)
-
-
-@dataclass(frozen=True)
-class ScoredSite:
-    """A site, its scores, and what else was asked for: an audit of its beams, its hits in the voxels that it sees."""
-
-    site: ScannedSite
-    score: SiteScore
-    targets: SiteTargets | None
-    audit: BeamAudit | None
-    visible: dict[str, NDArray[Any]] | None
-
-
-@dataclass(frozen=True)
-class BeamAudit:
-    """The worst of some beams, see :func:`pipeline.kernels.march.audit`."""
-
-    worst_sum: float
-    longest_gap_m: float
-    misplaced_chords: int
-    voxels_visited_twice: int
 
 
 def inputs(work: Workspace) -> StageInputs:
@@ -83,7 +52,7 @@ def inputs(work: Workspace) -> StageInputs:
         settings["effects"] = registry.settings(live)
         settings["sensors"] = sensor_settings(scenario)
     hashes = work.digests(TPOG, *(name for effect in live for name in effect.reads))
-    if _asks_targets(work):
+    if asks_targets(work.scenario):
         hashes |= work.digests(TRAJECTORIES)
     if scenario.score.blindspots:
         hashes |= network_digests(scenario)
@@ -98,7 +67,11 @@ def inputs(work: Workspace) -> StageInputs:
 
 
 def run(
-    work: Workspace, inputs: StageInputs, audit: bool = False, observe: Callable[[ScoredSite], None] | None = None
+    work: Workspace,
+    inputs: StageInputs,
+    audit: bool = False,
+    observe: Callable[[ScoredSite], None] | None = None,
+    scored_elsewhere: Callable[[SiteScoring], Iterable[ScoredSite]] | None = None,
 ) -> Summary:
     """Score and rank all sites; write ``scores.parquet``, ``visibility.parquet`` where sites are to be kept,
     ``scores_by_period.parquet`` where the traffic has periods, and ``blindspots.parquet`` unless it is not wanted.
@@ -109,32 +82,25 @@ def run(
         Check for every beam that the chords of its voxels add up to the clipped segment and that no voxel comes twice.
     observe
         Called with each site as it is scored, in order.
+    scored_elsewhere
+        Gives all sites in order, as :meth:`SiteScoring.score` scores them: other processes may share that work.
 
     Returns
     -------
     dict
         ``sites``, ``best`` (names), ``egvs_limit``; with ``audit`` the worst case found.
     """
-    tpog, wanted = read_tpog(work.path(TPOG)), work.scenario.score
-    leave_out = LeaveOut.of(work.path(TPOG), tpog) if wanted.standard_error else None
-    periods = period_scores.period_tpogs(work.path(TPOG), standard_errors=wanted.standard_error)
-    scorer = Scorer(scene_of(work), tpog, work.path(TRAJECTORIES), leave_out, periods)
-    targets = Targets(work, tpog.grid) if _asks_targets(work) else None
-
-    def score(scan: SiteBeams) -> ScoredSite:
-        checked = audit_beams(scan.beams, tpog.grid) if audit else None
-        its = targets.scores(targets.see(scan.beams)) if targets is not None else None
-        if wanted.keep_visibility == "all" or scan.site.name in wanted.keep_visibility:
-            worth, hits = scorer.score_and_hits(scan.beams)
-            return ScoredSite(scan.site, worth, its, checked, _sparse(hits))
-        return ScoredSite(scan.site, scorer.score(scan.beams), its, checked, None)
-
+    wanted, scoring = work.scenario.score, SiteScoring(work, audit=audit)
+    tpog, scorer, targets, leave_out, periods = (
+        scoring.tpog, scoring.scorer, scoring.targets, scoring.leave_out, scoring.periods,
+    )  # fmt: skip
+    scored = scored_elsewhere(scoring) if scored_elsewhere is not None else scoring.all_sites()
     done: list[ScoredSite] = []
-    for scored in in_order(score, scans(work), work.threads):
-        done.append(scored)
+    for its in scored:
+        done.append(its)
         work.progress("sites", len(done), 0)
         if observe is not None:
-            observe(scored)
+            observe(its)
     judged = {name: _judged(name, done, leave_out) for name in ("egvs", *wanted.asked)}
     ranking, others = judged[wanted.rank_by], [judged[name] for name in wanted.asked]
     sites = [d.site.to_json() for d in done]
@@ -184,11 +150,6 @@ def run(
     return summary
 
 
-def _asks_targets(work: Workspace) -> bool:
-    """Whether something is asked for that looks at the vehicles of recorded frames."""
-    return work.scenario.score.blindspots or any(name in WORTHS for name in work.scenario.score.asked)
-
-
 def _judged(name: str, done: list[ScoredSite], leave_out: LeaveOut | None) -> Judged:
     return Judged.of(name, [(d.score, d.targets) for d in done], None if leave_out is None else leave_out.groups)
 
@@ -197,19 +158,6 @@ def _doubts_of_errors(scenario: Scenario, estimate: uncertainty.Estimate, record
     traffic = scenario.traffic
     own = {p.name: f"{FILE}: traffic.periods ({p.name}).length_s" for p in traffic.periods if p.length_s is not None}
     return uncertainty.doubts(estimate, f"{FILE}: traffic.frames", traffic.frame_period_s, records, own)
-
-
-def _sparse(hits: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
-    """The voxels that are crossed, in order."""
-    ix, iy, iz = np.nonzero(hits)
-    index = {"ix": ix.astype(np.int32), "iy": iy.astype(np.int32), "iz": iz.astype(np.int32)}
-    return {**index, "hits": hits[ix, iy, iz]}
-
-
-def audit_beams(beams: Beams, grid: Grid) -> BeamAudit:
-    """Check each beam of a site, see :func:`pipeline.kernels.march.audit`."""
-    o, d, shape = in_voxels(beams, grid)
-    return BeamAudit(*march.audit(o, d, shape, grid.voxel_m, np.zeros(int(np.prod(grid.shape)), dtype=np.uint32)))
 
 
 def _write_scores(

@@ -12,9 +12,11 @@ from pipeline.artefacts import tables
 from pipeline.core.errors import InputError
 from pipeline.scoring.visibility import Beams
 from pipeline.sensing.scanner import Scanner
+from pipeline.sensing.scene import Scene
 from pipeline.sensing.sites import ScannedSite
 from pipeline.stages.base import Workspace
 from pipeline.stages.shared.scene import SCANS, scene_of
+from pipeline.stages.shared.world import STATICS
 
 
 @dataclass(frozen=True)
@@ -49,9 +51,15 @@ def _kept(work: Workspace, only: Collection[str] | None) -> Iterator[SiteBeams]:
 
 
 def _cast(work: Workspace, only: Collection[str] | None) -> Iterator[SiteBeams]:
-    scanner = Scanner(scene_of(work))
-    scanner.check(scene_of(work).sites)
+    scanner = work.remember("scanner", (STATICS,), lambda: _scanner(scene_of(work)))
     for site in scene_of(work).sites:
         if only is None or site.name in only:
             scan = scanner.scan_site(site)
             yield SiteBeams(scan.as_site(site.name, site.pole), Beams.of(scan))
+
+
+def _scanner(scene: Scene) -> Scanner:
+    """What scans the sites of a scene, each of which can stand where it is."""
+    scanner = Scanner(scene)
+    scanner.check(scene.sites)
+    return scanner
