@@ -36,8 +36,8 @@ from pipeline.runs.stages import Made
 _ENTRY, _HASH = "entry.json", "sha256"
 """What the store notes of an entry, and the note's key for the hash of all else in it."""
 
-KINDS = (*STAGES, "points", "detections")
-"""What entries are of: stages, and what was found from a site."""
+KINDS = (*STAGES, "points", "detections", "part")
+"""What entries are of: stages, what was found from a site, and parts of a score."""
 
 _NAME = re.compile(rf"({'|'.join(KINDS)})-[0-9a-f]{{32}}")
 """An entry's folder. A folder of any other name is not the store's own, and never touched."""

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 
 from pipeline.core.errors import InputError
@@ -15,8 +18,23 @@ DEFAULT_PLACE = Path("runs", ".store")
 DEFAULT_MAX_GB = 10.0
 
 
+_ORDERED: ContextVar[tuple[str, float] | None] = ContextVar("_ORDERED", default=None)
+
+
+@contextmanager
+def using(place: str, bound_bytes: float) -> Iterator[None]:
+    """Within the block, this thread's store is there, whatever the environment says."""
+    before = _ORDERED.set((place, bound_bytes))
+    try:
+        yield
+    finally:
+        _ORDERED.reset(before)
+
+
 def read() -> tuple[Path | None, float]:
     """The store's folder, None for no store; and its bound in bytes."""
+    if (ordered := _ORDERED.get()) is not None:
+        return Path(ordered[0]), ordered[1]
     place, most = os.environ.get(PLACE), os.environ.get(MAX_GB)
     try:
         bound_gb = DEFAULT_MAX_GB if most is None else float(most)

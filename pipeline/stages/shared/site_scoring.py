@@ -64,7 +64,7 @@ class SiteScoring:
 
     def __init__(self, work: Workspace, *, audit: bool = False) -> None:
         wanted = work.scenario.score
-        self._work, self._audit, self._kept = work, audit, wanted.keep_visibility
+        self.work, self._audit, self._kept = work, audit, wanted.keep_visibility
         self.tpog = read_tpog(work.path(TPOG))
         self.leave_out = LeaveOut.of(work.path(TPOG), self.tpog) if wanted.standard_error else None
         self.periods = period_tpogs(work.path(TPOG), standard_errors=wanted.standard_error)
@@ -74,11 +74,11 @@ class SiteScoring:
     @property
     def names(self) -> tuple[str, ...]:
         """The sites, in order."""
-        return tuple(site.name for site in scene_of(self._work).sites)
+        return tuple(site.name for site in scene_of(self.work).sites)
 
     def all_sites(self, only: Collection[str] | None = None) -> Iterator[ScoredSite]:
         """The sites in order, on the workspace's threads; of those named in ``only``, or of all."""
-        return in_order(self.score, scans(self._work, only), self._work.threads)
+        return in_order(self.score, scans(self.work, only), self.work.threads)
 
     def score(self, scan: SiteBeams) -> ScoredSite:
         """Score one scan."""

@@ -1,0 +1,87 @@
+"""Where tasks run: processes of this machine, or a cluster whose scheduler is named; all of it is Dask's."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from pipeline.core import parallel, plugins
+from pipeline.core.errors import InputError
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+LOCAL = "local"
+ADDRESSES = ("tcp://", "tls://")
+
+_SETTINGS = {
+    "logging.distributed": "critical",  # what goes wrong is told by the run
+    "distributed.scheduler.allowed-failures": 5,
+    "distributed.worker.daemon": True,
+    "distributed.nanny.pre-spawn-environ.DASK_LOGGING__DISTRIBUTED": "critical",
+    "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 65536,
+    "distributed.comm.timeouts.connect": "20s",
+}
+
+_MOST = 1000
+"""Processes on one machine."""
+
+
+@contextmanager
+def connected(where: str, *, memory_limit: str = "auto") -> Iterator[Client]:
+    """A client of the cluster that ``--cluster`` names.
+
+    Parameters
+    ----------
+    where
+        ``local``: a process a core of this machine; ``processes=N``; or the address of a scheduler, ``tcp://host:8786``.
+    memory_limit
+        Of a process on this machine, as Dask writes it; a process that takes more is ended. Its share of the machine's
+        memory by default.
+
+    Raises
+    ------
+    InputError
+        For a word that is none of these, or where no scheduler answers.
+    MissingExtraError
+        Where Dask is not installed.
+    """
+    count = _processes(where)
+    plugins.require("a city run", "cluster", "dask", "distributed", "fsspec")
+    import dask
+
+    with dask.config.set(_SETTINGS):
+        from distributed import Client, LocalCluster
+
+        if count is None:
+            try:
+                client = Client(where, timeout="20s", set_as_default=False)
+            except (OSError, ValueError) as error:
+                right = "the address of a running dask scheduler"
+                raise InputError(f"--cluster {where}", f"no scheduler answers there ({error})", right) from None
+            with client:
+                yield client
+            return
+        with (
+            LocalCluster(
+                n_workers=count, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None,
+                memory_limit=memory_limit,
+            ) as cluster,
+            Client(cluster, set_as_default=False) as client,
+        ):  # fmt: skip
+            yield client
+
+
+def _processes(where: str) -> int | None:
+    """How many processes on this machine; None for the address of a scheduler."""
+    if where == LOCAL:
+        return parallel.threads(None)
+    if where.startswith(ADDRESSES) and len(where) > len(ADDRESSES[0]):
+        return None
+    match = re.fullmatch(r"processes=([0-9]{1,4})", where)
+    if match is None or not 1 <= int(match[1]) <= _MOST:
+        right = f"local, processes=N (1 to {_MOST}), or the address of a scheduler, for example tcp://host:8786"
+        raise InputError("--cluster", repr(where)[:80], right)
+    return int(match[1])
