@@ -59,7 +59,14 @@ gamma = 4
 
 SITES = "site,x_m,y_m,z_m\npole_a,10,12,3\npole_b,30.5,-12,3\n"
 
-SYSTEM = ("tests/effects/test_traffic_effects", "tests/importers/", "tests/runs/", "tests/studies/", "tests/traffic/")
+SYSTEM = (
+    "tests/city/running/test_running",
+    "tests/effects/test_traffic_effects",
+    "tests/importers/",
+    "tests/runs/",
+    "tests/studies/",
+    "tests/traffic/",
+)
 """Where every test counts as `system`: SUMO runs there, or whole runs are made, interrupted and compared."""
 
 BUILDING = [[[14, 5], [18, 5], [18, 8], [14, 8], [14, 5]]]

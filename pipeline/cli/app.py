@@ -12,6 +12,7 @@ import typer
 
 from pipeline.cli import arguments, ending, explore, export, interrupts, placement
 from pipeline.cli.arguments import Audit, Jobs, Out, ScenarioPath, Set, Top
+from pipeline.cli.city import group as city
 from pipeline.cli.validation import verbs as validation
 from pipeline.core.errors import InputError
 from pipeline.core.version import __version__
@@ -304,6 +305,9 @@ def effects(
 # which poles together? moved by hand; does a score foretell detection? and a run taken along
 for verb in (placement.place, explore.explore, *validation.VERBS, export.export, export.figure):
     app.command()(verb)
+
+# every junction of a city
+app.add_typer(city.app, name="city")
 
 
 # ---- catalogues, and scenarios to begin with

@@ -47,10 +47,10 @@ from pipeline.scoring.targets.named import WORTHS
 from pipeline.scoring.uncertainty import Estimate, order
 from pipeline.sensing import sites
 from pipeline.stages.base import Workspace
-from pipeline.stages.shared.site_scoring import ScoredSite
 from pipeline.stages.shared.judged import Judged
 from pipeline.stages.shared.scans import scans
 from pipeline.stages.shared.scene import scene_of, site_digests
+from pipeline.stages.shared.site_scoring import ScoredSite
 from pipeline.stages.shared.target_scores import Targets
 from pipeline.studies.lengths import counted_frames
 from pipeline.studies.variants import Setting

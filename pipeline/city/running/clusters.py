@@ -48,8 +48,8 @@ def connected(where: str, *, memory_limit: str = "auto") -> Iterator[Client]:
     MissingExtraError
         Where Dask is not installed.
     """
+    check(where)
     count = _processes(where)
-    plugins.require("a city run", "cluster", "dask", "distributed", "fsspec")
     import dask
 
     with dask.config.set(_SETTINGS):
@@ -72,6 +72,12 @@ def connected(where: str, *, memory_limit: str = "auto") -> Iterator[Client]:
             Client(cluster, set_as_default=False) as client,
         ):  # fmt: skip
             yield client
+
+
+def check(where: str) -> None:
+    """InputError for a word that names no cluster; MissingExtraError where Dask is not installed."""
+    _processes(where)
+    plugins.require("a city run", "cluster", "dask", "distributed", "fsspec")
 
 
 def _processes(where: str) -> int | None:

@@ -46,7 +46,7 @@ def read(path: Path) -> list[ScoredSite]:
             about = json.loads(stored[_ABOUT].tobytes())
             arrays = {kind: stored[kind] for kind in _KINDS}
             return [_site(value, _of(arrays), path) for value in about]
-    except (OSError, ValueError, LookupError, TypeError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, ValueError, LookupError, TypeError, zipfile.BadZipFile) as error:
         raise InputError(path, f"is no part of a score ({error})", "remove it, and run again") from None
 
 

@@ -1,0 +1,89 @@
+"""A whole city run: the traffic once, every junction on a cluster, and what came of them brought together.
+
+Each junction's folder holds, byte for byte, what ``egvs run`` of its scenario alone would write: tasks call the same
+stages, and share what they make through the store.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.city.model import City, CityJunction
+from pipeline.city.results import junctions
+from pipeline.city.results.junctions import JunctionResult
+from pipeline.city.running import clusters, running
+from pipeline.city.running.jobs import Done, Job
+from pipeline.core.progress import Progress, silent
+from pipeline.runs.locking import alone
+
+
+@dataclass(frozen=True)
+class CityRun:
+    """What came of a city: its junctions, the best first, and the files beside their runs."""
+
+    out: Path
+    results: tuple[JunctionResult, ...]
+    files: tuple[Path, ...]
+
+
+def run(
+    city: City,
+    out: str | Path | None = None,
+    *,
+    where: str = clusters.LOCAL,
+    only: Collection[str] = (),
+    sets: Sequence[str] = (),
+    progress: Progress = silent,
+    heard: Callable[[Done], None] = lambda _: None,
+) -> CityRun:
+    """Run a city's junctions.
+
+    Parameters
+    ----------
+    out
+        Its folder; ``runs/<city's name>`` when None.
+    where
+        As ``--cluster`` says it, see :func:`pipeline.city.running.clusters.connected`.
+    only
+        Names of junctions; all when there is none.
+    sets
+        Laid over every junction's scenario, as ``egvs run --set`` does.
+    heard
+        Called with each junction as it is done.
+
+    Raises
+    ------
+    InputError
+        Where the city, a scenario or ``where`` is wrong.
+    RunError
+        Where a run cannot keep its promise, or the cluster is lost; what is done is kept then.
+    """
+    chosen = choose(city, only)
+    folder = Path(out) if out is not None else default_folder(city)
+    with alone(folder):
+        clusters.check(where)
+        with clusters.connected(where) as client:
+            running.run(client, jobs_of(city, folder, chosen, sets), heard=heard, progress=progress)
+        results = junctions.read_runs(folder, chosen)
+        return CityRun(folder, results, junctions.write(folder, city, results))
+
+
+def choose(city: City, only: Collection[str]) -> tuple[CityJunction, ...]:
+    """The junctions of these names, in the city's order; all where there is none."""
+    names = {city.junction(name).id for name in only}
+    return tuple(junction for junction in city.junctions if not names or junction.id in names)
+
+
+def jobs_of(city: City, out: Path, chosen: Sequence[CityJunction], sets: Sequence[str]) -> list[Job]:
+    """What workers get of junctions."""
+    return [
+        Job(its.id, its.scenario_folder(city).absolute(), junctions.run_folder(out, its.id).absolute(), tuple(sets))
+        for its in chosen
+    ]
+
+
+def default_folder(city: City) -> Path:
+    """Where a city run goes when no folder is given."""
+    return Path("runs") / city.name

@@ -1,0 +1,1 @@
+"""``egvs city``: every junction of a city."""

@@ -1,0 +1,11 @@
+"""The verbs of ``egvs city``."""
+
+from __future__ import annotations
+
+import typer
+
+from pipeline.cli.city import running
+
+app = typer.Typer(no_args_is_help=True, help="Every junction of a city, on one machine or a cluster.")
+
+app.command()(running.run)

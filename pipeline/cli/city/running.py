@@ -1,0 +1,72 @@
+"""``egvs city run``: parses, calls, and prints the junctions, the best first."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pipeline.cli.arguments import Set
+
+if TYPE_CHECKING:
+    from pipeline.city.city_run import CityRun
+    from pipeline.city.running.jobs import Done
+
+CityPath = Annotated[Path, typer.Argument(metavar="CITY", help="A folder that egvs city new made.")]
+CityOut = Annotated[
+    Path | None, typer.Option("--out", metavar="DIR", help="The folder of the city's run; runs/<name> by default.")
+]
+Cluster = Annotated[
+    str,
+    typer.Option(
+        metavar="WHERE",
+        help="local: a process a core of this machine; processes=N of them; or a scheduler, tcp://host:8786.",
+    ),
+]
+Junctions = Annotated[
+    list[str] | None, typer.Option("--junction", metavar="ID", help="This junction only; all by default. Repeatable.")
+]
+
+
+def run(
+    city: CityPath,
+    out: CityOut = None,
+    cluster: Cluster = "local",
+    junction: Junctions = None,
+    set_: Set = None,
+) -> None:
+    """Run every junction: the traffic once, then all of them on the processes of a cluster."""
+    from pipeline.city import city_run, model
+    from pipeline.cli.progress import Screen
+
+    with Screen("city") as screen:
+
+        def heard(done: Done) -> None:
+            made = ", ".join(done.made) or "nothing"
+            screen.say(f"{done.junction:<14} {done.seconds:>8.2f} s   {done.sites} sites; made {made}")
+
+        ran = city_run.run(
+            model.load(city), out, where=cluster, only=junction or (), sets=set_ or (), progress=screen.progress,
+            heard=heard,
+        )  # fmt: skip
+    print_junctions(ran)
+
+
+def print_junctions(ran: CityRun) -> None:
+    """The junctions, the best first, and what was written."""
+    from pipeline.cli.terminal import WIDE, console, table
+
+    out, by = console(WIDE), ran.results[0].best.by
+    names = [*dict.fromkeys(("rank", "junction", "title", "best site", by.head, "entropy seen", "sites"))]
+    rows = table(names, left=("junction", "title", "best site"), whole=[name for name in names if name != "title"])
+    for its in ran.results:
+        best = its.best
+        cells = {
+            "rank": str(its.rank), "junction": its.junction.id, "title": its.junction.title, "best site": best.site,
+            "entropy seen": f"{best.entropy_seen:.1%}", "sites": str(its.sites), by.head: by.value(its.score),
+        }  # fmt: skip
+        rows.add_row(*(cells[name] for name in names))
+    out.print(rows)
+    for path in ran.files:
+        out.print(str(path))
