@@ -19,12 +19,15 @@ def explore(
     out: Out = None,
     set_: Set = None,
     jobs: Jobs = None,
+    view: Annotated[
+        str, typer.Option(metavar="LINK", help='What is shown first, as "Link to this view" in the page has it.')
+    ] = "",
 ) -> None:
     """Move sensors in the browser, and see at once what they are worth there."""
     import webbrowser
 
     from pipeline.cli.progress import Screen
-    from pipeline.core import plugins
+    from pipeline.core import files, plugins
 
     plugins.require("egvs explore", "explore", "viser")
     from pipeline.explore.opening import open_session
@@ -34,13 +37,17 @@ def explore(
         session = open_session(
             place, set_ or (), out, jobs=jobs, progress=screen.progress, listener=screen.stage_event
         )  # fmt: skip
-    page = Page(session, port)
-    try:
-        print(f"{page.address}  (Ctrl-C ends it)", flush=True)
-        if browser:
-            webbrowser.open(page.address)
-        page.run()
-    except KeyboardInterrupt:  # how it is meant to end
-        print()
-    finally:
-        page.stop()
+    words = ["egvs", "explore", str(place), *(word for one in set_ or () for word in ("--set", one))]
+    with files.scratch() as scratch:
+        page = Page(session, scratch, port, (*words, *(() if out is None else ("--out", str(out)))))
+        try:
+            if view:
+                page.open_at(view, "--view")
+            print(f"{page.address}  (Ctrl-C ends it)", flush=True)
+            if browser:
+                webbrowser.open(page.address)
+            page.run()
+        except KeyboardInterrupt:  # how it is meant to end
+            print()
+        finally:
+            page.stop()

@@ -10,15 +10,11 @@ from pipeline.artefacts.run_record import RECORD, RunRecord
 from pipeline.core.errors import InputError
 from pipeline.core.progress import Progress, silent
 from pipeline.explore.session import Session
-from pipeline.runs import stages, workflow
-from pipeline.runs.locking import alone
+from pipeline.explore.settings import session_in
+from pipeline.runs import workflow
 from pipeline.runs.workflow import StageListener, unheard
 from pipeline.scenario.loading import from_values, load
 from pipeline.scenario.models import Scenario
-from pipeline.stages.base import Workspace
-
-NEEDED = ("check", "statics", "scan", "traffic", "tpog", "score")
-"""The stages that a session reads."""
 
 
 def open_session(
@@ -52,10 +48,7 @@ def open_session(
     else:
         scenario = load(place, sets)
         folder = out or workflow.default_folder(scenario)
-    record = workflow.run(scenario, folder, only=NEEDED, jobs=jobs, progress=progress, listener=listener)
-    with alone(folder):
-        work = Workspace(scenario, folder, jobs=jobs, recorded=stages.recorded(record))
-        return Session(work, {name: stage.inputs for name, stage in record.stages.items()})
+    return session_in(scenario, folder, jobs=jobs, progress=progress, listener=listener)
 
 
 def _recorded(folder: Path) -> Scenario:

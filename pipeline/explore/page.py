@@ -1,44 +1,44 @@
 """The page of a session: the scene in three dimensions, the candidates, and a gizmo that moves one of them.
 
-All browsers that look at it share one state. Whatever moves a sensor (gizmo, numbers, a click) only says which pose is
-wanted; :meth:`Page.run` scores the last one that was wanted, in the thread that called it, and shows that. So the
-number that rests is that of the pose that rests, however fast somebody drags.
+All browsers that look at it share one state. Whatever they do (gizmo, numbers, a click, a link) only says what is
+wanted; :meth:`Page.run` shows the last that was wanted, in the thread that called it. So the number that rests is that
+of the pose that rests, however fast somebody drags.
 """
 
 from __future__ import annotations
 
 import io
+import shlex
 import threading
+from collections.abc import Sequence
 from contextlib import redirect_stdout
-from dataclasses import asdict, replace
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 import viser
 from matplotlib import image
 
-from pipeline.core.errors import InputError
-from pipeline.explore import layers, shapes, turning, wording
-from pipeline.explore.session import Rating, Session
-from pipeline.sensing.sensors import CATALOGUE
-from pipeline.sensing.sites import Pose, Site
+from pipeline.core.errors import EgvsError, InputError, RunError
+from pipeline.explore import settings, wording
+from pipeline.explore.controls import Controls, modal
+from pipeline.explore.drawing import layers, shapes, surroundings, turning
+from pipeline.explore.guard import KEY, Guard
+from pipeline.explore.kept import KEPT, free_name, keep
+from pipeline.explore.plan import MovingPlan
+from pipeline.explore.playback import Playback
+from pipeline.explore.session import Session
+from pipeline.explore.settings import Variants
+from pipeline.explore.view import Camera, View, of_text, text_of
+from pipeline.sensing.sites import Site
 
 HOST = "127.0.0.1"
 """Nobody else's machine can reach it."""
 
-_COLOURS = {"building": (205, 208, 216), "ground": (225, 222, 214), "tree_crown": (150, 190, 165)}
-_OTHER_SOLID, _LANE, _ROI = (150, 154, 166), (112, 118, 130), (232, 89, 12)
-_SITE_RADIUS_M, GIZMO_M = 0.9, 6.0
-_LABELS = {
-    "x_m": "x m",
-    "y_m": "y m",
-    "z_m": "z m",
-    "yaw_deg": "yaw deg",
-    "pitch_deg": "tilt deg",
-    "roll_deg": "roll deg",
-}
-_LENGTH_STEP, _ANGLE_STEP = 0.001, 0.01
+GIZMO_M = 6.0
+FRAME_S = 0.25
+"""So long a frame stays while recorded traffic plays; longer where the machine needs it."""
 
 
 class _Server(viser.ViserServer):
@@ -54,8 +54,12 @@ class Page:
 
     Parameters
     ----------
+    scratch
+        A folder for runs with other settings, which goes with the page.
     port
         On this machine; 0 for any that is free.
+    opened_with
+        The words of the command that opens it again; for links.
 
     Raises
     ------
@@ -63,47 +67,57 @@ class Page:
         When the port is taken.
     """
 
-    def __init__(self, session: Session, port: int = 0) -> None:
-        self.session = session
+    def __init__(self, session: Session, scratch: Path, port: int = 0, opened_with: Sequence[str] = ()) -> None:
+        self.session = self._mix = session
+        self._own, self._variants, self._opened_with = session, Variants(session, scratch), tuple(opened_with)
         self.zero_m = shapes.zero_of(session.scene.roi)
-        best = session.ranked[0]
-        self.rating = session.rate(best.site.name, best.site.pose)  # compiles what is needed before anybody waits
-        self.plan = session.plan
+        self.view = self._opened = View.of(session)
+        site = self.view.site
+        self.rating = session.rate(site.name, site.pose)  # compiles what is needed before anybody waits
+        self.plan, self._playback = session.plan, Playback(session)
         self._changed = threading.Condition()
-        self._wanted: Site | None = None
-        self._ended = self._is_dragged = self._is_busy = False
-        with redirect_stdout(io.StringIO()):  # it greets in its own words
+        self._latest, self._wanted = self.view, False
+        self._ended = self._is_busy = False
+        self._dragging: int | None = None
+        self._notice = ""
+        self.guard = Guard(self._followed)
+        with redirect_stdout(io.StringIO()), self.guard.before_a_server():  # it greets in its own words
             self._server = _Server(host=HOST, port=port, label="egvs explore", verbose=False)
+        if not self.guard.stands:
+            self.stop()
+            raise RunError("viser serves pages in another way than egvs explore knows how to guard")
         if port and self._server.get_port() != port:
             self.stop()
             raise InputError("--port", f"{port} is taken", "another one, or 0 for any that is free")
-        self._draw_scene()
-        self._draw_controls()
-        self._show(self.rating)
+        self._draw()
+        self._show(self.view)
 
     @property
     def address(self) -> str:
-        """What a browser opens."""
+        """What a browser opens: with the key, without which nobody gets in."""
+        return f"{self._origin}/?{KEY}={self.guard.key}"
+
+    @property
+    def _origin(self) -> str:
         return f"http://{HOST}:{self._server.get_port()}"
 
-    def want(self, site: Site) -> None:
-        """Ask for a candidate in another pose, or with another sensor; what was asked for before and not yet scored is
-        let go."""
+    def ask(self, **changes: Any) -> None:
+        """Want something else of the view (its fields by name); the rest of what was wanted last stays."""
         with self._changed:
-            self._wanted = site
+            self._latest, self._wanted = replace(self._latest, **changes), True
             self._changed.notify_all()
 
     def run(self) -> None:
-        """Score what is wanted, until :meth:`end` or an interrupt."""
+        """Show what is wanted, until :meth:`end` or an interrupt."""
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._wanted is not None or self._ended)
+                is_asked = self._changed.wait_for(lambda: self._wanted or self._ended, self._patience_s())
                 if self._ended:
                     return
-                wanted, self._wanted = self._wanted, None
-                self._is_busy = True
-            if wanted is not None:
-                self._show(self.session.rate(wanted.name, wanted.pose, wanted.sensor))
+                if not is_asked:
+                    self._latest = replace(self._latest, frame=(self._latest.frame + 1) % self._playback.frames)
+                wanted, self._wanted, self._is_busy = self._latest, False, True
+            self._show(wanted)
             with self._changed:
                 self._is_busy = False
                 self._changed.notify_all()
@@ -111,7 +125,7 @@ class Page:
     def rest(self, timeout_s: float) -> bool:
         """Wait until all that was wanted is shown; whether that came in time."""
         with self._changed:
-            return self._changed.wait_for(lambda: self._wanted is None and not self._is_busy, timeout_s)
+            return self._changed.wait_for(lambda: not self._wanted and not self._is_busy, timeout_s)
 
     def end(self) -> None:
         """Let :meth:`run` return."""
@@ -124,154 +138,180 @@ class Page:
         with redirect_stdout(io.StringIO()):
             self._server.stop()
 
+    def present(self, candidate: Site) -> Site:
+        """Where a candidate's sensor is in the plan now; the candidate itself where it is in none."""
+        return candidate if self.plan is None else self.plan.sites.get(candidate.name, candidate)
+
+    def look_from(self, camera: Camera) -> None:
+        """Where a browser that opens the page looks from."""
+        self._server.initial_camera.position = np.subtract(camera.from_m, self.zero_m)
+        self._server.initial_camera.look_at = np.subtract(camera.at_m, self.zero_m)
+
+    def open_at(self, text: str, place: str) -> None:
+        """Begin with the view that a link's text asks for; InputError where it asks for what is not there."""
+        view, camera = of_text(text, self._own, self._opened, place)
+        self.ask(**vars(view))
+        if camera is not None:
+            self.look_from(camera)
+
+    def _patience_s(self) -> float | None:
+        """How long nothing has to happen until the next recorded frame is shown; None: for ever."""
+        return FRAME_S if self.view.layer == "replay" and self.controls.plays.value else None
+
     # ---- what is drawn once
 
-    def _draw_scene(self) -> None:
+    def _draw(self) -> None:
         scene, session = self._server.scene, self.session
-        scene.configure_default_lights(cast_shadow=False)  # a graphics card in software has no time for it
-        for kind, mesh in shapes.solids(session.scene.world, self.zero_m).items():
-            colour = _COLOURS.get(kind, _OTHER_SOLID)
-            scene.add_mesh_simple(f"/world/{kind}", mesh.points, mesh.faces, color=colour, flat_shading=True,
-                                  side="double", cast_shadow=False)  # fmt: skip
-        if session.carriageway is not None:
-            road = shapes.lanes(session.carriageway, self.zero_m)
-            self._lanes = scene.add_mesh_simple("/lanes", road.points, road.faces, color=_LANE, side="double",
-                                                cast_shadow=False)  # fmt: skip
-        scene.add_line_segments("/roi", shapes.edges(session.scene.roi, self.zero_m), _ROI, thickness=0.15)
-        self._draw_sites()
+        surroundings.draw_world(scene, session, self.zero_m)
+        surroundings.draw_sites(scene, session, self.zero_m, self._choose)
+        surroundings.draw_plan(scene, self.plan, self.zero_m, self._choose)
         self._gizmo = scene.add_transform_controls("/sensor", scale=GIZMO_M, depth_test=False)
         self._label = scene.add_label("/sensor/label", "")
         self._gizmo.on_update(self._dragged)
         self._server.on_client_disconnect(self._lost)
         reach_m = max(session.scene.roi.size_m)
-        self._server.initial_camera.position = (0.0, -0.45 * reach_m, 0.85 * reach_m)
-        self._server.initial_camera.look_at = (0.0, 0.0, 0.0)
-
-    def _draw_sites(self) -> None:
-        ranked = self.session.ranked
-        ball = trimesh.creation.icosphere(subdivisions=2, radius=_SITE_RADIUS_M)
-        places = np.array([rating.site.pose.position_m for rating in ranked]) - self.zero_m
-        balls = self._server.scene.add_batched_meshes_simple(
-            "/sites", np.asarray(ball.vertices, dtype=np.float32), np.asarray(ball.faces, dtype=np.int32),
-            batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (len(ranked), 1)), batched_positions=places,
-            batched_colors=shapes.scale([rating.scores[self.session.rank_by] for rating in ranked]), lod="off",
-        )  # fmt: skip
-
-        @balls.on_click
-        def _(event: viser.SceneNodePointerEvent[viser.BatchedMeshHandle]) -> None:
-            if event.instance_index is not None:
-                self.want(self._present(ranked[event.instance_index].site))
-
-    def _draw_controls(self) -> None:
-        gui, session = self._server.gui, self.session
-        gui.configure_theme(show_logo=False, show_share_button=False)
-        gui.main_panel.dock_right()
-        self._choices = {wording.choice(its, session.rank_by): its.site for its in session.ranked}
-        self._of_site = {site.name: choice for choice, site in self._choices.items()}
-        self._site = gui.add_dropdown("site", tuple(self._choices), hint="Candidates, the best first.")
-        self._site.on_update(self._chosen)
-        self._told = gui.add_markdown("")
-        with gui.add_folder("pose"):
-            self._numbers = {
-                name: gui.add_number(label, 0.0, step=_ANGLE_STEP if name.endswith("_deg") else _LENGTH_STEP)
-                for name, label in _LABELS.items()
-            }
-            known = dict.fromkeys((*session.scene.used_sensors, *session.scenario.sensors, *CATALOGUE))
-            self._sensor = gui.add_dropdown("sensor", tuple(known))
-        for number in self._numbers.values():
-            number.on_update(self._typed)
-        self._sensor.on_update(self._typed)
-        gui.add_button("Back to the candidate").on_click(lambda _: self._back())
-        gui.add_button("Keep this pose").on_click(self._keep)
-        gui.add_button("Picture (PNG)").on_click(self._picture)
-        with gui.add_folder("show"):
-            self._layer = gui.add_dropdown("layer", layers.LAYERS, hint="What lies on the road, added up along z.")
-            self._ring = gui.add_number("ring", 0, min=0, step=1, hint="Whose beams the last layer shows.")
-            for control in (self._layer, self._ring):
-                control.on_update(lambda _: self.want(self.rating.site))
-            dark = gui.add_checkbox("dark", False)
-            dark.on_update(
-                lambda _: gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=dark.value)
-            )
-        with gui.add_folder("ranking", expand_by_default=False):
-            gui.add_markdown(wording.ranking(session.ranked, session.rank_by))
+        x, y, z = self.zero_m
+        self.look_from(Camera((x, y - 0.45 * reach_m, z + 0.85 * reach_m), self.zero_m))
+        buttons = {"Keep this pose": self._keep, "Link to this view": self._link, "Picture (PNG)": self._picture}
+        effects, frames = settings.offered(session), self._playback.frames
+        self.controls = Controls(self._server.gui, session, self.view, self, effects, frames, buttons)
 
     # ---- what somebody does
 
     async def _dragged(self, event: viser.TransformControlsEvent) -> None:
         """A coroutine, so that drags come in their order."""
-        self._is_dragged = event.phase != "end"
-        own = self.rating.site
+        self._dragging = None if event.phase == "end" else event.client_id
+        own = self.view.site
         position_m = np.asarray(event.target.position, dtype=np.float64) + self.zero_m
-        self.want(replace(own, pose=turning.moved(own.pose, position_m.tolist(), event.target.wxyz.tolist())))
+        self.ask(site=replace(own, pose=turning.moved(own.pose, position_m.tolist(), event.target.wxyz.tolist())))
 
-    def _lost(self, _client: viser.ClientHandle) -> None:
+    def _lost(self, client: viser.ClientHandle) -> None:
         """Who is gone holds nothing any more."""
-        self._is_dragged = False
-        self.want(self.rating.site)
+        if self._dragging == client.client_id:
+            self._dragging = None
+            self.ask()
 
-    def _chosen(self, event: viser.GuiEvent[viser.GuiDropdownHandle[str]]) -> None:
-        if event.client is not None:
-            self.want(self._present(self._choices[event.target.value]))
+    def _choose(self, site: Site) -> None:
+        self.ask(site=self.present(self.session.candidates[site.name].site))
 
-    def _typed(self, event: viser.GuiEvent[Any]) -> None:
-        if event.client is not None:
-            values = {name: float(number.value) for name, number in self._numbers.items()}
-            self.want(replace(self.rating.site, pose=Pose(**values), sensor=self._sensor.value))
-
-    def _present(self, candidate: Site) -> Site:
-        """Where a candidate's sensor is in the plan now; the candidate itself where it is in none."""
-        return candidate if self.plan is None else self.plan.sites.get(candidate.name, candidate)
-
-    def _back(self) -> None:
-        site = self.session.candidates[self.rating.site.name].site
-        self.want(site)
-
-    def _keep(self, event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
+    def _followed(self, query: dict[str, str]) -> dict[str, str]:
+        """Somebody opens a link; where its browser is to look from."""
+        if not query:
+            return {}
         try:
-            path, name = self.session.keep(self.rating)
-            title, text = f"kept as {name}", f"in {path}"
-        except (InputError, OSError) as error:
-            title, text = "not kept", str(error)
-        if event.client is not None:
-            event.client.add_notification(title, text)
+            view, camera = of_text(query, self._own, self._opened, "the link")
+        except InputError as error:
+            self._notice = str(error)
+            self.ask()
+            return {}
+        self.ask(**vars(view))
+        if camera is None:
+            return {}
+        places = {"initialCameraPosition": camera.from_m, "initialCameraLookAt": camera.at_m}
+        return {key: ",".join(f"{x:.6g}" for x in np.subtract(at, self.zero_m)) for key, at in places.items()}
 
-    def _picture(self, event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
-        if event.client is not None:
-            camera, file = event.client.camera, io.BytesIO()
-            drawn = event.client.get_render(camera.image_height, camera.image_width, transport_format="png")
-            image.imsave(file, drawn, format="png")
-            event.client.send_file_download(f"{self.session.scenario.name}.png", file.getvalue())
+    def _keep(self, client: viser.ClientHandle, name: str = KEPT) -> None:
+        path = self.session.scenario.folder / name
+        try:
+            if not self.rating.stands:
+                raise InputError(f"site {self.rating.site.name}", "no sensor can stand there", "a free place")
+            kept = keep(path, self.rating.site, self.session.candidates)
+        except InputError as error:
+            other = free_name(path.parent)
+            answers = {f"Keep in {other}": lambda: self._keep(client, other)} if self.rating.stands else {}
+            modal(client, "Not kept", [wording.plain(str(error))], {**answers, "Keep nothing": lambda: None})
+        except OSError as error:
+            modal(client, "Not kept", [wording.plain(str(error))], {"Close": lambda: None})
+        else:
+            client.add_notification(f"kept as {kept}", f"in {path}")
+
+    def _link(self, client: viser.ClientHandle) -> None:
+        from_m, at_m = (np.add(at, self.zero_m) for at in (client.camera.position, client.camera.look_at))
+        camera = Camera(tuple(from_m.tolist()), tuple(at_m.tolist()))
+        text = text_of(self.view, self._opened, camera)
+        command = shlex.join((*(self._opened_with or ("egvs", "explore", "RUN")), "--view", text))
+        texts = ["While this page is served, on this machine:", f"```\n{self.address}&{text}\n```",
+                 "At any time:", f"```\n{command}\n```"]  # fmt: skip
+        modal(client, "Link to this view", texts, {"Close": lambda: None})
+
+    def _picture(self, client: viser.ClientHandle) -> None:
+        file = io.BytesIO()
+        drawn = client.get_render(client.camera.image_height, client.camera.image_width, transport_format="png")
+        image.imsave(file, drawn, format="png")
+        client.send_file_download(f"{self.session.scenario.name}.png", file.getvalue(), save_immediately=True)
 
     # ---- what changes
 
-    def _show(self, rating: Rating) -> None:
-        """Show what a sensor is worth, and bring controls and gizmo to where it is."""
-        self.rating, site = rating, rating.site
-        candidate = self.session.candidates[site.name]
+    def _show(self, view: View) -> None:
+        """Show what is wanted, and bring controls and gizmo to it."""
+        session_before, plan_before = self.session, self.plan
+        view = self._settled(view)
+        site, is_new, rests = view.site, self.session is not session_before, self._dragging is None
+        if is_new or site != self.rating.site:
+            self.rating = self.session.rate(site.name, site.pose, site.sensor)
+        self.view, rating = view, self.rating
+        if rests and rating.stands and self.plan is not None and self.plan.sites.get(site.name, site) != site:
+            self.plan = self.plan.moved(site, self.session.beams(site))
         with self._server.atomic():
-            told = wording.in_words(rating, self.session.rank_by, candidate, len(self.session.candidates))
-            self._told.content = told + ("" if self._is_dragged else self._plan_in_words(rating))
-            _set(self._sensor, site.sensor)
-            _set(self._site, self._of_site[site.name])
-            for name, value in asdict(site.pose).items():
-                _set(self._numbers[name], value)
+            if is_new:
+                surroundings.draw_sites(self._server.scene, self.session, self.zero_m, self._choose)
+            if self.plan is not plan_before:
+                surroundings.draw_plan(self._server.scene, self.plan, self.zero_m, self._choose)
             self._label.text = f"{site.name}  rank {rating.rank}" if rating.stands else f"{site.name}: cannot stand"
-            if not self._is_dragged:  # else it would be pulled out of a hand
+            legend = None
+            if rests:  # else it would be pulled out of a hand
                 self._gizmo.position = np.subtract(site.pose.position_m, self.zero_m)
                 self._gizmo.wxyz = np.array(turning.quaternion(site.pose))
-                layer, ring = self._layer.value, int(self._ring.value)
-                layers.draw(self._server.scene, self.session, rating, layer, ring, self.zero_m)
+                legend = layers.draw(self._drawn())
+            self.controls.show(self.session, view, rating, self._told(rests), legend)
 
-    def _plan_in_words(self, rating: Rating) -> str:
-        """The plan with this sensor as it is now, where it belongs to it; nothing where there is no plan."""
-        if self.plan is None or not rating.stands:
-            return ""
-        if rating.site.name in self.plan.sites and rating.site != self.plan.sites[rating.site.name]:
-            self.plan = self.plan.moved(rating.site, self.session.beams(rating.site))
-        return wording.plan(self.plan)
+    def _settled(self, view: View) -> View:
+        """Bring the session to the settings and the period of a view; settings that are refused stay as they are."""
+        mix = self._mix
+        if view.settings != self.view.settings:
+            self.controls.told.content = wording.WORKING
+            try:
+                mix = self._variants.session(view.settings)
+            except (EgvsError, OSError) as error:
+                self._notice = str(error)
+                with self._changed:
+                    self._latest = replace(self._latest, settings=self.view.settings)
+                view = replace(view, settings=self.view.settings)
+        if mix is not self._mix:
+            self.plan = _as_moved(self.plan, mix)
+        if mix is not self._mix or view.period != self.session.period:
+            self._mix, self.session = mix, mix.in_period(view.period) if view.period else mix
+            self._playback = Playback(self.session)
+        return view
+
+    def _drawn(self) -> layers.Drawn:
+        beside = self.view.beside or next(
+            (its.site.name for its in self.session.ranked if its.site.name != self.view.site.name), ""
+        )
+        other = self.session.candidates.get(beside)
+        if other is not None and (site := self.present(other.site)) != other.site:
+            other = self.session.rate(beside, site.pose, site.sensor)
+        return layers.Drawn(
+            self._server.scene, self.session, self._playback, self.rating, self.view, other, self.zero_m
+        )
+
+    def _told(self, rests: bool) -> str:
+        """What is said of the sensor, and of the plan; what went wrong comes first, once."""
+        notice, self._notice = self._notice, ""
+        name = self.view.site.name
+        said = wording.in_words(
+            self.rating, self.session.rank_by, self.session.candidates[name], len(self.session.candidates)
+        )
+        of_plan = wording.plan(self.plan) if rests and self.plan is not None and self.rating.stands else ""
+        return (wording.notice(notice) if notice else "") + said + of_plan
 
 
-def _set(control: Any, value: str | float) -> None:
-    """Show another value; viser's types have it that nobody may."""
-    control.value = value
+def _as_moved(before: MovingPlan | None, session: Session) -> MovingPlan | None:
+    """A session's plan, with its sensors where somebody has moved them."""
+    plan = session.plan
+    if plan is None or before is None:
+        return plan
+    for name, site in before.sites.items():
+        if plan.sites.get(name, site) != site:
+            plan = plan.moved(site, session.beams(site))
+    return plan

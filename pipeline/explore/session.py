@@ -7,28 +7,27 @@ candidates, as if the moved one hung there in place of its own. Nothing here kno
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.artefacts.readers import Tpog, read_scores, read_tpog
+from pipeline.artefacts.blindspots import SiteBlindspots
+from pipeline.artefacts.period_ranking import PERIOD_SCORES
+from pipeline.artefacts.readers import Tpog, read_periods, read_scores, read_scores_by_period, read_tpog
 from pipeline.checks import sites as rules
 from pipeline.checks.subject import Subject
-from pipeline.core import files
 from pipeline.core.errors import InputError
 from pipeline.core.findings import Finding
 from pipeline.effects import scene_resolving
+from pipeline.explore import missed
 from pipeline.explore.plan import MovingPlan
 from pipeline.scenario.models import Scenario
 from pipeline.scoring.egvs import EntropyField
-from pipeline.scoring.scorer import Scorer
+from pipeline.scoring.scorer import PeriodTpog, Scorer
 from pipeline.scoring.targets.named import WORTHS
 from pipeline.scoring.targets.seen import noticed_in, see
 from pipeline.scoring.visibility import Beams
@@ -42,10 +41,8 @@ from pipeline.traffic import sumo_folder
 from pipeline.traffic.network import Network
 from pipeline.world.carriageway import Carriageway
 
-KEPT = "kept_sites.csv"
-"""Where poses are kept, in the scenario's folder: a file of sites that ``sites.file`` can name."""
-
-_COLUMNS = ("site", "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg", "sensor")
+SCORES = "scores.parquet"
+_RECORDED = (TRAJECTORIES, TPOG)
 
 
 @dataclass(frozen=True)
@@ -94,18 +91,27 @@ class Session:
         A folder in which all stages up to ``score`` are done.
     stages
         Their keys, by name: a plan in the folder is taken only where it was made from them.
+    period
+        Of the traffic, whose scores are told; the mix of all when empty.
     """
 
-    def __init__(self, work: Workspace, stages: Mapping[str, str]) -> None:
+    def __init__(self, work: Workspace, stages: Mapping[str, str], period: str = "") -> None:
+        self.work, self._stages, self.period = work, stages, period
         self.scenario: Scenario = work.scenario
         self.scene: Scene = scene_of(work)
-        self.tpog: Tpog = read_tpog(work.path(TPOG))
-        self.candidates: dict[str, Rating] = self._rated(work)
-        self._trajectories = work.path(TRAJECTORIES)
+        self.periods: tuple[str, ...] = tuple(its.name for its in read_periods(work.path(TPOG)) if its.name)
+        self.tpog: Tpog = read_tpog(work.path(TPOG), period or None)
+        self.candidates: dict[str, Rating] = self._rated()
         self._engines: dict[tuple[str, ...], _Engine] = {}
-        asked = any(name in WORTHS for name in self.scenario.score.asked)
-        self.plan = MovingPlan.of(work, stages)
-        self._targets = Targets(_without_blindspots(work), self.tpog.grid) if asked else None
+
+    def in_period(self, period: str) -> Session:
+        """The same run, seen in another period alone; in the mix of all for an empty name."""
+        return Session(self.work, self._stages, period)
+
+    @cached_property
+    def plan(self) -> MovingPlan | None:
+        """The plan in the run's folder, where there is one that was made from the same traffic and scans."""
+        return MovingPlan.of(self.work, self._stages)
 
     @property
     def rank_by(self) -> str:
@@ -117,16 +123,20 @@ class Session:
         """The candidates, the best first."""
         return sorted(self.candidates.values(), key=lambda rating: rating.rank)
 
-    @cached_property
+    @property
     def network(self) -> Network | None:
         """The roads, where the scenario has some."""
-        return sumo_folder.roads(self.scenario)
+        return self.work.remember("explored roads", (), lambda: sumo_folder.roads(self.scenario))
 
-    @cached_property
+    @property
     def carriageway(self) -> Carriageway | None:
         """The lanes that vehicles drive on, where the scenario has some."""
-        found = None if self.network is None else Carriageway.of(self.network)
-        return found if found is not None and found.lanes else None
+
+        def found() -> Carriageway | None:
+            its = None if self.network is None else Carriageway.of(self.network)
+            return its if its is not None and its.lanes else None
+
+        return self.work.remember("explored lanes", (), found)
 
     def rate(self, name: str, pose: Pose, sensor: str | None = None) -> Rating:
         """What a candidate's sensor, or another one, is worth in a pose; KeyError where there is no such candidate.
@@ -173,6 +183,19 @@ class Session:
         ends = scan.rows.ends_m[of_ring] + site.pose.position_m
         return np.stack([np.broadcast_to(site.pose.position_m, ends.shape), ends], axis=1)
 
+    def blindspots(self, site: Site) -> SiteBlindspots:
+        """Where a sensor misses vehicles, of all periods together; InputError as above."""
+        asking = _asking_blindspots(self.work, True)
+        targets = self.work.remember("targets at places", _RECORDED, lambda: Targets(asking, self.tpog.grid))
+        beams = self.beams(site)
+        seen = see(targets.record, beams, noticed_in(self.scene_before(site), beams.sensor))
+        assert targets.spots is not None
+        return missed.of_site(site.name, targets.spots, targets.spots.by(seen.points), self.tpog.grid)
+
+    def scene_before(self, site: Site) -> Scene:
+        """The scene with the effects that act while a sensor is as it is now."""
+        return self._engine(site).scene
+
     @cached_property
     def entropy_bit(self) -> NDArray[np.float64]:
         """Entropy of each voxel, (nx, ny, nz) float64."""
@@ -181,32 +204,12 @@ class Session:
         found[field.cells] = field.per_cell_bit
         return found.reshape(self.tpog.grid.shape)
 
-    def keep(self, rating: Rating) -> tuple[Path, str]:
-        """Add a pose to the file of kept sites; the file, and the name that it has there.
-
-        Raises
-        ------
-        InputError
-            Where the file is another one than this program's own: it stays as it is. Or where no sensor can stand.
-        """
-        path = self.scenario.folder / KEPT
-        if not rating.stands:
-            raise InputError(f"site {rating.site.name}", "no sensor can stand there", "a free place")
-        rows = _kept_rows(path)
-        taken = {row[0] for row in rows} | self.candidates.keys()
-        name = next(new for n in range(1, len(taken) + 2) if (new := f"{rating.site.name[:72]}-{n}") not in taken)
-        pose = rating.site.pose
-        rows.append([name, *(repr(float(value)) for value in (*pose.position_m, *pose.angles_deg)), rating.site.sensor])
-        text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows([_COLUMNS, *rows])
-        files.write_text(path, text.getvalue())
-        return path, name
-
-    def _rated(self, work: Workspace) -> dict[str, Rating]:
-        """The candidates as ``scores.parquet`` has them."""
-        path = work.path("scores.parquet")
-        work.digest(path.name)
-        rows = {row["site"]: row for row in read_scores(path).to_pylist()}
+    def _rated(self) -> dict[str, Rating]:
+        """The candidates as ``scores.parquet`` has them, or ``scores_by_period.parquet``."""
+        path = self.work.path(PERIOD_SCORES if self.period else SCORES)
+        self.work.digest(path.name)
+        every = (read_scores_by_period if self.period else read_scores)(path).to_pylist()
+        rows = {row["site"]: row for row in every if row.get("period", "") == self.period}
         if rows.keys() != {site.name for site in self.scene.sites}:
             raise InputError(path, "holds other sites than the scenario", "egvs run makes it again")
         names = dict.fromkeys(("egvs", "entropy_seen", *self.scenario.score.asked))
@@ -214,6 +217,14 @@ class Session:
             site.name: Rating(site, {name: rows[site.name][name] for name in names}, rows[site.name]["rank"])
             for site in self.scene.sites
         }
+
+    @cached_property
+    def _targets(self) -> Targets | None:
+        """The vehicles that scores look at; None where no score does."""
+        if not any(name in WORTHS for name in self.scenario.score.asked):
+            return None
+        lean = _asking_blindspots(self.work, False)
+        return self.work.remember("targets", _RECORDED, lambda: Targets(lean, self.tpog.grid))
 
     def _findings(self, site: Site) -> tuple[Finding, ...]:
         """What the check says of a place, candidates of a rule included: nobody has sorted this one out."""
@@ -230,18 +241,28 @@ class Session:
         key = tuple(effect.NAME for effect in scene.effects)
         if key not in self._engines:
             scene = replace(scene, sites=())  # one caster serves every pose
-            self._engines[key] = _Engine(scene, Scanner(scene), Scorer(scene, self.tpog, self._trajectories))
+            self._engines[key] = _Engine(scene, Scanner(scene), self._scorer(scene))
         return self._engines[key]
+
+    def _scorer(self, scene: Scene) -> Scorer:
+        """Effects on what is seen know the mix, in a period too."""
+        tpog, trajectories = self.work.path(TPOG), self.work.path(TRAJECTORIES)
+        mix = read_tpog(tpog) if self.period else self.tpog
+        alone = (PeriodTpog(self.period, self.tpog),) if self.period else ()
+        return Scorer(scene, mix, trajectories, periods=alone)
 
     def _scores(self, site: Site) -> dict[str, float]:
         engine = self._engine(site)
         beams = Beams.of(engine.scanner.scan_site(site))
         found = engine.scorer.score(beams)
+        found = found.by_period[0] if self.period else found
         scores = {"egvs": found.egvs, "entropy_seen": found.entropy_seen}
         scores |= {name: float(value[0]) for name, value in found.shares.items()}
         if self._targets is not None:
             seen = see(self._targets.record, beams, noticed_in(engine.scene, beams.sensor))
-            scores |= {name: float(value[0]) for name, value in self._targets.scores(seen).scores.items()}
+            worth = self._targets.scores(seen)
+            whole = {name: float(value[0]) for name, value in worth.scores.items()}
+            scores |= worth.by_period[self.periods.index(self.period)] if self.period else whole
         return scores
 
     def _rank(self, name: str, score: float) -> int:
@@ -249,20 +270,9 @@ class Session:
         return 1 + sum(other > score for other in others)
 
 
-def _without_blindspots(work: Workspace) -> Workspace:
-    """The same folder where blind spots are not asked for: they cost time for every pose, and change no score."""
-    score = work.scenario.score.model_copy(update={"blindspots": False})
-    without = copy(work)
-    without.scenario = work.scenario.model_copy(update={"score": score})
-    return without
-
-
-def _kept_rows(path: Path) -> list[list[str]]:
-    """The rows of a file of kept sites; none where there is no file yet."""
-    if not path.is_file():
-        return []
-    with path.open(newline="", encoding="utf-8", errors="replace") as file:
-        header, *rows = [row for row in csv.reader(file) if row] or [[]]
-    if tuple(header) != _COLUMNS or any(len(row) != len(_COLUMNS) for row in rows):
-        raise InputError(path, "was not written by egvs explore, and stays as it is", "move it elsewhere to keep poses")
-    return rows
+def _asking_blindspots(work: Workspace, asked: bool) -> Workspace:
+    """The same folder where blind spots are asked for, or not: they cost time for every pose, and change no score."""
+    score = work.scenario.score.model_copy(update={"blindspots": asked})
+    other = copy(work)
+    other.scenario = work.scenario.model_copy(update={"score": score})
+    return other

@@ -10,6 +10,9 @@ from pipeline.explore.session import Rating
 MOST_LISTED = 20
 """Rows of the ranked list; the others are in the list to choose from."""
 
+WORKING = "## working ..."
+"""While a run with other settings is made."""
+
 _SHARES = ("entropy_seen", "coverage", "expected_visibility", "expected_detections", "seen_well")
 _STEERS = str.maketrans({sign: f"\\{sign}" for sign in "\\`*_{}[]()<>#+-.!|"})
 
@@ -27,6 +30,11 @@ def in_words(rating: Rating, rank_by: str, candidate: Rating, candidates: int) -
     rows = "\n".join(f"| {plain(name)} | {value_in_words(name, value)} |" for name, value in rating.scores.items())
     head = f"## {value_in_words(rank_by, score)}{more}\n\nrank {rating.rank} of {candidates}"
     return f"{head}\n\n| score | value |\n|---|---|\n{rows}\n\n{told}"
+
+
+def notice(text: str) -> str:
+    """What went wrong."""
+    return f"**{plain(text)}**\n\n"
 
 
 def plan(its: MovingPlan) -> str:

@@ -82,7 +82,11 @@ def called(scenario: Scenario, out: Path | None = None, progress: Progress = sil
     """Every effect before ``scenario``, see :class:`Call`; tried on the traffic of the run in ``out``, where that is
     there."""
     scene = build_scene(scenario)
-    trials = None if out is None else Trials.of(scene, out)
+    return called_in(scene, None if out is None else Trials.of(scene, out), progress)
+
+
+def called_in(scene: Scene, trials: Trials | None = None, progress: Progress = silent) -> list[Call]:
+    """The same before a scene that is at hand."""
     calls, names = [], registry.names()
     for done, name in enumerate(names, start=1):
         calls.append(_unless_broken(name, lambda name: _call(name, scene, trials)))

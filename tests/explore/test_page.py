@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-import shutil
 import socket
 import threading
+import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from dataclasses import replace
@@ -17,20 +17,21 @@ import pytest
 
 import pipeline
 from pipeline.core.errors import InputError
+from pipeline.explore import wording
 from pipeline.explore.opening import open_session
+from pipeline.explore.playback import Playback
 from pipeline.explore.session import Session
+from pipeline.explore.settings import Settings, Variants
+from pipeline.explore.view import LAYERS
 from pipeline.sensing.sites import Pose
 from tests.conftest import write_mini
 
 viser = pytest.importorskip("viser", reason="the page needs viser: pip install 'egvs[explore]'")
 
-from pipeline.explore.layers import LAYERS  # noqa: E402 - needs viser
-from pipeline.explore.page import GIZMO_M, HOST, Page  # noqa: E402
+import websockets  # noqa: E402 - comes with viser
+from websockets.sync.client import connect  # noqa: E402
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-in_a_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine: apt-get install chromium")
-GRAPHICS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-READY_MS = 30_000
+from pipeline.explore.page import HOST, Page  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -40,10 +41,17 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
     return open_session(write_mini(folder / "mini"), (), folder / "run")
 
 
+def with_key(served: Page) -> Any:
+    """What opens the page as a browser does: it keeps the cookie."""
+    opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
+    assert opener.open(served.address).status == 200
+    return opener
+
+
 @pytest.fixture
-def page(session: Session) -> Iterator[Page]:
+def page(session: Session, tmp_path: Path) -> Iterator[Page]:
     """Served, with its loop in a thread."""
-    served = Page(session)
+    served = Page(session, tmp_path / "scratch")
     loop = threading.Thread(target=served.run)
     loop.start()
     try:
@@ -56,196 +64,207 @@ def page(session: Session) -> Iterator[Page]:
 
 def settled(page: Page, name: str, pose: Pose, sensor: str = "small") -> None:
     """Wait until a pose is shown."""
-    page.want(replace(page.session.candidates[name].site, pose=pose, sensor=sensor))
+    page.ask(site=replace(page.session.candidates[name].site, pose=pose, sensor=sensor))
     assert page.rest(30)
 
 
 def test_it_serves_this_machine_alone(page: Page) -> None:
     assert page.address.startswith("http://127.0.0.1:")
-    with urllib.request.urlopen(page.address) as answer:
-        assert answer.status == 200
+    assert b"viser" in with_key(page).open(page._origin).read()
     assert page._server.get_host() == HOST
     assert page._server.request_share_url() is None
+
+
+def test_who_has_no_key_gets_neither_page_nor_connection(page: Page) -> None:
+    for request in ("/", "/index.html", "/?key=guessed"):
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(page._origin + request)
+    port, protocol = page._server.get_port(), [websockets.Subprotocol(f"viser-v{viser.__version__}")]
+    cookie = {"Cookie": f"egvs_explore_{port}={page.guard.key}"}
+    for headers, origin in (({}, page._origin), (cookie, "http://evil.example"), (cookie, None)):
+        with pytest.raises(websockets.exceptions.InvalidStatus, match="403"):
+            connect(f"ws://{HOST}:{port}", additional_headers=headers, origin=origin, subprotocols=protocol)
+    with connect(
+        f"ws://{HOST}:{port}", additional_headers=cookie, origin=page._origin, subprotocols=protocol
+    ) as connection:
+        assert connection.recv(10)
 
 
 def test_what_rests_is_what_was_wanted_last(page: Page, session: Session) -> None:
     poses = [Pose(10 + i / 8, 12, 3 + i / 16, 3.0 * i) for i in range(40)]
     for pose in poses[:-1]:
-        page.want(replace(session.candidates["pole_a"].site, pose=pose))
+        page.ask(site=replace(session.candidates["pole_a"].site, pose=pose))
     settled(page, "pole_a", poses[-1])
     expected = session.rate("pole_a", poses[-1])
     assert page.rating == expected
-    assert f"## {expected.scores['egvs']:,.1f}" in page._told.content
+    assert f"## {expected.scores['egvs']:,.1f}" in page.controls.told.content
 
 
 def test_controls_and_gizmo_follow(page: Page) -> None:
     pose = Pose(10.5, 12.25, 4.125, 33.0, -7.5, 2.0)
     settled(page, "pole_a", pose)
-    assert {name: number.value for name, number in page._numbers.items()} == pose.__dict__
-    assert page._site.value.endswith("pole_a: 993.0")
+    assert {name: number.value for name, number in page.controls.numbers.items()} == pose.__dict__
+    assert page.controls._site.value.endswith("pole_a: 993.0")
     assert (page._gizmo.position + page.zero_m).tolist() == [10.5, 12.25, 4.125]
     assert page._label.text == f"pole_a  rank {page.rating.rank}"
 
 
 def test_where_none_can_stand_no_score_is_left(page: Page) -> None:
     settled(page, "pole_a", Pose(16, 6, 3))
-    assert page._told.content.startswith("## no score")
-    assert "stands inside house" in page._told.content
+    assert page.controls.told.content.startswith("## no score")
+    assert "stands inside house" in page.controls.told.content
     assert page._label.text == "pole_a: cannot stand"
 
 
 def test_another_sensor_is_that_of_the_catalogue(page: Page, session: Session) -> None:
     pose = session.candidates["pole_a"].site.pose
     settled(page, "pole_a", pose, "VLP-16")
-    assert page._sensor.value == "VLP-16"
+    assert page.controls.sensor.value == "VLP-16"
     assert page.rating.scores["egvs"] > session.candidates["pole_a"].scores["egvs"]
 
 
 @pytest.mark.parametrize("layer", LAYERS)
 def test_layers_show_what_their_names_say(page: Page, session: Session, layer: str) -> None:
-    pose = Pose(11, 12, 3)
-    page._layer.value = layer
-    settled(page, "pole_a", pose)
-    drawn = page._server.scene.get_handle_by_name("/layer")
-    hits = session.hits(page.rating.site)
-    total = session.entropy_bit.sum()
+    page.ask(layer=layer, ring=0, frame=7)
+    settled(page, "pole_a", Pose(11, 12, 3))
+    drawn, site = page._server.scene.get_handle_by_name("/layer"), page.rating.site
+    hits, entropy = session.hits(site), session.entropy_bit
+    other = session.hits(session.candidates["pole_b"].site)
     expected = {
         "none": 0,
-        "traffic (TPOG)": (session.tpog.counts.sum(axis=2) > 0).sum(),
-        "entropy seen": (session.entropy_bit * (hits > 0)).any(axis=2).sum(),
-        "entropy missed": (session.entropy_bit * (hits == 0)).any(axis=2).sum(),
-        "empty scan": len(session.returns_m(page.rating.site)),
-        "beams of a ring": len(session.beams_m(page.rating.site, 0)),
+        "traffic": (session.tpog.counts.sum(axis=2) > 0).sum(),
+        "seen": (entropy * (hits > 0)).any(axis=2).sum(),
+        "missed": (entropy * (hits == 0)).any(axis=2).sum(),
+        "blindspots": (~np.isnan(session.blindspots(site).share_missed)).sum(),
+        "difference": (entropy * ((hits > 0) != (other > 0))).any(axis=2).sum(),
+        "scan": len(session.returns_m(site)),
+        "ring": len(session.beams_m(site, 0)),
+        "replay": len(Playback(session).moment(site, 7).returns_m),
     }
     assert (0 if drawn is None else len(drawn.points)) == expected[layer]
-    assert math.isclose((session.entropy_bit * (hits > 0)).sum() / total, page.rating.scores["entropy_seen"])
+    assert (page.controls._legend.content != "") == (layer != "none")
+    assert math.isclose((entropy * (hits > 0)).sum() / entropy.sum(), page.rating.scores["entropy_seen"])
+    if layer == "difference":
+        alone = (entropy * ((hits > 0) & (other == 0))).sum(), (entropy * ((hits == 0) & (other > 0))).sum()
+        for name, bit in zip(("pole_a", "pole_b"), alone, strict=True):
+            assert f"{name} alone sees {bit:,.1f} bit" in page.controls._legend.content
+    if layer == "blindspots":
+        assert f"{session.blindspots(site).whole.share:.1%} seen" in page.controls._legend.content
+
+
+def test_recorded_traffic_plays(page: Page) -> None:
+    page.controls.plays.value = True
+    page.ask(layer="replay", frame=39)
+    deadline = threading.Event()
+    watched = page.controls.frame
+    watched.on_update(lambda event: deadline.set() if event.target.value in (1, 2) else None)
+    assert deadline.wait(30)  # after the last frame comes the first
+    bodies = [page._server.scene.get_handle_by_name(f"/layer/{name}") for name in ("seen", "missed")]
+    assert any(body is not None for body in bodies)
+
+
+def test_settings_are_those_of_a_run_with_them(page: Page, session: Session, tmp_path: Path) -> None:
+    pose = Pose(10.5, 12.25, 4.125, 33.0, -7.5, 2.0)
+    settled(page, "pole_a", pose)
+    with_them = Settings(2.0, "points_on_target", frozenset({"moving_occlusion"}))
+    page.ask(settings=with_them)
+    assert page.rest(60)
+    expected = Variants(session, tmp_path / "other").session(with_them)
+    assert page.session is not session
+    assert page.rating == expected.rate("pole_a", pose)
+    assert {name: its.scores for name, its in page.session.candidates.items()} == {
+        name: its.scores for name, its in expected.candidates.items()
+    }
+    assert (page.controls.gamma.value, page.controls.score.value) == (2.0, "points_on_target")
+    assert page.controls.effects["moving_occlusion"].value
+    assert wording.ranking(expected.ranked, "points_on_target") == page.controls._ranking.content
+    page.ask(settings=replace(with_them, gamma=-1.0))
+    assert page.rest(60)
+    assert "input should be greater than or equal to 0" in page.controls.told.content
+    assert page.view.settings == with_them
+    page.ask(settings=Settings.of(session.scenario))
+    assert page.rest(60)
+    assert page.session is session
+    assert page.rating == session.rate("pole_a", pose)
+
+
+def test_what_is_asked_while_a_setting_is_made_is_not_lost(page: Page, session: Session) -> None:
+    pose = Pose(10.5, 12.25, 4.0)
+    page.ask(settings=Settings(2.0, "egvs", frozenset()))
+    page.ask(site=replace(session.candidates["pole_a"].site, pose=pose))
+    page.ask(layer="missed")
+    assert page.rest(60)
+    assert (page.view.settings.gamma, page.view.site.pose, page.view.layer) == (2.0, pose, "missed")
+    assert page.session.scenario.gamma == 2.0
+
+
+def test_a_link_shows_what_it_says(page: Page, session: Session) -> None:
+    opener = with_key(page)
+    link = f"{page.address}&site=pole_a&pose=10.5,12,4,0,0,0&layer=seen&camera=20,-30,40,20,0,2.5"
+    assert opener.open(link).url == f"{page._origin}/?initialCameraPosition=0,-30,40&initialCameraLookAt=0,0,2.5"
+    assert page.rest(30)
+    assert (page.view.site.pose, page.view.layer) == (Pose(10.5, 12, 4), "seen")
+    assert opener.open(f"{page.address}&site=nobody").url == f"{page._origin}/"
+    assert page.rest(30)
+    assert "nobody" in page.controls.told.content
+    assert page.view.site.pose == Pose(10.5, 12, 4)
+
+
+def test_who_is_gone_holds_nothing_any_more(page: Page) -> None:
+    class Gone:
+        client_id = 7
+
+    page._dragging = 7
+    settled(page, "pole_a", Pose(10.5, 12, 4))
+    assert (page._gizmo.position + page.zero_m).tolist() == [30.5, -12, 3]  # somebody's hand has it
+    page._lost(Gone())  # type: ignore[arg-type]
+    assert page.rest(30)
+    assert (page._gizmo.position + page.zero_m).tolist() == [10.5, 12, 4]
 
 
 def test_a_plan_moves_with_its_sensors(mini: Path, tmp_path: Path) -> None:
     placed = pipeline.place(pipeline.load(mini, ["placement.count=1"]), tmp_path / "run")
-    served = Page(open_session(mini, (), tmp_path / "run"))
+    served = Page(open_session(mini, (), tmp_path / "run"), tmp_path / "scratch")
     try:
         site = served.rating.site
-        assert f"**plan** pole\\_b: together {placed.joint:,.1f}; best for one more: pole\\_a" in served._told.content
+        assert (
+            f"**plan** pole\\_b: together {placed.joint:,.1f}; best for one more: pole\\_a"
+            in served.controls.told.content
+        )
+        assert served._server.scene.get_handle_by_name("/plan/label0").text == "pole_b: in the plan"
+        assert served._server.scene.get_handle_by_name("/plan/label1").text == "pole_a: best for one more"
         there = replace(site, pose=replace(site.pose, z_m=4.5))
-        served._show(served.session.rate(there.name, there.pose))
+        served._show(replace(served.view, site=there))
         assert served.plan is not None
         assert served.plan.sites["pole_b"] == there
         assert served.plan.joint == served.rating.scores["egvs"]  # of one sensor, the joint score is the score
+        balls = served._server.scene.get_handle_by_name("/plan/balls")
+        assert (balls.batched_positions[0] + served.zero_m).tolist() == [*there.pose.position_m]
         other = served.session.candidates["pole_a"].site
-        served._show(served.session.rate(other.name, other.pose))
+        served._show(replace(served.view, site=other))
         assert served.plan.sites["pole_b"] == there
+        assert served.present(served.session.candidates["pole_b"].site) == there
+        served._show(replace(served.view, settings=Settings(1.0, "egvs", frozenset())))
+        assert served.plan.sites["pole_b"] == there
+        assert served.plan.joint == served.session.rate("pole_b", there.pose).scores["egvs"]
     finally:
         served.stop()
 
 
-def test_a_port_that_is_taken_is_refused(session: Session) -> None:
+def test_a_port_that_is_taken_is_refused(session: Session, tmp_path: Path) -> None:
     with socket.socket() as other:
         other.bind((HOST, 0))
         other.listen()
         port = other.getsockname()[1]
         with pytest.raises(InputError, match=f"--port: {port} is taken; another one, or 0 for any that is free"):
-            Page(session, port)
+            Page(session, tmp_path, port)
 
 
-def test_nothing_is_served_after_the_end(session: Session) -> None:
-    served = Page(session)
+def test_nothing_is_served_after_the_end(session: Session, tmp_path: Path) -> None:
+    served = Page(session, tmp_path)
     address = served.address
     served.end()
     served.run()
     served.stop()
     with pytest.raises(OSError):
         urllib.request.urlopen(address)
-
-
-# ---- in a browser
-
-
-@pytest.fixture
-def browser() -> Iterator[Any]:
-    """Chromium, with software rendering."""
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        opened = playwright.chromium.launch(executable_path=CHROMIUM, args=GRAPHICS)
-        yield opened
-        opened.close()
-
-
-def look(browser: Any, page: Page) -> tuple[Any, list[str]]:
-    """A browser's view of the page, and the errors that it will have."""
-    tab = browser.new_page(viewport={"width": 1200, "height": 800})
-    errors: list[str] = []
-    tab.on("pageerror", lambda error: errors.append(str(error)))
-    tab.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-    tab.goto(page.address)
-    tab.get_by_text("rank 1 of 2").wait_for(timeout=READY_MS)
-    return tab, errors
-
-
-@in_a_browser
-@pytest.mark.system
-@pytest.mark.slow
-def test_two_browsers_see_the_score_of_a_pose_that_one_types(browser: Any, page: Page, session: Session) -> None:
-    (first, wrong), (second, other_wrong) = look(browser, page), look(browser, page)
-    field = first.get_by_label("z m")
-    field.fill("4.5")
-    field.press("Enter")
-    best = session.ranked[0].site
-    pose = Pose(best.pose.x_m, best.pose.y_m, 4.5)
-    expected = f"{session.rate(best.name, pose).scores['egvs']:,.1f}"
-    for tab in (first, second):
-        tab.get_by_text(expected).first.wait_for(timeout=READY_MS)
-    first.reload()
-    first.get_by_text(expected).first.wait_for(timeout=READY_MS)
-    assert page.rating.site.pose == pose
-    assert (wrong, other_wrong) == ([], [])
-
-
-def on_screen(page: Page, tab: Any, at_m: np.ndarray) -> tuple[float, float]:
-    """Where a point of the page's frame is drawn, in pixels, by the camera that the browser tells of."""
-    (client,) = page._server.get_clients().values()
-    w, x, y, z = client.camera.wxyz
-    columns = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
-        [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
-        [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    right, down, ahead = np.array(columns) @ (at_m - client.camera.position)
-    box = tab.locator("canvas").first.bounding_box()
-    focal = box["height"] / 2.0 / math.tan(client.camera.fov / 2.0)
-    return (
-        box["x"] + box["width"] / 2.0 + focal * right / ahead,
-        box["y"] + box["height"] / 2.0 + focal * down / ahead,
-    )
-
-
-@in_a_browser
-@pytest.mark.system
-@pytest.mark.slow
-def test_a_drag_ends_with_the_score_of_where_it_ends(browser: Any, page: Page, session: Session) -> None:
-    tab, wrong = look(browser, page)
-    start = page.rating.site
-    at_m = np.subtract(start.pose.position_m, page.zero_m)
-    x, y = on_screen(page, tab, at_m + np.array([0.0, 0.0, 0.85 * GIZMO_M]))
-    ended = threading.Event()
-
-    @page._gizmo.on_update
-    def _(event: Any) -> None:
-        if event.phase == "end":
-            ended.set()
-
-    tab.mouse.move(x, y)
-    tab.mouse.down()
-    for step in range(1, 9):
-        tab.mouse.move(x, y - 6 * step)
-    tab.mouse.up()
-    assert ended.wait(30)
-    assert page.rest(30)
-    moved = page.rating.site.pose
-    assert (moved.x_m, moved.y_m, moved.angles_deg) == (start.pose.x_m, start.pose.y_m, start.pose.angles_deg)
-    assert moved.z_m > start.pose.z_m + 0.2
-    assert page.rating == session.rate(start.name, moved)
-    tab.get_by_text(f"{page.rating.scores['egvs']:,.1f}").first.wait_for(timeout=READY_MS)
-    assert (page._gizmo.position + page.zero_m).tolist() == list(moved.position_m)
-    assert wrong == []

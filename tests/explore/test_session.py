@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 import pipeline
-from pipeline.artefacts.readers import read_scores
+from pipeline.artefacts import blindspots
+from pipeline.artefacts.readers import read_scores, read_scores_by_period
 from pipeline.core.errors import InputError
 from pipeline.explore.opening import open_session
-from pipeline.explore.session import KEPT, Session
-from pipeline.sensing import sites
+from pipeline.explore.session import Session
 from pipeline.sensing.sites import Pose
 from tests.conftest import feature, write_mini
 
@@ -101,6 +101,58 @@ def test_a_sensor_that_no_catalogue_has_is_refused(opened: Session) -> None:
         opened.rate("pole_a", MOVED, "nothing")
 
 
+PERIODS = """
+[[traffic.periods]]
+name = "day"
+weight = 2.5
+length_s = 12
+
+[[traffic.periods]]
+name = "night"
+begin_s = 12
+length_s = 8
+
+[[traffic.kinds]]"""
+
+
+def in_periods(folder: Path) -> Path:
+    """The small scenario, its first 24 frames by day and its last 16 by night."""
+    file = folder / "scenario.toml"
+    file.write_text(file.read_text().replace("[[traffic.kinds]]", PERIODS, 1))
+    return folder
+
+
+@pytest.mark.parametrize("effect", [None, "effects.range_limit={rated_range_m=40,rated_reflectivity=0.1}"])
+def test_a_moved_sensor_has_the_scores_of_each_period(mini: Path, tmp_path: Path, effect: str | None) -> None:
+    settings = [EVERY, *([effect] if effect else [])]
+    session = open_session(in_periods(mini), settings, tmp_path / "run")
+    assert session.periods == ("day", "night")
+    its = {period: session.in_period(period) for period in ("day", "night")}
+    moved = {period: one.rate("pole_a", MOVED) for period, one in its.items()}
+    for one in its.values():
+        for name, candidate in one.candidates.items():
+            assert one.rate(name, candidate.site.pose).scores == candidate.scores
+    assert its["night"].in_period("").candidates == session.candidates
+    write_site(mini, "pole_a", MOVED)
+    scored(mini, *settings)
+    rows = read_scores_by_period(mini / "scored" / "scores_by_period.parquet").to_pylist()
+    for row in (row for row in rows if row["site"] == "pole_a"):
+        found = moved[row["period"]]
+        assert dict(found.scores) == {name: row[name] for name in found.scores}
+        assert found.rank == row["rank"]
+    assert moved["day"].scores != moved["night"].scores
+
+
+def test_blind_spots_are_those_of_the_artefact(opened: Session, tmp_path: Path) -> None:
+    for expected in blindspots.read(opened.work.path("blindspots.parquet")):
+        found = opened.blindspots(opened.candidates[expected.site].site)
+        assert np.array_equal(found.share_missed, expected.share_missed, equal_nan=True)
+        assert [replace(place, se=0.0) for place in found.places] == [replace(its, se=0.0) for its in expected.places]
+        assert np.array_equal([its.se for its in found.places], [its.se for its in expected.places], equal_nan=True)
+        assert (found.points, found.origin_m, found.cell_m) == (expected.points, expected.origin_m, expected.cell_m)
+        assert found.in_words() == expected.in_words()
+
+
 def test_beams_of_a_ring_lie_on_its_cone(opened: Session) -> None:
     site = opened.candidates["pole_a"].site
     for ring, elevation in ((0, -15.0), (2, -15.0 + 2 * 20.0 / 7), (99, 5.0)):
@@ -151,32 +203,6 @@ def test_a_measured_scan_cannot_be_moved(tmp_path: Path) -> None:
     moved = session.rate("pole_a", replace(there.site.pose, z_m=4.0))
     assert not moved.stands
     assert "its empty scan was measured" in str(moved.findings[0])
-
-
-def test_kept_poses_are_a_file_of_sites(opened: Session) -> None:
-    folder = opened.scenario.folder
-    first = opened.keep(opened.rate("pole_a", MOVED))
-    second = opened.keep(opened.rate("pole_a", replace(MOVED, z_m=1 / 3)))
-    assert [first, second] == [(folder / KEPT, "pole_a-1"), (folder / KEPT, "pole_a-2")]
-    kept = sites.of(pipeline.load(folder, [f"sites.file='{KEPT}'"]))
-    assert [site.name for site in kept] == ["pole_a-1", "pole_a-2"]
-    assert [site.pose for site in kept] == [MOVED, replace(MOVED, z_m=1 / 3)]
-    assert {site.sensor for site in kept} == {"small"}
-
-
-@pytest.mark.parametrize("content", ["site,x_m,y_m,z_m\nmine,1,2,3\n", "", "\x00\xff", '"site'])
-def test_a_file_of_the_users_own_stays(mini: Path, tmp_path: Path, content: str) -> None:
-    (mini / KEPT).write_text(content)
-    session = open_session(mini, (), tmp_path / "run")
-    with pytest.raises(InputError, match="was not written by egvs explore, and stays as it is"):
-        session.keep(session.rate("pole_a", MOVED))
-    assert (mini / KEPT).read_text() == content
-
-
-def test_what_cannot_stand_is_not_kept(opened: Session) -> None:
-    refused = opened.rate("pole_a", replace(MOVED, z_m=-1.0))
-    with pytest.raises(InputError, match="no sensor can stand there"):
-        opened.keep(refused)
 
 
 def test_a_run_is_opened_as_it_was_run(mini: Path, tmp_path: Path) -> None:

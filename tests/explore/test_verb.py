@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import urllib.error
 import urllib.request
 import webbrowser
 from pathlib import Path
@@ -21,21 +22,25 @@ from tests.processes import EGVS
 def test_it_serves_until_an_interrupt_and_leaves_nothing(mini: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     command = [sys.executable, "-c", EGVS, "explore", mini, "--no-browser", "--out", out]
+    (tmp_path / "tmp").mkdir()
     started = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        env=os.environ | {"TMPDIR": str(tmp_path / "tmp")},
+    )  # fmt: skip
     assert started.stdout is not None
     address = next(line.split()[0] for line in started.stdout if line.startswith("http"))
     before = {path: path.read_bytes() for path in out.iterdir()}
-    assert urllib.request.urlopen(address).status == 200
+    opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
+    assert opener.open(address).status == 200
     os.kill(started.pid, signal.SIGINT)
     printed, said = started.communicate()
     assert (started.returncode, printed.strip()) == (0, "")
     assert said.splitlines()[-1].startswith("score")  # no word of an interrupt
     with pytest.raises(ProcessLookupError):
         os.killpg(started.pid, 0)  # nobody is left of all that it started
-    with pytest.raises(OSError):
-        urllib.request.urlopen(address)
+    with pytest.raises(urllib.error.URLError, match="refused"):
+        opener.open(address)
+    assert not any(tmp_path.glob("tmp/egvs-work-*"))  # where runs with other settings are made
     assert {path: path.read_bytes() for path in out.iterdir()} == before
 
 
@@ -49,6 +54,21 @@ def test_the_address_is_printed_and_opened(egvs, mini: Path, tmp_path: Path, mon
     assert out.splitlines()[-1] == f"{opened[0]}  (Ctrl-C ends it)"
     egvs("explore", tmp_path / "run", "--no-browser")
     assert len(opened) == 3
+
+
+def test_it_begins_with_the_view_of_a_link(egvs, mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[tuple] = []
+
+    def run(page: pages.Page) -> None:
+        page._show(page._latest)
+        shown.append((page.view.site.name, page.view.site.pose.z_m, page.view.layer))
+
+    monkeypatch.setattr(pages.Page, "run", run)
+    explore = ("explore", mini, "--no-browser", "--out", tmp_path / "run", "--view")
+    assert egvs(*explore, "site=pole_a&pose=10,12,4.5,0,0,0&layer=seen")[0] == 0
+    assert shown == [("pole_a", 4.5, "seen")]
+    code, _, err = egvs(*explore, "site=nobody")
+    assert (code, err.splitlines()[-1]) == (2, "egvs: --view: site: 'nobody'; one of pole_a, pole_b")
 
 
 def test_without_the_extra_it_says_how_to_install_it(egvs, mini: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -137,7 +137,12 @@ def drawn_size_m(kind: str) -> tuple[float, float, float]:
 
 
 def of_scenario(scenario: Scenario) -> Bodies:
-    """The bodies that a scenario's clouds are made with.
+    """The bodies that a scenario's clouds are made with; InputError as :func:`parts_of`."""
+    return Bodies.of(parts_of(scenario))
+
+
+def parts_of(scenario: Scenario) -> Mapping[str, tuple[Part, ...]]:
+    """The parts of each kind of body that a scenario's clouds are made with.
 
     Raises
     ------
@@ -148,7 +153,7 @@ def of_scenario(scenario: Scenario) -> Bodies:
     for kind, name in scenario.validation.bodies.items():
         place = f"validation.bodies.{kind}"
         parts[kind] = read(scenario.find(name, place), place)
-    return Bodies.of(parts)
+    return parts
 
 
 def digests(scenario: Scenario) -> dict[str, str]:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.explore import turning
+from pipeline.explore.drawing import turning
 from pipeline.sensing.sensors import rotation
 from pipeline.sensing.sites import Pose
 

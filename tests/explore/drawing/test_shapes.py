@@ -9,7 +9,8 @@ import numpy as np
 import pipeline
 from pipeline.artefacts.readers import Tpog
 from pipeline.core.grid import Grid, Roi
-from pipeline.explore import shapes, wording
+from pipeline.explore import wording
+from pipeline.explore.drawing import shapes
 from pipeline.explore.session import Rating
 from pipeline.sensing.sites import Pose, Site
 from pipeline.traffic.network import Lane, Permission

@@ -1,0 +1,224 @@
+"""The panel beside the scene: what is chosen there, typed and ticked, and what it says.
+
+A control says only what somebody wants (``ask``, with the fields of :class:`pipeline.explore.view.View` that change);
+what is shown comes back through :meth:`Controls.show`. So all browsers show the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
+from typing import Any, Protocol, get_args
+
+import viser
+
+from pipeline.explore import wording
+from pipeline.explore.session import Rating, Session
+from pipeline.explore.settings import Settings
+from pipeline.explore.view import LAYERS, View
+from pipeline.scenario.score import OtherScore
+from pipeline.sensing.sensors import CATALOGUE
+from pipeline.sensing.sites import Pose, Site
+
+_LABELS = {
+    "x_m": "x m",
+    "y_m": "y m",
+    "z_m": "z m",
+    "yaw_deg": "yaw deg",
+    "pitch_deg": "tilt deg",
+    "roll_deg": "roll deg",
+}
+_LENGTH_STEP, _ANGLE_STEP = 0.001, 0.01
+_ALL_PERIODS, _BEST_OTHER = "all periods", "the best other one"
+_NAMES = {words: name for name, words in LAYERS.items()}
+_FIRST = ("egvs", "points_on_target", "expected_detections")
+
+
+class Asking(Protocol):
+    """The page, as its controls know it."""
+
+    def ask(self, **changes: Any) -> None:
+        """Show something else."""
+
+    def present(self, candidate: Site) -> Site:
+        """Where a candidate's sensor is now."""
+
+
+class Controls:
+    """The panel.
+
+    Parameters
+    ----------
+    gui
+        Of the page.
+    session, view
+        As the page is opened.
+    effects
+        Those that may be switched, by name, and why.
+    frames
+        That were recorded.
+    buttons
+        What is done by whom presses them, by what stands on them.
+    """
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        session: Session,
+        view: View,
+        page: Asking,
+        effects: dict[str, str],
+        frames: int,
+        buttons: Mapping[str, Callable[[viser.ClientHandle], None]],
+    ) -> None:
+        self._gui, self._session, self._view, self._page = gui, session, view, page
+        self._theme(False)
+        gui.main_panel.dock_right()
+        self._sites: dict[str, Site] = {}
+        self._site = gui.add_dropdown("site", ("",), hint="Candidates, the best first.")
+        self._site.on_update(self._chosen)
+        self.told = gui.add_markdown("")
+        with gui.add_folder("pose"):
+            self._draw_pose(session)
+        with gui.add_folder("layer"):
+            self._draw_layer(session, frames)
+        with gui.add_folder("scored by", expand_by_default=False):
+            self._draw_settings(session, effects)
+        for name, pressed in buttons.items():
+            gui.add_button(name).on_click(_by_client(pressed))
+        with gui.add_folder("ranking", expand_by_default=False):
+            self._ranking = gui.add_markdown("")
+
+    def _draw_pose(self, session: Session) -> None:
+        gui = self._gui
+        self.numbers = {
+            name: gui.add_number(label, 0.0, step=_ANGLE_STEP if name.endswith("_deg") else _LENGTH_STEP)
+            for name, label in _LABELS.items()
+        }
+        known = dict.fromkeys((*session.scene.used_sensors, *session.scenario.sensors, *CATALOGUE))
+        self.sensor = gui.add_dropdown("sensor", tuple(known))
+        for number in self.numbers.values():
+            number.on_update(self._typed)
+        self.sensor.on_update(self._typed)
+        gui.add_button("Back to the candidate").on_click(lambda _: self._back())
+
+    def _draw_layer(self, session: Session, frames: int) -> None:
+        gui = self._gui
+        self.layer = gui.add_dropdown("layer", tuple(LAYERS.values()), hint="What lies over the scene.")
+        self.ring = gui.add_number("ring", 0, min=0, step=1)
+        self.beside = gui.add_dropdown("beside", (_BEST_OTHER, *sorted(session.candidates)))
+        self.frame = gui.add_slider("frame", 0, max(1, frames - 1), 1, 0)
+        self.plays = gui.add_checkbox("play", False)
+        self._legend = gui.add_html("")
+        dark = gui.add_checkbox("dark", False)
+        self._dark = dark
+        self._on(self.layer, lambda: {"layer": _NAMES[self.layer.value]})
+        self._on(self.ring, lambda: {"ring": int(self.ring.value)})
+        self._on(self.beside, lambda: {"beside": "" if self.beside.value == _BEST_OTHER else self.beside.value})
+        self._on(self.frame, lambda: {"frame": int(self.frame.value)})
+        self._on(self.plays, dict)
+        self._on(dark, lambda: {"is_dark": dark.value})
+
+    def _draw_settings(self, session: Session, effects: dict[str, str]) -> None:
+        gui, asked = self._gui, session.scenario.score.asked
+        scores = dict.fromkeys((*_FIRST, *asked, *get_args(OtherScore)))
+        self.score = gui.add_dropdown("score", tuple(scores), hint="By which candidates are ranked.")
+        self.gamma = gui.add_number("gamma", 0.0, min=0.0, step=0.1, hint="More beams in a voxel count no more.")
+        self.effects = {name: gui.add_checkbox(name, False, hint=why) for name, why in effects.items()}
+        self.period = gui.add_dropdown("period", (_ALL_PERIODS, *session.periods), visible=bool(session.periods))
+        for control in (self.score, self.gamma, *self.effects.values()):
+            self._on(control, self._settings)
+        self._on(self.period, lambda: {"period": "" if self.period.value == _ALL_PERIODS else self.period.value})
+
+    def show(self, session: Session, view: View, rating: Rating, told: str, legend: str | None) -> None:
+        """Bring all controls to what is shown; the legend stays as it is where it is None."""
+        if session is not self._session or not self._sites:
+            self._sites = {wording.choice(its, session.rank_by): its.site for its in session.ranked}
+            self._site.options = tuple(self._sites)
+            self._ranking.content = wording.ranking(session.ranked, session.rank_by)
+        if view.is_dark != self._view.is_dark:
+            self._theme(view.is_dark)
+        self._session, self._view = session, view
+        self.told.content = told
+        _set(self._site, next(choice for choice, site in self._sites.items() if site.name == view.site.name))
+        _set(self.sensor, view.site.sensor)
+        for name, value in asdict(view.site.pose).items():
+            _set(self.numbers[name], value)
+        self._show_layer(view, legend)
+        _set(self.score, session.rank_by)
+        _set(self.gamma, session.scenario.gamma)
+        _set(self.period, view.period or _ALL_PERIODS)
+        for name, control in self.effects.items():
+            _set(control, name in view.settings.effects)
+
+    def _show_layer(self, view: View, legend: str | None) -> None:
+        _set(self.layer, LAYERS[view.layer])
+        _set(self.ring, view.ring)
+        _set(self.frame, min(view.frame, self.frame.max))
+        _set(self.beside, view.beside or _BEST_OTHER)
+        _set(self._dark, view.is_dark)
+        for control, layer in ((self.ring, "ring"), (self.beside, "difference"), (self.frame, "replay")):
+            if control.visible != (view.layer == layer):
+                control.visible = view.layer == layer
+        if self.plays.visible != self.frame.visible:
+            self.plays.visible = self.frame.visible
+        if legend is not None and self._legend.content != legend:
+            self._legend.content = legend
+
+    # ---- what somebody does
+
+    def _on(self, control: Any, changes: Callable[[], dict[str, Any]]) -> None:
+        """Ask for changes when somebody, not this program, has set a control."""
+        control.on_update(lambda event: self._page.ask(**changes()) if event.client is not None else None)
+
+    def _chosen(self, event: viser.GuiEvent[viser.GuiDropdownHandle[str]]) -> None:
+        site = self._sites.get(event.target.value)
+        if event.client is not None and site is not None:
+            self._page.ask(site=self._page.present(site))
+
+    def _typed(self, event: viser.GuiEvent[Any]) -> None:
+        if event.client is not None:
+            values = {name: float(number.value) for name, number in self.numbers.items()}
+            self._page.ask(site=replace(self._view.site, pose=Pose(**values), sensor=self.sensor.value))
+
+    def _back(self) -> None:
+        self._page.ask(site=self._session.candidates[self._view.site.name].site)
+
+    def _settings(self) -> dict[str, Settings]:
+        own, its = self._session.scenario.gamma, self._view.settings
+        gamma = its.gamma if float(self.gamma.value) == own else float(self.gamma.value)
+        left = its.effects - self.effects.keys()
+        ticked = {name for name, control in self.effects.items() if control.value}
+        return {"settings": Settings(gamma, self.score.value, left | ticked)}
+
+    def _theme(self, is_dark: bool) -> None:
+        self._gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=is_dark)
+
+
+def _by_client(pressed: Callable[[viser.ClientHandle], None]) -> Callable[[Any], None]:
+    """What a button does for the browser that pressed it."""
+    return lambda event: pressed(event.client) if event.client is not None else None
+
+
+def _set(control: Any, value: str | float | bool) -> None:
+    """Show another value; viser's types have it that nobody may."""
+    if control.value != value:
+        control.value = value
+
+
+def modal(client: viser.ClientHandle, title: str, texts: Sequence[str], answers: dict[str, Callable[[], None]]) -> None:
+    """Tell one browser something, and ask what to do; any answer closes it."""
+    window = client.gui.add_modal(title)
+    with window:
+        for text in texts:
+            client.gui.add_markdown(text)
+        for name, act in answers.items():
+            client.gui.add_button(name).on_click(_closing(window, act))
+
+
+def _closing(window: Any, act: Callable[[], None]) -> Callable[[Any], None]:
+    def answered(_: Any) -> None:
+        window.close()
+        act()
+
+    return answered
