@@ -107,13 +107,31 @@ def make_room(path: Path) -> None:
     InputError
         Where it could not be written.
     """
+    see_room(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _unwritable(path, error) from None
+
+
+def see_room(path: Path) -> None:
+    """See that a file could be written, in a folder that may not be there yet; nothing is made.
+
+    Raises
+    ------
+    InputError
+        Where it could not.
+    """
     try:
         _refuse_folder(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path.parent):
+        with tempfile.TemporaryFile(dir=next(folder for folder in path.parents if folder.exists())):
             pass
     except OSError as error:
-        raise InputError(path, f"cannot be written ({error.strerror})", "a file in a folder of yours") from None
+        raise _unwritable(path, error) from None
+
+
+def _unwritable(path: Path, error: OSError) -> InputError:
+    return InputError(path, f"cannot be written ({error.strerror})", "a file in a folder of yours")
 
 
 def _refuse_folder(path: Path) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from pipeline.core import files, plugins
 from pipeline.core.errors import InputError
 from pipeline.core.progress import Progress, silent
 from pipeline.export.finished_run import FinishedRun
-from pipeline.export.layers import Layer, best_site, layers_of
+from pipeline.export.layers import NAMES, Layer, best_site, layers_of
 from pipeline.export.reference import CHOICES, DEGREES, SCENARIO, Reference
 
 FOLDER = "export"
@@ -96,15 +97,14 @@ def export(
     chosen = _chosen(run, sites)
     target = out or folder / FOLDER / (f"{file_name(run.scenario.name)}{its.suffix}" if its.is_one_file else to)
     _check_target(target, its)
+    _check_free([target] if its.is_one_file else [], out)
     with files.scratch() as aside:
         made, notes = _made(run, its, reference, aside, target.name, chosen, progress)
         paths = [target if its.is_one_file else target / path.name for path in made]
-        _check_free(paths, out, its)
-        for path in paths:
-            files.make_room(path)
-        for path, done in zip(paths, made, strict=True):
-            with files.aside(path) as partial:
-                shutil.copyfile(done, partial)
+        _check_free(paths, out)
+        _bring(made, paths)
+    if out is None and not its.is_one_file:
+        _remove_others(target, paths)
     return Exported(tuple(paths), reference.words, tuple(notes))
 
 
@@ -144,19 +144,36 @@ def _check_target(target: Path, its: Format) -> None:
     if its.is_one_file:
         if target.suffix != its.suffix:
             raise InputError("--out", repr(str(target)), f"a file that ends in {its.suffix} for --to {its.name}")
-        files.make_room(target)
+        files.see_room(target)
         return
     if target.exists() and not target.is_dir():
         raise InputError("--out", f"{target} is a file", f"a folder: --to {its.name} writes several files")
-    files.make_room(target / f"any{its.suffix}")
+    files.see_room(target / f"any{its.suffix}")
 
 
-def _check_free(paths: Sequence[Path], out: Path | None, its: Format) -> None:
-    """InputError where a file in a folder that the user names would be replaced: a scenario has a ``sites.csv`` too."""
-    if out is None or its.is_one_file:
-        return
-    if there := [path for path in paths if path.exists()]:
-        raise InputError("--out", f"{there[0]} is there already", "a new folder, or one without such files")
+def _check_free(paths: Sequence[Path], out: Path | None) -> None:
+    """InputError where a file that the user names, or in a folder that the user names, would be replaced: a scenario
+    has a ``sites.csv`` too, and a GeoPackage may hold other layers."""
+    if out is not None and (there := [path for path in paths if path.exists()]):
+        right = "another name" if there[0] == out else "a new folder, or one without such files"
+        raise InputError("--out", f"{there[0]} is there already", right)
+
+
+def _bring(made: Sequence[Path], paths: Sequence[Path]) -> None:
+    """All files to where they belong, or none."""
+    for path in paths:
+        files.make_room(path)
+    with ExitStack() as partials:
+        for path, done in zip(paths, made, strict=True):
+            shutil.copyfile(done, partials.enter_context(files.aside(path)))
+
+
+def _remove_others(folder: Path, paths: Sequence[Path]) -> None:
+    """Remove the layers that an earlier export left in a run's folder and that are no more: a plan of other sites."""
+    for layer in NAMES:
+        path = folder / f"{layer}{paths[0].suffix}"
+        if path not in paths:
+            path.unlink(missing_ok=True)
 
 
 def _made(

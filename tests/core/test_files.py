@@ -19,6 +19,16 @@ def test_room_is_made_and_nothing_else(tmp_path: Path) -> None:
     assert (tmp_path / "mine").read_text() == "kept"
 
 
+def test_room_is_seen_and_nothing_made(tmp_path: Path) -> None:
+    files.see_room(tmp_path / "a" / "b" / "map.gpkg")
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match=r"file/b/m\.gpkg: cannot be written \(.+\); a file in a folder of yours"):
+        files.see_room(tmp_path / "file" / "b" / "m.gpkg")
+    with pytest.raises(InputError, match=r"is a folder; a file"):
+        files.see_room(tmp_path)
+
+
 def test_where_there_is_no_room_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match=r"file/m\.onnx: cannot be written \(.+\); a file in a folder of yours"):

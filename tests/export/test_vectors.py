@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import json
 import shutil
 import sqlite3
@@ -313,7 +314,7 @@ def test_a_damaged_artefact_is_refused_and_nothing_written(
         path.write_bytes(kept)
     assert code == 2
     assert f"{path}: was altered or replaced" in err
-    assert not list(out.glob("*"))
+    assert not out.exists()
 
 
 @pytest.mark.parametrize("to", sorted(FORMATS))
@@ -343,6 +344,42 @@ def test_no_file_in_a_user_s_folder_is_replaced(local: Path, egvs: Call) -> None
             f"egvs: --out: {folder / name} is there already; a new folder, or one without such files\n",
         )
         assert ((folder / name).read_bytes(), sorted(folder.rglob("*"))) == (kept, before)
+
+
+@pytest.mark.parametrize("to", ["gpkg", "kml"])
+def test_a_user_s_file_is_not_replaced(located: Path, tmp_path: Path, egvs: Call, to: str) -> None:
+    (path := tmp_path / f"mine.{to}").write_text("mine")
+    code, _, err = egvs("export", located, "--to", to, "--out", path)
+    assert (code, err) == (2, f"egvs: --out: {path} is there already; another name\n")
+    assert path.read_text() == "mine"
+
+
+def test_all_files_appear_or_none(located: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    copy, copied = shutil.copyfile, []
+
+    def full(source: Path, target: Path) -> None:
+        if len(copied) == 2:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        copied.append(copy(source, target))
+
+    monkeypatch.setattr(shutil, "copyfile", full)
+    with pytest.raises(OSError, match="No space left") as caught:
+        export(located, "csv", out=tmp_path / "out")
+    assert caught.value.filename == str(tmp_path / "out" / "footprints.csv")
+    assert copied
+    assert not list((tmp_path / "out").iterdir())
+
+
+def test_a_layer_that_is_no_more_does_not_stay_in_the_run(local: Path, tmp_path: Path) -> None:
+    shutil.copytree(local.parent, tmp_path / "copy")
+    folder = tmp_path / "copy" / "run" / "export" / "csv"
+    folder.mkdir(parents=True)
+    for name in ("plan.csv", "mine.csv"):
+        (folder / name).write_text("of before")
+    export(tmp_path / "copy" / "run", "csv")
+    assert {path.name for path in folder.iterdir()} == {
+        "sites.csv", "blindspots.csv", "footprints.csv", "region.csv", "mine.csv"
+    }  # fmt: skip
 
 
 def test_by_default_it_goes_into_the_run_and_again(local: Path, egvs: Call) -> None:

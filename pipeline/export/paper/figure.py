@@ -76,7 +76,7 @@ def draw(
     chosen = _site(ranking, site)
     name = f"{what}_{file_name(chosen.site)}" if what in OF_SITES else what
     path = out or folder / FOLDER / f"{name}.{kind}"
-    files.make_room(path)
+    files.see_room(path)
     units = width_mm / 25.4 * 72.0 * 12.0 / LETTERS_PT
     svg = flat(_drawn(run, what, ranking, chosen, units), width_mm)
     progress("drawn", 1, 2)
