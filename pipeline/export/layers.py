@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from pipeline.artefacts import tables
 from pipeline.artefacts.blindspots import BLINDSPOTS
+from pipeline.artefacts.period_ranking import PERIOD_SCORES
 from pipeline.artefacts.readers import read_placement
 from pipeline.export.finished_run import FinishedRun
 from pipeline.report.drawing.outlines import united
@@ -97,7 +98,21 @@ def _sites(run: FinishedRun, notes: list[str]) -> Iterator[Layer]:
     del notes
     scores, about = tables.read(run.artefact("scores.parquet"), "scores")
     first = ["rank", *(name for name in scores.column_names if name != "rank")]
-    yield Layer(SITES, _points(scores), _plain(scores.select(first)), about.get("rank_by", "egvs"))
+    rows = _with_periods(run, scores.select(first))
+    yield Layer(SITES, _points(scores), _plain(rows), about.get("rank_by", "egvs"))
+
+
+def _with_periods(run: FinishedRun, scores: pa.Table) -> pa.Table:
+    """Beside the scores those of each period alone, where traffic has periods: ``rank_in_morning``."""
+    if PERIOD_SCORES not in run.record.stages["score"].artefacts:
+        return scores
+    alone = tables.read(run.artefact(PERIOD_SCORES), "scores_by_period")[0]
+    for period in alone.column("period").unique().to_pylist():
+        its = alone.filter(pc.equal(alone.column("period"), period)).drop_columns(["period"])
+        row = pc.index_in(scores.column("site"), its.column("site").combine_chunks())
+        for name in its.drop_columns(["site"]).column_names:
+            scores = scores.append_column(f"{name}_in_{period}", its.column(name).take(row))
+    return scores
 
 
 def _plan(run: FinishedRun, notes: list[str]) -> Iterator[Layer]:
@@ -209,8 +224,8 @@ def _plain(table: pa.Table) -> pa.Table:
     more than their case; a user's own column that is called as one here, or as one of a format, gets ``given_``."""
     columns: dict[str, Any] = {}
     taken = set(_RESERVED)
-    for name in table.column_names:
-        column = table.column(name).combine_chunks()
+    for number, name in enumerate(table.column_names):  # names that are equal too
+        column = table.column(number).combine_chunks()
         if pa.types.is_integer(column.type):
             column = column.cast(pa.int64())
         elif pa.types.is_floating(column.type):

@@ -59,10 +59,23 @@ def binary(name: str) -> Path:
 
     import sumolib
 
-    program = shutil.which(sumolib.checkBinary(name))
+    with _projections_kept():
+        program = shutil.which(sumolib.checkBinary(name))
     if program is None:
         raise MissingBackendError(f"SUMO's program '{name}' was not found: set SUMO_HOME, or pip install eclipse-sumo")
     return Path(program)
+
+
+@contextmanager
+def _projections_kept() -> Iterator[None]:
+    """Importing SUMO's wheel points this process at its data of projections, which not every library can read."""
+    before = {name: os.environ.get(name) for name in ("PROJ_DATA", "PROJ_LIB")}
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
 
 
 def environment() -> dict[str, str]:

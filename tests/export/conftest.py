@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
 
-from pipeline import load
+from pipeline import load, place
 from pipeline.runs import workflow
-from tests.conftest import write_mini
+from tests.conftest import collection, feature, write_mini
 
 EPSG, OFFSET_M = 25832, (-550000.0, -5630000.0)
 """UTM zone 32, and what is added to eastings and northings to reach the scenario's x, y."""
@@ -40,3 +41,32 @@ def located(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def local(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of which nobody knows where it lies."""
     return _made(tmp_path_factory.mktemp("local"))
+
+
+HOUSE = [[150, 206], [158, 206], [158, 209.5], [150, 209.5], [150, 206]]
+LAMP = (152.0, 252.0)
+
+
+@pytest.fixture(scope="session")
+def on_roads(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run in which SUMO drove, a minute on the shipped junction seen from two sites, and a plan of both."""
+    scenario = tmp_path_factory.mktemp("on_roads") / "junction"
+    shutil.copytree(Path(__file__).resolve().parents[2] / "scenarios" / "nishishinjuku", scenario)
+    file = scenario / "scenario.toml"
+    text = file.read_text()
+    for long, short in (
+        ("frames = 5000", "frames = 60"), ("warmup_s = 300", "warmup_s = 60"), ("vehicles = 50", "vehicles = 25"),
+        ("frame_period_s = 0.25", "frame_period_s = 1"), ("step_s = 0.25", "step_s = 1"),
+        ("voxel_m = 0.25", "voxel_m = 1.0"), ("VLP-32C", "VLP-16"), ("gamma = 10", "gamma = 1000"),
+    ):  # fmt: skip
+        assert long in text
+        text = text.replace(long, short)
+    file.write_text(f"{text}\n[crs]\nepsg = {EPSG}\noffset_m = [{OFFSET_M[0]}, {OFFSET_M[1]}]\n")
+    (scenario / "sites.csv").write_text("".join((scenario / "sites.csv").read_text().splitlines(keepends=True)[:12:5]))
+    house = feature({"type": "Polygon", "coordinates": [HOUSE]}, name="house", kind="building", height_m=6.5)
+    lamp = feature({"type": "Point", "coordinates": LAMP}, name="lamp", kind="pole", height_m=5, radius_m=0.1)
+    (scenario / "statics.geojson").write_text(collection(house, lamp))
+    loaded, out = load(scenario, ["placement.count=2"]), scenario.parent / "run"
+    workflow.run(loaded, out)
+    place(loaded, out)
+    return out

@@ -1,5 +1,8 @@
 """Is what goes wrong with SUMO's programs told with its own words?"""
 
+import os
+import sys
+
 import pytest
 
 from pipeline.core.errors import MissingBackendError, RunError
@@ -39,6 +42,19 @@ def test_a_binary_that_is_none_is_told(tmp_path, monkeypatch):
     (tmp_path / "sumo").write_bytes(b"\x00not a program")
     with pytest.raises(MissingBackendError, match="sumo cannot be started"):
         sumo.run("sumo", [], tmp_path)
+
+
+def test_finding_sumo_leaves_this_process_its_own_projections(monkeypatch):
+    """The wheel's data is of a PROJ that rasterio's refuses."""
+    for name in ("PROJ_DATA", "PROJ_LIB", "SUMO_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.delitem(sys.modules, "sumo", raising=False)
+    sumo.binary("sumo")
+    assert "PROJ_DATA" not in os.environ and "PROJ_LIB" not in os.environ
+    assert sumo.environment()["PROJ_DATA"].endswith("proj")
+    monkeypatch.setenv("PROJ_DATA", "mine")
+    sumo.binary("sumo")
+    assert os.environ["PROJ_DATA"] == sumo.environment()["PROJ_DATA"] == "mine"
 
 
 def test_another_sumos_version_is_asked(tmp_path, monkeypatch):
