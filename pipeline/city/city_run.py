@@ -10,11 +10,13 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline.city import traffic
 from pipeline.city.model import City, CityJunction
-from pipeline.city.results import junctions
+from pipeline.city.results import junctions, page
 from pipeline.city.results.junctions import JunctionResult
 from pipeline.city.running import clusters, running
 from pipeline.city.running.jobs import Done, Job
+from pipeline.core.findings import Finding, warnings_of
 from pipeline.core.progress import Progress, silent
 from pipeline.runs.locking import alone
 
@@ -26,6 +28,7 @@ class CityRun:
     out: Path
     results: tuple[JunctionResult, ...]
     files: tuple[Path, ...]
+    warnings: tuple[Finding, ...] = ()
 
 
 def run(
@@ -58,16 +61,18 @@ def run(
     InputError
         Where the city, a scenario or ``where`` is wrong.
     RunError
-        Where a run cannot keep its promise, or the cluster is lost; what is done is kept then.
+        Where the traffic or a run cannot keep its promise, or the cluster is lost; what is done is kept then.
     """
     chosen = choose(city, only)
     folder = Path(out) if out is not None else default_folder(city)
     with alone(folder):
         clusters.check(where)
+        made = traffic.make(city, progress)
         with clusters.connected(where) as client:
             running.run(client, jobs_of(city, folder, chosen, sets), heard=heard, progress=progress)
-        results = junctions.read_runs(folder, chosen)
-        return CityRun(folder, results, junctions.write(folder, city, results))
+        results, warnings = junctions.read_runs(folder, chosen), tuple(warnings_of([made.summary]))
+        written = *junctions.write(folder, city, results), page.write(folder, city, results, warnings)
+        return CityRun(folder, results, written, warnings)
 
 
 def choose(city: City, only: Collection[str]) -> tuple[CityJunction, ...]:

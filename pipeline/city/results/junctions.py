@@ -44,6 +44,11 @@ class JunctionResult:
         """Of the best site, by the score that ranks."""
         return self.best.score
 
+    @property
+    def gain(self) -> float:
+        """What it brings: its score, and nothing where that is not defined."""
+        return 0.0 if math.isnan(self.score) else self.score
+
 
 def run_folder(out: Path, junction: str) -> Path:
     """The folder of a junction's run."""
@@ -63,7 +68,7 @@ def read_runs(out: Path, junctions: Sequence[CityJunction]) -> tuple[JunctionRes
         sites = ScoredSite.read(run_folder(out, junction.id) / _FILE)
         found.append(JunctionResult(junction, len(sites), min(sites, key=lambda site: site.rank)))
     _check_alike(out, found)
-    values = np.array([-math.inf if math.isnan(its.score) else its.score for its in found])
+    values = np.array([its.gain for its in found])
     ranked = zip(found, ranks(values).tolist(), strict=True)
     by_rank = [JunctionResult(its.junction, its.sites, its.best, rank) for its, rank in ranked]
     return tuple(sorted(by_rank, key=lambda its: its.rank))

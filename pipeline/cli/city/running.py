@@ -50,6 +50,8 @@ def run(
             model.load(city), out, where=cluster, only=junction or (), sets=set_ or (), progress=screen.progress,
             heard=heard,
         )  # fmt: skip
+        for warning in ran.warnings:
+            screen.say(f"warning: {warning}")
     print_junctions(ran)
 
 
