@@ -4,13 +4,17 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: run test test-train unit lint bench scaling numerics validity detectability pictures schema docs fuzz clean
+.PHONY: run test test-slow test-train unit lint bench scaling numerics validity detectability pictures schema docs fuzz clean
 
 run: $(VENV)/.installed
 	$(BIN)/egvs run scenarios/nishishinjuku
 
 test: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest --ignore=tests/validation/training
+	$(BIN)/python -m pytest -m "not slow" --ignore=tests/validation/training
+
+# Sweeps, whole studies, kills: what takes more than a second or two each.
+test-slow: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest -m slow --ignore=tests/validation/training
 
 # PyTorch is large, and only those who train a detector need it.
 test-train: $(VENV)/.installed-train

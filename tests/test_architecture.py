@@ -188,6 +188,7 @@ print(json.dumps(found))
 libraries that the program imports whole, so that nothing can be forgotten of them: they cost more than the rest."""
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_each_name_can_be_imported_and_used_first_and_says_what_it_is(run_folder: Path) -> None:
     codes = {}

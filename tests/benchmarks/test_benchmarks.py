@@ -19,6 +19,7 @@ ALONG = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ALONG)
 @pytest.mark.parametrize("way", others.MARCHES)
 def test_along_an_axis_all_marches_give_the_same_voxels(way: str, case: str) -> None:

@@ -44,6 +44,7 @@ def boxes(*its: tuple[float, ...]) -> np.ndarray:
 # what was found
 
 
+@pytest.mark.slow
 def test_hits_by_hand() -> None:
     record = record_of([car(10.0), car(20.0)], [], [car(30.0), car(40.0), car(50.0)])
     found = [
@@ -109,6 +110,7 @@ def truth(x: np.ndarray) -> np.ndarray:
     return x[:, 0] / 8.0 * np.where(x[:, FEATURES.index("gap_m")] < 5.0, 0.5, 1.0)
 
 
+@pytest.mark.slow
 def test_a_planted_dependence_is_found_and_holds_elsewhere() -> None:
     given = {name: made_up(seed) for seed, name in enumerate(("one", "two", "three"), start=1)}
     learnt = fitting.fitted(list(given.values()))

@@ -51,6 +51,7 @@ DOCS = ROOT / "docs"
 # the places
 
 
+@pytest.mark.slow
 def test_the_grid_is_the_same_each_time_upright_and_at_all_heights(mini: Path) -> None:
     first, again = (poses.grid_poses(pipeline.build_scene(pipeline.load(mini)), None, "small") for _ in range(2))
     assert first == again and len(first) == 40
@@ -109,6 +110,7 @@ def part_of(mini: Path, folder: Path) -> measuring.Part:
     return measuring.Part(**{**vars(part), "scores": ("entropy_seen",)})
 
 
+@pytest.mark.slow
 def test_a_part_that_was_measured_is_kept_and_an_interrupted_one_goes_on(mini, tmp_path, monkeypatch, short) -> None:
     said: list[str] = []
     part = part_of(mini, tmp_path)

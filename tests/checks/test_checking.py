@@ -384,6 +384,7 @@ def test_warnings_are_told_beside_the_errors_that_stop_a_run(street: Path, egvs)
     assert error.startswith("egvs: ") and "the network has no edge 'north'" in error
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_a_map_that_netconvert_refuses_is_wrong_input_and_told_once(
     street: Path, monkeypatch: pytest.MonkeyPatch, egvs

@@ -34,6 +34,7 @@ def shell(line: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(["bash", "-c", f"set -o pipefail; {words}"], capture_output=True, text=True)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_closed_streams_are_no_error(mini: Path, tmp_path: Path) -> None:
     closed = "import os, sys\nfor n in (0, 1, 2): os.close(n)\nsys.stdin = sys.stdout = sys.stderr = None\n"
@@ -52,6 +53,7 @@ def test_names_that_an_encoding_does_not_know_are_printed_as_escapes(mini: Path,
     assert "\\u67f1" in done.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_full_streams_are_told_and_unread_ones_are_not() -> None:
     full = shell("egvs sensors > /dev/full")

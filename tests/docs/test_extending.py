@@ -64,6 +64,7 @@ def test_the_example_is_short(heading: str) -> None:
     assert len(modules[0].splitlines()) <= _LINES
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_an_effect_of_another_package_acts(mini: Path, tmp_path: Path) -> None:
     beside = install(package("An effect"), tmp_path / "installed")
@@ -92,6 +93,7 @@ def test_an_effect_of_another_package_is_listed_and_checked(mini: Path, tmp_path
     assert code == 2 and "unknown effect" in text, text
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_a_format_of_another_package_is_read(mini: Path, tmp_path: Path) -> None:
     beside = install(package("A format of point clouds"), tmp_path / "installed")

@@ -317,6 +317,7 @@ def test_columns_of_channels_give_the_twins_numbers(seed: int, tilt: float, step
     assert len(set(expected.tolist())) > 3
 
 
+@pytest.mark.slow
 def test_beams_of_any_weight_add_as_many_hits_as_their_listed_crossings(
     ran: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:

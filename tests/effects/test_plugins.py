@@ -57,6 +57,7 @@ def egvs(package: Path | None, *arguments: object) -> CompletedProcess[str]:
     return processes.egvs(*arguments, beside=package)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_it_is_run_like_any_other(mini, package, tmp_path):
     plain, halved, dropped = (tmp_path / name for name in ("plain", "halved", "dropped"))
@@ -72,6 +73,7 @@ def test_it_is_run_like_any_other(mini, package, tmp_path):
     assert egvs(package, "verify", halved).returncode == 0
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_a_changed_line_of_it_makes_the_score_stage_run_again(mini, package, tmp_path):
     call = ("run", mini, "--out", tmp_path / "run", "--set", "effects.half.share=0.25")

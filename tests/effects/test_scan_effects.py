@@ -231,6 +231,7 @@ def test_a_swaying_pole_sees_over_a_wall_for_its_share(mini: Path, tmp_path: Pat
 # --- foliage
 
 
+@pytest.mark.slow
 def test_leaves_let_through_what_beer_and_lambert_say(mini: Path, tmp_path: Path) -> None:
     """A crown 4 m deep, from x = 10 to 14; G x LAD = 0.5 x 0.5 = 0.25 a metre: exp(-1) = 0.3679 gets through.
 
@@ -483,6 +484,7 @@ IDLE: dict[str, tuple[list[str], tuple[dict[str, Any], ...], str]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", IDLE)
 @pytest.mark.parametrize("keep", ["true", "false"])
 def test_an_effect_that_can_change_nothing_is_skipped_and_leaves_no_trace(

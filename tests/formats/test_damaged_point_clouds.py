@@ -152,6 +152,7 @@ WHOLE = {
 }
 
 
+@pytest.mark.slow
 @settings(quick, max_examples=400)
 @given(name=st.sampled_from(sorted(WHOLE)), data=st.data())
 def test_damage_never_ends_in_anything_but_points_or_a_message(tmp_path: Path, name: str, data: st.DataObject) -> None:

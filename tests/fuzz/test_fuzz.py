@@ -27,7 +27,6 @@ def test_there_are_kinds_enough_and_each_has_its_own_file() -> None:
 
 
 @pytest.mark.system
-@pytest.mark.slow
 def test_mutants_of_some_kinds_fare_well(tmp_path: Path) -> None:
     """And a second call has nothing left to do."""
     options = ("--cases", 18, "--seed", 11, "--kinds", SLICE, "--keep", tmp_path)

@@ -360,6 +360,7 @@ def test_a_real_town_at_a_place(town: Made, tmp_path: Path) -> None:
     assert (tmp_path / "other" / "network.net.xml").read_bytes() == (town[0] / "network.net.xml").read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("walk", [False, True])
 def test_people_move_in_a_real_town(town: Made, tmp_path: Path, walk: bool) -> None:
     from pipeline.stages import traffic

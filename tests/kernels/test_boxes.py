@@ -265,6 +265,7 @@ def test_other_voxel_sizes(voxel_m):
         check(box, (6, 6, 5), voxel_m)
 
 
+@pytest.mark.slow
 def test_large_coordinates_keep_the_margin():
     """The bound that holds: 2**-48 of the largest coordinate or size; 1e-9 m covers boxes of up to 100 km."""
     rng = np.random.default_rng(4)
@@ -536,6 +537,7 @@ def test_a_fault_in_the_box_test_shows(fault, awkward):
 # --- the long hunt, in short ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "seed", "voxel_m"), [(hunt.hostile, 31, 0.25), (hunt.hostile, 32, 0.1), (hunt.vehicles, 33, 0.25)]
 )

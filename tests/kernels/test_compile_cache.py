@@ -52,6 +52,7 @@ def kept(folder: Path) -> int:
     return len(list(folder.glob("numba-*")))
 
 
+@pytest.mark.slow
 def test_a_called_kernel_that_changed_is_noticed(package: Path) -> None:
     assert call(package) == "2 compiled"
     assert call(package) == "2 kept"
@@ -69,6 +70,7 @@ def test_a_called_kernel_that_changed_is_noticed(package: Path) -> None:
     assert not list(folder.glob("numba-000*")), "those that were used longest ago went"
 
 
+@pytest.mark.slow
 def test_a_folder_of_the_users_is_used(package: Path, tmp_path: Path) -> None:
     assert call(package, NUMBA_CACHE_DIR=str(tmp_path / "mine")) == "2 compiled"
     assert call(package, NUMBA_CACHE_DIR=str(tmp_path / "mine")) == "2 kept"
@@ -76,6 +78,7 @@ def test_a_folder_of_the_users_is_used(package: Path, tmp_path: Path) -> None:
     assert kept(package / "pipeline" / "kernels" / "__pycache__") == 0
 
 
+@pytest.mark.slow
 def test_where_the_package_cannot_be_written_the_users_cache_is_used(package: Path, tmp_path: Path) -> None:
     (package / "pipeline" / "kernels" / "__pycache__").write_text("a file where the folder would be")
     home = {"XDG_CACHE_HOME": str(tmp_path / "cache"), "PYTHONDONTWRITEBYTECODE": "1"}
@@ -101,10 +104,12 @@ for data in (
 """
 
 
+@pytest.mark.slow
 def test_what_is_damaged_is_compiled_again(package: Path) -> None:
     assert call(package, DAMAGES).split() == ["kept", *["compiled"] * 6, "kept"]
 
 
+@pytest.mark.slow
 def test_where_nothing_can_be_written_the_temporary_directory_is_used(package: Path, tmp_path: Path) -> None:
     (package / "pipeline" / "kernels" / "__pycache__").write_text("a file where the folder would be")
     (tmp_path / "cache").write_text("and here")

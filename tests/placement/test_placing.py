@@ -150,6 +150,7 @@ def test_a_budget_pays_a_pole_once_and_forced_ones_never(many: Path, out: Path, 
     assert plan["cost"] == 70.0
 
 
+@pytest.mark.slow
 def test_the_fewest_that_reach_a_share(many: Path, out: Path, egvs) -> None:
     code, text, error = egvs("place", many, "--out", out, "--reach", 0.9)
     assert code == 0, error
@@ -180,6 +181,7 @@ def test_rules_and_zones_hold(many: Path, out: Path, egvs) -> None:
     assert "by 2 sensors, 50.0% asked for" in text
 
 
+@pytest.mark.slow
 def test_what_is_left_when_the_sensor_that_is_missed_most_fails(many: Path, out: Path, egvs) -> None:
     code, _, error = egvs("place", many, "--out", out, "--count", 3, "--exact", "--set", "placement.survives=1")
     assert code == 0, error
@@ -291,6 +293,7 @@ def test_a_cost_that_is_no_number_is_refused(many: Path, out: Path, egvs) -> Non
     assert "sites.csv: site c: cost: 'dear'; a number, 0 or above, in digits: 8000, not 8e3" in error
 
 
+@pytest.mark.slow
 def test_the_report_shows_the_plan_until_something_changes(many: Path, out: Path, egvs) -> None:
     egvs("run", many, "--out", out)
     before = (out / "report.html").read_text()

@@ -61,6 +61,7 @@ def test_orders_are_compared_in_words(values, tau, agreement, judgement):
     assert summary.judgement(SCORED) == judgement
 
 
+@pytest.mark.slow
 def test_a_validation_is_shown_beside_its_own_run_alone(mini, tmp_path, egvs):
     out = tmp_path / "out"
     validate = ("validate", mini, "--out", out, "--frames", "10", "--detector", "points", "--jobs", "1")
@@ -93,6 +94,7 @@ def test_a_validation_is_shown_beside_its_own_run_alone(mini, tmp_path, egvs):
     assert not section()
 
 
+@pytest.mark.slow
 def test_a_damaged_validation_is_named(mini, tmp_path, egvs):
     out = tmp_path / "out"
     assert egvs("validate", mini, "--out", out, "--frames", "10", "--detector", "points", "--jobs", "1")[0] == 0

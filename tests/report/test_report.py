@@ -471,6 +471,7 @@ def test_every_site_can_be_chosen_with_larger_pixels_where_there_are_many(tmp_pa
     assert width(second, "seen") == (width(best, "seen") // 2 if is_coarse else width(best, "seen"))
 
 
+@pytest.mark.slow
 def test_five_hundred_sites(tmp_path):
     sites = [(f"g{n:03}", 0.5 * (n % 25), -1 - 0.5 * (n // 25), 2) for n in range(500)]
     about, out = finished(tmp_path, sites=sites)
@@ -580,6 +581,7 @@ def test_ticks_are_round(low, high, texts):
     assert [text for _, text in map_frame.round_values(low, high, 5)] == texts
 
 
+@pytest.mark.slow
 def test_the_accuracy_study_is_shown_where_there_is_one(mini, tmp_path, egvs, monkeypatch):
     """Its recommendation, the front, the figure; not of another scenario or other files; the run is verified in each
     case."""
@@ -630,6 +632,7 @@ def test_the_accuracy_study_is_shown_where_there_is_one(mini, tmp_path, egvs, mo
     assert not shown()  # nor is it of other sites
 
 
+@pytest.mark.slow
 def test_a_study_that_was_replaced_is_named_by_verify(mini, tmp_path, egvs):
     out = tmp_path / "out"
     assert egvs("run", mini, "--out", out)[0] == 0

@@ -113,6 +113,7 @@ def test_a_second_folder_makes_nothing(
     assert_whole(store)
 
 
+@pytest.mark.slow
 def test_what_sumo_read_and_the_report_draws_is_held_against_its_digest(junction: Path, tmp_path: Path, egvs) -> None:
     out, scenario = tmp_path / "out", pipeline.load(junction)
     states(scenario, out)
@@ -155,6 +156,7 @@ def test_a_file_that_the_kept_stage_does_not_have_goes(mini: Path, tmp_path: Pat
     assert not (tmp_path / "out" / "visibility.parquet").exists()
 
 
+@pytest.mark.slow
 def test_a_stage_with_options_is_made_and_not_kept(done: tuple[pipeline.Scenario, Path], tmp_path: Path, store) -> None:
     scenario, _ = done
     options = {"score": {"audit": True}}
@@ -215,6 +217,7 @@ DAMAGE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", DAMAGE)
 def test_a_damaged_entry_is_named_and_made_again(
     done: tuple[pipeline.Scenario, Path], tmp_path: Path, store: Path, capsys: pytest.CaptureFixture[str], case: str
@@ -259,6 +262,7 @@ def test_a_full_disk_is_the_destinations(
     assert said.endswith(f" MB are free in {other})\n")
 
 
+@pytest.mark.slow
 def test_several_at_once_make_every_stage_once(mini: Path, tmp_path: Path, store: Path) -> None:
     running = [Child(Job(mini, tmp_path / str(number), store)) for number in range(4)]
     jobs = [child.join() for child in running]
@@ -283,6 +287,7 @@ def test_who_comes_second_waits_and_takes_it(done: tuple[pipeline.Scenario, Path
     assert_whole(store)
 
 
+@pytest.mark.slow
 def test_killed_at_ten_steps_the_store_is_whole_and_the_next_run_ends_in_the_same_bytes(
     junction: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

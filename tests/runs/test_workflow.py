@@ -253,6 +253,7 @@ def test_another_seed_in_the_same_folder_changes_no_byte_of_what_is_not_random(
     assert egvs("verify", out)[0] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by", ["egvs", "seen_well", "points_on_target", "entropy_seen"])
 @pytest.mark.parametrize("width", [80, 120, 190])
 def test_a_ranking_fits_the_terminal(mini: Path, tmp_path: Path, width: int, by: str) -> None:
@@ -274,6 +275,7 @@ def test_a_ranking_fits_the_terminal(mini: Path, tmp_path: Path, width: int, by:
     assert by == "egvs" or all(told(value) in text for value in table[by].to_pylist())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [("run",), ("accuracy", "--budget", "20s")])
 def test_an_interrupt_is_answered_in_words(tmp_path: Path, words: tuple[str, ...]) -> None:
     """It comes while SUMO is at work, which is seen by what SUMO writes."""

@@ -69,6 +69,7 @@ def test_settings_of_a_study_keep_the_number(auto: Path, tmp_path: Path) -> None
     assert gammas["gamma 2"] == 2.0
 
 
+@pytest.mark.slow
 def test_a_run_is_that_with_the_number_and_tells_it(auto: Path, tmp_path: Path, egvs) -> None:  # type: ignore[no-untyped-def]
     code, _, told = egvs("run", auto, "--out", tmp_path / "auto")
     assert code == 0

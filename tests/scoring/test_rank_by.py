@@ -45,6 +45,7 @@ def by_rank(rows: dict[str, dict[str, float]], name: str) -> bool:
     return all(row["rank"] == 1 + sum(other[name] > row[name] for other in rows.values()) for row in rows.values())
 
 
+@pytest.mark.slow
 def test_means_over_vehicles_are_those_of_the_slow_twin(
     mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -88,6 +89,7 @@ def test_what_ranks_changes_no_score(mini: Path, tmp_path: Path) -> None:
     assert all(other[site][key] == row[key] for site, row in plain.items() for key in shared)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["entropy_seen", "coverage", "expected_visibility"])
 def test_the_error_of_a_share_of_voxels_is_that_of_its_groups(mini: Path, tmp_path: Path, name: str) -> None:
     """With two blocks a group left out is the other block: its share by hand, voxel by voxel."""

@@ -173,6 +173,7 @@ EFFECTS = {
 WINDOW = "{range_m = 100, elevations_deg = [-25, 5], channels = 16, azimuth_deg = [-60, 60], azimuth_step_deg = 1}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sensor", ["window", "Livox Tele-15", "small"])
 def test_effects_act_on_every_kind_of_sensor(mini: Path, tmp_path: Path, sensor: str) -> None:
     """A score with an effect is another, and not 0: the sensors look at the region from 6 m up."""

@@ -141,6 +141,7 @@ def test_study_of_a_finished_file(mini: Path, tmp_path: Path, few: None) -> None
     assert recommended[0].error <= 0.02
 
 
+@pytest.mark.slow
 def test_recommended_setting_holds_where_sumo_runs(
     junction: Path, tmp_path: Path, few: None, monkeypatch: pytest.MonkeyPatch, egvs
 ) -> None:
@@ -174,6 +175,7 @@ def compared(study: AccuracyStudy) -> list[tuple[object, ...]]:
     return sorted(tuple(getattr(row, name) for name in names) for row in study.rows)
 
 
+@pytest.mark.slow
 def test_errors_are_deterministic_and_a_study_is_resumed(
     mini: Path, tmp_path: Path, few: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -189,6 +191,7 @@ def test_errors_are_deterministic_and_a_study_is_resumed(
     assert study_of(mini, [], tmp_path / "one").rows == one.rows
 
 
+@pytest.mark.slow
 def test_an_interrupted_study_goes_on(mini: Path, tmp_path: Path, few: None, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = study_of(mini, [], tmp_path / "whole")
     run, done = SettingRunner.run, []
@@ -218,6 +221,7 @@ def test_a_budget_leaves_settings_out_and_names_them(mini: Path, tmp_path: Path,
     assert [row["setting"] for row in rows] == ["scenario"]
 
 
+@pytest.mark.slow
 def test_without_a_longer_reference_simulated_traffic_is_judged_by_its_standard_error(
     junction: Path, tmp_path: Path, few: None
 ) -> None:
@@ -349,6 +353,7 @@ def test_thinned_beams_are_weighted_up_without_a_cap_too(mini: Path, tmp_path: P
     assert np.abs(thin / whole - 1).max() < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sensor", ["VLP-32C", "OS1-64", "RS-M1"])
 def test_a_thinned_catalogue_sensor_has_the_beams_of_the_whole_one(mini: Path, sensor: str) -> None:
     from pipeline.sensing.sensors import CATALOGUE, resolve
@@ -396,6 +401,7 @@ def test_effects_that_are_not_named_are_tried_where_they_act(mini: Path) -> None
     assert "with divergence" not in named
 
 
+@pytest.mark.slow
 def test_effects_say_what_they_cost_and_change(mini: Path, tmp_path: Path, few: None, egvs) -> None:
     """As a plain run with and without the effect says."""
     sets = ["--set", "effects.rain.rate_mm_h=90"]
@@ -431,6 +437,7 @@ KEPT = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", KEPT)
 def test_what_was_kept_and_damaged_is_named(
     mini: Path, junction: Path, tmp_path: Path, few: None, egvs, case: str
@@ -460,6 +467,7 @@ SHARED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", SHARED)
 def test_what_was_kept_and_has_another_shape_is_named(mini: Path, tmp_path: Path, few: None, egvs, case: str) -> None:
     pattern, change = SHARED[case]
@@ -473,11 +481,13 @@ def test_what_was_kept_and_has_another_shape_is_named(mini: Path, tmp_path: Path
     assert "Traceback" not in said + printed
 
 
+@pytest.mark.slow
 def test_a_study_of_another_seed_goes_on_in_the_same_folder(mini: Path, tmp_path: Path, few: None) -> None:
     study_of(mini, ["seed=9"], tmp_path, budget_s=0.5)
     assert study_of(mini, ["seed=10"], tmp_path).repeated > 0
 
 
+@pytest.mark.slow
 def test_what_is_recommended_can_be_typed(mini: Path, tmp_path: Path, few: None, egvs) -> None:
     """With the user's own ``--set``, and quoted."""
     folder = tmp_path / "a place with späce"
@@ -500,6 +510,7 @@ def test_nothing_that_is_as_long_as_the_reference_is_compared_with_it(junction: 
     assert not {"800 frames", "1600 frames", "400 frames every 1 s"} & kept
 
 
+@pytest.mark.slow
 def test_tables_fit_the_terminal(mini: Path, tmp_path: Path, few: None, capsys, monkeypatch) -> None:
     study = study_of(mini, [], tmp_path / "out")
     rows = [replace(row, front=row.kind != "measures", recommended=row.kind == "scenario") for row in study.rows]
@@ -516,6 +527,7 @@ def test_tables_fit_the_terminal(mini: Path, tmp_path: Path, few: None, capsys, 
         assert all(f"{row.seconds:.2f}" in table for row in study.rows if row.kind != "measures"), width
 
 
+@pytest.mark.slow
 def test_where_every_score_is_0_nothing_is_recommended(mini: Path, tmp_path: Path, few: None, egvs) -> None:
     far = ("--set", "roi.center_m=[5000, 5000, 2.5]", "--set", "sensors.small.range_m=20000")
     code, printed, said = egvs("accuracy", mini, "--out", tmp_path / "out", *far)
@@ -524,6 +536,7 @@ def test_where_every_score_is_0_nothing_is_recommended(mini: Path, tmp_path: Pat
     assert "inf frames" not in printed
 
 
+@pytest.mark.slow
 def test_what_was_kept_and_removed_or_damaged_is_made_again(
     mini: Path, tmp_path: Path, few: None, store: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -601,6 +614,7 @@ def test_memory_is_let_go_before_a_stage_is_measured(
     assert done == ["let go", "measured"] * len(stages.RANKING)
 
 
+@pytest.mark.slow
 def test_memory_is_that_of_the_stage(mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a stage takes is measured above what the program holds."""
     from pipeline.stages import tpog
@@ -669,6 +683,7 @@ def test_comparisons_with_ties() -> None:
     assert comparison.relative(np.array([0.0, 1.0]), np.array([0.0, 0.0])).tolist() == [0.0, np.inf]
 
 
+@pytest.mark.slow
 def test_front_holds_no_setting_that_another_beats(mini: Path, tmp_path: Path, few: None) -> None:
     rows = [row for row in study_of(mini, [], tmp_path / "out").rows if row.kind in ("approximates", "scenario")]
     for row in rows:
@@ -681,6 +696,7 @@ def test_front_holds_no_setting_that_another_beats(mini: Path, tmp_path: Path, f
         assert row.front != beaten
 
 
+@pytest.mark.slow
 def test_one_block_tells_nothing_of_errors(junction: Path, mini: Path, tmp_path: Path, few: None, egvs) -> None:
     """Refused where SUMO could watch longer; of a finished file the errors are unknown, not 0."""
     code, _, said = egvs("accuracy", junction, "--out", tmp_path / "out", "--set", "tpog.blocks=1")

@@ -62,6 +62,7 @@ def test_a_limit_beyond_the_region_is_of_little_effect_before_a_run_too(mini: Pa
         assert ("100% of returns" in found[1]) == (state == "little")
 
 
+@pytest.mark.slow
 def test_the_change_that_is_expected_is_the_one_that_a_run_finds(mini: Path, tmp_path: Path) -> None:
     plain = tmp_path / "plain"
     pipeline.run(pipeline.load(mini), plain)
@@ -133,6 +134,7 @@ def test_an_effect_that_cannot_change_anything_is_skipped_and_the_run_says_so(mi
         assert (plain / name).read_bytes() == (skipped / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_ablation_runs_each_effect_alone_and_all_together(mini: Path, tmp_path: Path, egvs) -> None:
     named = ("--set", "effects.rain.rate_mm_h=50", "--set", "effects.dropout.share=0.25")
     code, printed, said = egvs("effects", mini, *named, "--ablation", "--out", tmp_path)
@@ -197,6 +199,7 @@ def test_an_effect_that_lacks_something_is_refused(mini: Path) -> None:
     assert "finished FCD file" in found["pedestrians_bicycles"][1]
 
 
+@pytest.mark.slow
 def test_effects_that_a_study_left_out_are_named(mini: Path, tmp_path: Path, egvs) -> None:
     words = ("--out", tmp_path / "out", "--set", "effects.rain.rate_mm_h=20")
     assert egvs("accuracy", mini, "--budget", "0.001s", *words)[0] == 0

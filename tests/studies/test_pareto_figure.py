@@ -26,6 +26,7 @@ def settings(seconds: float, judged: float) -> list[Row]:
     return [row(SCENARIO, SCENARIO, "", seconds, judged), *front, *measures]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seconds", "judged"), [(0.8, 0.3), (40.0, 0.3), (40.0, 0.0), (5.0, 0.01)])
 def test_the_legend_covers_no_setting_wherever_the_scenario_lies(seconds: float, judged: float) -> None:
     figure = make_figure(settings(seconds, judged), 0.02, "trial")

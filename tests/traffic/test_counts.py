@@ -63,6 +63,7 @@ def test_turning_movements_an_edge_and_a_kind_are_met(cross, tmp_path):
     assert not {"driven.rou.xml", "candidates.rou.xml", "counts.xml"} & {f.name for f in (tmp_path / "sumo").iterdir()}
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_traffic(cross, tmp_path):
     rows = [turn("left", "right", 300), {"edge": "top0A0", "per_hour": 200}]
 

@@ -51,6 +51,7 @@ def _plain(found):
     return points, others
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_the_same_is_found_whatever_the_processes(record, monkeypatch):
     monkeypatch.setenv("EGVS_STORE", "")  # so that all is looked at both times
@@ -105,6 +106,7 @@ def test_keys_change_with_all_that_findings_depend_on(mini, tmp_path, record):
     assert key(at=same.scene.sites[0], of=same) == points
 
 
+@pytest.mark.slow
 @pytest.mark.system
 @pytest.mark.parametrize(
     ("what", "error", "message"),
@@ -150,6 +152,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_no_process_outlives_one_that_was_killed(mini, tmp_path):
     os.mkfifo(tmp_path / "alive")

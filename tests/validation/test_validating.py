@@ -91,6 +91,7 @@ def test_twice_the_same_bytes(whole, middle, tmp_path):
         assert (tmp_path / "again" / name).read_bytes() == (out / name).read_bytes(), name
 
 
+@pytest.mark.slow
 def test_what_is_kept_comes_back_as_the_results_of_another_detector(mini, middle, tmp_path):
     scenario = load(mini)
     first = validate(scenario, tmp_path / "a", frames=10, detectors=["middle"], keep=True, jobs=1)
@@ -116,6 +117,7 @@ def test_what_is_kept_comes_back_as_the_results_of_another_detector(mini, middle
         validate(scenario, tmp_path / "b", frames=10, detections=kept, jobs=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sets", "parameters"),
     [
@@ -184,6 +186,7 @@ def test_a_score_is_named_with_what_it_was_tried_with():
 # ---- through the command line
 
 
+@pytest.mark.slow
 def test_a_second_run_says_that_all_was_kept(egvs, mini, tmp_path):
     (tmp_path / "out" / ".validate-killed" / "unseen").mkdir(parents=True)  # what a kill leaves
     code, out, error = egvs(*WANTED, mini, "--out", tmp_path / "out")
@@ -225,6 +228,7 @@ def test_a_file_in_place_of_the_folder_is_left_alone(egvs, mini, tmp_path):
     assert (tmp_path / "out").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_a_site_that_sees_no_vehicle_is_told(egvs, mini, tmp_path):
     with (mini / "scenario.toml").open("a") as file:
         file.write("\n[sensors.up]\nelevations_deg = [20, 40]\nchannels = 4\nazimuth_step_deg = 2.0\nrange_m = 100\n")

@@ -310,6 +310,7 @@ def test_the_far_tip_of_a_spike_seen_along_its_length():
     assert not cast.differ(found, true).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degrees", range(1, 90, 8))
 def test_a_sensor_on_a_wall_is_not_blocked_by_it(degrees):
     """Rounding must not tell on which side of the wall the sensor stands."""

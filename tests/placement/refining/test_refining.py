@@ -94,6 +94,7 @@ def _unmoved(folder: Path, poses: dict[str, Pose]) -> Placement:
     return placed
 
 
+@pytest.mark.slow
 def test_from_the_worst_corner_it_finds_what_a_fine_grid_finds(mini: Path) -> None:
     """One sensor, its height and its pitch free: 5 heights by 41 pitches, tried one by one, and 200 poses from the
     worst of the corners."""
@@ -173,6 +174,7 @@ def test_the_forced_one_stays_and_costs_nothing(mini: Path) -> None:
     assert other.moved_m > 0.0 and other.cost == 5.0
 
 
+@pytest.mark.slow
 def test_the_same_bytes_twice_and_on_two_threads(mini: Path) -> None:
     written = []
     for jobs in (1, 1, 2):

@@ -26,6 +26,7 @@ def best_of_all(its) -> float | None:
     return max(values, default=None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", range(0, 2000, 100))
 def test_no_plan_is_better_than_the_one_that_is_proved_and_no_bound_is_exceeded(start: int) -> None:
     """2,000 problems of every kind: the exact plan is the best to the last bit, and no certificate is wrong."""
@@ -90,6 +91,7 @@ def test_a_search_that_runs_out_of_time_proves_what_it_says() -> None:
         assert found.point.bound >= best, seed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", range(0, 150, 50))
 def test_degenerate_problems_are_solved_and_every_point_of_the_curve_holds(start: int) -> None:
     """The plan is the best one, whether the search ends or not no bound is exceeded, and no larger plan is worse."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 import shapely
 from hypothesis import given
 from hypothesis import strategies as st
@@ -75,6 +76,7 @@ def slowly(at, yaw, lanes):
     return best
 
 
+@pytest.mark.slow
 @given(st.integers(0, 10_000))
 def test_against_shapely(seed):
     rng = np.random.default_rng(seed)

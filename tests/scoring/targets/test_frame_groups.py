@@ -89,6 +89,7 @@ def test_the_standard_error_of_a_plain_mean_is_that_of_its_groups():
     assert estimate.bias[0] == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_the_standard_error_is_as_large_as_the_error_is():
     """On made-up traffic whose vehicles come in numbers, and are seen the worse the more there are."""
     rng = np.random.default_rng(4)

@@ -147,6 +147,7 @@ def scene(seed: int, upright: bool):
     return frames, beams, noticed
 
 
+@pytest.mark.slow
 @given(st.integers(0, 2**32 - 1), st.booleans())
 @settings(max_examples=20)
 def test_as_every_beam_against_every_box(seed, upright):

@@ -54,6 +54,7 @@ def overlaps(boxes, found, slope=0.0):
     return np.array(each).T
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("yaw", [0.0, 0.4, 1.2, 2.5])
 @pytest.mark.parametrize("place", [(15.0, 6.0), (-9.0, 20.0), (-12.0, -14.0)])
 @pytest.mark.parametrize("noise_m", [0.0, 0.03])
@@ -129,6 +130,7 @@ def test_an_empty_sweep_and_one_point_are_nothing():
     assert detector.detect(Sweep(sweep.points[new], sweep.beam[new])).scores.shape == (0,)
 
 
+@pytest.mark.slow
 def test_the_empty_scene_holds_nothing():
     detector, sweep = look([], still=[(0.8, 7.0, 1.3, 0.5, 4.0, 0.0)], noise_m=0.02)
     assert len(detector.detect(sweep).boxes) == 0

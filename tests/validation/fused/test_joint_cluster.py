@@ -25,6 +25,7 @@ def fused(boxes, poses, still=(), noise_m=0.0):
     return joint.detect([sweep for _, sweep in seen]), [detector.detect(sweep) for detector, sweep in seen]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("yaw", [0.0, 0.7, 1.6])
 def test_a_car_between_two_sensors_is_found_once(yaw):
     boxes = [(4.0, 15.0, *CAR, yaw)]
@@ -93,6 +94,7 @@ def test_ends_that_another_sensor_faces_and_sees_as_sides():
     assert shown_ends(edge, box, sensors_m, 0).tolist() == [[[False, True], [False, False]]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("x_m", "size_m"), [(0.0, (4.3, 1.79, 1.46)), (4.0, (10.5, 2.5, 3.7))])
 def test_what_is_seen_from_both_ends_is_as_long_as_it_looks(x_m, size_m):
     """A car on the line between two sensors, of which neither sees its length; a lorry beside it."""

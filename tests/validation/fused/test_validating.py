@@ -32,6 +32,7 @@ def planned(mini, tmp_path, egvs):
     return mini, tmp_path / "out"
 
 
+@pytest.mark.slow
 def test_the_plan_of_a_run(egvs, planned, tmp_path, monkeypatch):
     mini, out = planned
     code, told, error = egvs("validate", mini, "--plan", "--out", out, *WANTED)
@@ -56,6 +57,7 @@ def test_the_plan_of_a_run(egvs, planned, tmp_path, monkeypatch):
     assert not (tmp_path / "again" / "placement.parquet").exists()
 
 
+@pytest.mark.slow
 def test_one_sensor_finds_what_it_finds_alone_and_points_add_up(mini, tmp_path):
     record = unseen_record.prepare(load(mini), tmp_path / "unseen", FRAMES)
     detectors, sites, names = {"cluster": Cluster()}, record.scene.sites, [POINTS, "cluster"]
