@@ -7,6 +7,7 @@ of the pose that rests, however fast somebody drags.
 
 from __future__ import annotations
 
+import gc
 import io
 import shlex
 import threading
@@ -20,6 +21,7 @@ import numpy as np
 import viser
 from matplotlib import image
 
+from pipeline.core.cost import let_go
 from pipeline.core.errors import EgvsError, InputError, RunError
 from pipeline.explore import settings, wording
 from pipeline.explore.controls import Controls, modal
@@ -39,6 +41,10 @@ HOST = "127.0.0.1"
 GIZMO_M = 6.0
 FRAME_S = 0.25
 """So long a frame stays while recorded traffic plays; longer where the machine needs it."""
+
+
+LET_GO_EVERY = 32
+"""After so many moves memory that is kept for later is given back: it grows as arrays of many sizes come and go."""
 
 
 class _Server(viser.ViserServer):
@@ -79,7 +85,7 @@ class Page:
         self._latest, self._wanted = self.view, False
         self._ended = self._is_busy = False
         self._dragging: int | None = None
-        self._notice = ""
+        self._notice, self._shown = "", 0
         self.guard = Guard(self._followed)
         with redirect_stdout(io.StringIO()), self.guard.before_a_server():  # it greets in its own words
             self._server = _Server(host=HOST, port=port, label="egvs explore", verbose=False)
@@ -91,6 +97,7 @@ class Page:
             raise InputError("--port", f"{port} is taken", "another one, or 0 for any that is free")
         self._draw()
         self._show(self.view)
+        let_go()  # what the run that came before has left
 
     @property
     def address(self) -> str:
@@ -247,6 +254,7 @@ class Page:
         session_before, plan_before = self.session, self.plan
         view = self._settled(view)
         site, is_new, rests = view.site, self.session is not session_before, self._dragging is None
+        is_another = is_new or site.sensor != self.rating.site.sensor
         if is_new or site != self.rating.site:
             self.rating = self.session.rate(site.name, site.pose, site.sensor)
         self.view, rating = view, self.rating
@@ -264,6 +272,11 @@ class Page:
                 self._gizmo.wxyz = np.array(turning.quaternion(site.pose))
                 legend = layers.draw(self._drawn())
             self.controls.show(self.session, view, rating, self._told(rests), legend)
+        self._shown += 1
+        if is_another:
+            gc.collect()  # what was made for the session or the sensor before
+        if is_another or self._shown % LET_GO_EVERY == 0:
+            let_go()
 
     def _settled(self, view: View) -> View:
         """Bring the session to the settings and the period of a view; settings that are refused stay as they are."""
@@ -280,6 +293,7 @@ class Page:
         if mix is not self._mix:
             self.plan = _as_moved(self.plan, mix)
         if mix is not self._mix or view.period != self.session.period:
+            self.session.forget()  # it may be wanted again, but not now
             self._mix, self.session = mix, mix.in_period(view.period) if view.period else mix
             self._playback = Playback(self.session)
         return view

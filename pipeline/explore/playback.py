@@ -98,7 +98,7 @@ class Playback:
     def _maker_of(self, site: Site) -> CloudMaker:
         scene = self._session.scene_before(site)
         if self._scanner is None or self._scanner[0] is not scene:
-            self._scanner = (scene, Scanner(scene, whole=True))
+            self._scanner = (scene, Scanner(scene, whole=True, mounts=1))
             self._maker = None
         if self._maker is None or self._maker[0] != site:
             self._maker = (site, CloudMaker.of_site(scene, site, self._scanner[1], self._shapes))

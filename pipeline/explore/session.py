@@ -108,6 +108,11 @@ class Session:
         """The same run, seen in another period alone; in the mix of all for an empty name."""
         return Session(self.work, self._stages, period)
 
+    def forget(self) -> None:
+        """Let go of what scores poses quickly; it is made again when it is asked for."""
+        self._engines.clear()
+        self.__dict__.pop("entropy_bit", None)
+
     @cached_property
     def plan(self) -> MovingPlan | None:
         """The plan in the run's folder, where there is one that was made from the same traffic and scans."""
@@ -241,7 +246,7 @@ class Session:
         key = tuple(effect.NAME for effect in scene.effects)
         if key not in self._engines:
             scene = replace(scene, sites=())  # one caster serves every pose
-            self._engines[key] = _Engine(scene, Scanner(scene), self._scorer(scene))
+            self._engines[key] = _Engine(scene, Scanner(scene, mounts=1), self._scorer(scene))
         return self._engines[key]
 
     def _scorer(self, scene: Scene) -> Scorer:

@@ -72,6 +72,10 @@ class Scan:
         return ScannedSite(name, pole or name, self.pose, self.sensor.name, *counts)
 
 
+_MOUNTS = 32
+"""Different mounts whose beam directions are kept (1.4 MB each of 57,600 beams)."""
+
+
 class Scanner:
     """Scans from any pose before one scene. Threads may share one; it pickles to the scene that it was built from.
 
@@ -83,10 +87,12 @@ class Scanner:
         What is scanned.
     whole
         Cast every beam of a sensor, also those that cannot meet the region of interest, and tell what each ends on.
+    mounts
+        How many ways of mounting a sensor are remembered: many sites share theirs, poses that are dragged do not.
     """
 
-    def __init__(self, scene: Scene, *, whole: bool = False) -> None:
-        self.scene, self.whole = scene, whole
+    def __init__(self, scene: Scene, *, whole: bool = False, mounts: int = _MOUNTS) -> None:
+        self.scene, self.whole, self._mounts = scene, whole, mounts
         self._expanders = [effect for effect in scene.effects if isinstance(effect, BeamExpander)]
         cutters = [effect for effect in scene.effects if isinstance(effect, BeamCutter)]
         self._opaque = scene.world
@@ -99,7 +105,7 @@ class Scanner:
         self._lock = threading.Lock()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return partial(Scanner, whole=self.whole), (self.scene,)
+        return partial(Scanner, whole=self.whole, mounts=self._mounts), (self.scene,)
 
     @property
     def opaque_world(self) -> World:
@@ -185,7 +191,7 @@ class Scanner:
         mount = (sensor, pose.angles_deg)
         with self._lock:
             if mount not in self._directions:
-                while len(self._directions) >= _MOUNTS:
+                while len(self._directions) >= self._mounts:
                     del self._directions[next(iter(self._directions))]
                 self._directions[mount] = sensor.directions(*pose.angles_deg)
             return self._directions[mount]
@@ -240,10 +246,6 @@ def _standing(scene: Scene) -> Iterator[tuple[tuple[float, float, float], Sensor
             yield site.pose.position_m, scene.sensor(site.sensor)
         except InputError:
             continue
-
-
-_MOUNTS = 32
-"""Different mounts whose beam directions are kept (1.4 MB each of 57,600 beams)."""
 
 
 def _different(ascending: NDArray[np.uint32]) -> int:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import socket
 import threading
 import urllib.error
 import urllib.request
+import weakref
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -196,6 +198,35 @@ def test_what_is_asked_while_a_setting_is_made_is_not_lost(page: Page, session: 
     assert page.rest(60)
     assert (page.view.settings.gamma, page.view.site.pose, page.view.layer) == (2.0, pose, "missed")
     assert page.session.scenario.gamma == 2.0
+
+
+def test_nothing_is_held_of_poses_sensors_and_sessions_that_were(page: Page, session: Session) -> None:
+    """What a page holds on to is bounded: one mount a scanner, one engine a session, messages of what is shown."""
+    buffer = page._server._websock_server._broadcast_buffer
+
+    def held() -> tuple[int, int, int, int]:
+        engines = session._engines.values()
+        mounts = sum(len(engine.scanner._directions) for engine in engines)
+        return len(engines), mounts, len(buffer.message_from_id), len(buffer.id_from_redundancy_key)
+
+    def walk() -> None:
+        for step in range(12):
+            page.ask(layer=sorted(LAYERS)[step % len(LAYERS)])
+            settled(page, "pole_a", Pose(10 + step / 8, 12, 3, 3.0 * step), ("VLP-16", "small")[step % 2])
+        for gamma in (1.0, 2.0, None):
+            page.ask(settings=Settings(gamma, "egvs", frozenset()))
+            assert page.rest(60)
+
+    walk()
+    sessions = weakref.WeakSet([page._variants.session(Settings(3.0, "egvs", frozenset()))])
+    first = held()
+    walk()
+    gc.collect()
+    assert held() == first
+    assert first[1] == 1
+    assert not sessions
+    again = session.rate("pole_a", page.view.site.pose, "small")
+    assert page.rating == again
 
 
 def test_a_link_shows_what_it_says(page: Page, session: Session) -> None:

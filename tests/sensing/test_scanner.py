@@ -72,7 +72,19 @@ def test_threads_may_share_one(scene):
     assert all(same(one, other) for one, other in zip(alone, shared, strict=True))
 
 
-def test_it_pickles_to_what_it_was_built_from(mini):
+def test_no_more_mounts_are_remembered_than_it_is_told(mini: Path) -> None:
+    scene = pipeline.build_scene(pipeline.load(mini))
+    one, many = Scanner(scene, mounts=1), Scanner(scene)
+    for yaw_deg in (0.0, 10.0, 20.0, 10.0):
+        pose = Pose(10.0, 12.0, 3.0, yaw_deg)
+        first, second = (scanner.scan(pose, scene.sensor("small")) for scanner in (one, many))
+        assert np.array_equal(first.rows.ends_m, second.rows.ends_m)
+        assert len(one._directions) == 1
+    assert len(many._directions) == 3
+    assert pickle.loads(pickle.dumps(one))._mounts == 1
+
+
+def test_it_pickles_to_what_it_was_built_from(mini: Path) -> None:
     scene = pipeline.build_scene(pipeline.load(mini, EFFECTS))
     scanner = Scanner(scene)
     pose, sensor = scene.sites[0].pose, scene.sensor("small")
@@ -81,7 +93,7 @@ def test_it_pickles_to_what_it_was_built_from(mini):
     assert same(scanner.scan(pose, sensor), again.scan(pose, sensor))
 
 
-def test_one_bad_site_refuses_itself_alone(mini):
+def test_one_bad_site_refuses_itself_alone(mini: Path) -> None:
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m,sensor\ngood,10,12,3,\nwall,16,6,3,\ntypo,10,12,3,VLP-99\n")
     scene = pipeline.build_scene(pipeline.load(mini))
     scanner = Scanner(scene)

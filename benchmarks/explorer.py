@@ -1,0 +1,116 @@
+"""What the explorer takes: from the end of a move to the new number, and the memory after many moves.
+
+Random moves of candidates of a scenario (position, height, yaw, tilt), changes of sensor and of period, all through the
+page that a browser would look at, but without a browser: what it takes to draw depends on the graphics card. Prints the
+median and the 95th percentile of the time, and the resident memory as it goes.
+
+    python -m benchmarks.explorer scenarios/nishishinjuku --moves 200
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import resource
+import tempfile
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.explore.opening import open_session
+from pipeline.explore.page import Page
+from pipeline.explore.view import LAYERS
+from pipeline.sensing.sensors import CATALOGUE
+from pipeline.sensing.sites import Site
+
+_PAGE = resource.getpagesize()
+
+
+def memory_mb() -> float:
+    """Resident memory of this process."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * _PAGE / 1e6
+
+
+def moved(site: Site, dice: random.Random) -> Site:
+    """A candidate somewhere near."""
+    pose = site.pose
+    return replace(
+        site,
+        pose=replace(
+            pose,
+            x_m=round(pose.x_m + dice.uniform(-5, 5), 3),
+            y_m=round(pose.y_m + dice.uniform(-5, 5), 3),
+            z_m=round(pose.z_m + dice.uniform(0, 4), 3),
+            yaw_deg=round(dice.uniform(-180, 180), 2),
+            pitch_deg=round(dice.uniform(-20, 5), 2),
+        ),
+    )
+
+
+def main() -> None:
+    """Move, change sensors and periods, and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("place", type=Path)
+    parser.add_argument("--moves", type=int, default=200)
+    parser.add_argument("--sensors", type=int, default=20)
+    parser.add_argument("--periods", type=int, default=5)
+    parser.add_argument("--layer", choices=list(LAYERS), default="none")
+    parser.add_argument("--out", type=Path)
+    asked = parser.parse_args()
+    session = open_session(asked.place, (), asked.out)
+    with tempfile.TemporaryDirectory() as scratch:
+        page = Page(session, Path(scratch))
+        loop = threading.Thread(target=page.run)
+        loop.start()
+        try:
+            page.ask(layer=asked.layer)
+            page.rest(600)
+            _walk(page, asked)
+        finally:
+            page.end()
+            loop.join()
+            page.stop()
+
+
+def _walk(page: Page, asked: argparse.Namespace) -> None:
+    dice, sites = random.Random(1), [its.site for its in page.session.ranked]
+    opened = memory_mb()
+    moves = [moved(dice.choice(sites), dice) for _ in range(asked.moves)]
+    _walked(page, moves[:10], len(CATALOGUE), 1 + len(page.session.periods))
+    first = memory_mb()
+    taken_ms = _walked(page, moves, asked.sensors, asked.periods)
+    last = memory_mb()
+    median, most = np.percentile(taken_ms, [50, 95])
+    print(f"end of a move to the number: median {median:.0f} ms, 95 % within {most:.0f} ms")
+    print(f"memory: {opened:.0f} MB opened, {first:.0f} MB after a few of each, {last:.0f} MB at the end: "
+          f"{last / first - 1.0:+.1%}")  # fmt: skip
+    again = page.session.rate(page.view.site.name, page.view.site.pose, page.view.site.sensor)
+    print(f"the last score is right: {again == page.rating}")
+
+
+def _walked(page: Page, moves: list[Site], sensors: int, periods: int) -> list[float]:
+    """So many moves, changes of sensor and of period; milliseconds of each move."""
+    taken_ms = [_shown_ms(page, site) for site in moves]
+    for sensor in (list(CATALOGUE) * sensors)[:sensors]:
+        _shown_ms(page, replace(page.view.site, sensor=sensor))
+    _shown_ms(page, moves[-1])
+    names = ("", *page.session.periods)
+    for number in range(periods if page.session.periods else 0):
+        page.ask(period=names[(number + 1) % len(names)])
+        page.rest(600)
+    return taken_ms
+
+
+def _shown_ms(page: Page, site: Site) -> float:
+    """From the end of a move until all is shown."""
+    begin = time.perf_counter()
+    page.ask(site=site)
+    page.rest(600)
+    return 1000.0 * (time.perf_counter() - begin)
+
+
+if __name__ == "__main__":
+    main()

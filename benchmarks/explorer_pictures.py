@@ -1,0 +1,111 @@
+"""Draws the pictures of the explorer in the docs and in the README: the page over nishishinjuku, in a headless browser.
+
+    python -m benchmarks.explorer_pictures [--only lanes] [--out docs/images]
+
+Needs Chromium and playwright. Drawing is done in software, so it takes a minute or two.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import tempfile
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import pipeline
+from pipeline.explore.opening import open_session
+from pipeline.explore.page import Page
+from pipeline.explore.view import Camera
+from pipeline.sensing.sites import Pose
+
+SCENARIO = Path("scenarios/nishishinjuku")
+GRAPHICS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+WIDTH, HEIGHT = 1200, 720
+ABOVE = Camera((196.0, 168.0, 86.0), (198.0, 230.0, 0.0))
+NEAR = Camera((172.0, 196.0, 30.0), (196.0, 232.0, 0.0))
+HIGHER = Pose(190.0, 255.0, 5.5)
+
+PICTURES: dict[str, tuple[Camera, dict[str, Any]]] = {
+    "explore": (ABOVE, {"layer": "missed", "pose": HIGHER}),
+    "explore-dark": (ABOVE, {"layer": "missed", "pose": HIGHER, "is_dark": True}),
+    "explore-1-opened": (ABOVE, {}),
+    "explore-2-dragged": (ABOVE, {"layer": "seen", "pose": HIGHER}),
+    "explore-3-lanes": (ABOVE, {"layer": "blindspots", "pose": HIGHER}),
+    "explore-4-difference": (ABOVE, {"layer": "difference", "pose": HIGHER, "beside": "c10"}),
+    "explore-5-traffic": (NEAR, {"layer": "replay", "pose": HIGHER, "frame": 120}),
+}
+
+
+def main() -> None:
+    """Draw them all, or some."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", default="")
+    parser.add_argument("--run", type=Path, help="a folder of a run, with a plan; a fresh one when left out")
+    parser.add_argument("--out", type=Path, default=Path("docs/images"))
+    asked = parser.parse_args()
+    with tempfile.TemporaryDirectory() as scratch:
+        run = asked.run or Path(scratch) / "run"
+        if not (run / "placement.parquet").is_file():
+            pipeline.place(pipeline.load(SCENARIO, ["placement.count=2"]), run)
+        with _tab(Path(scratch), run) as (page, tab):
+            for name, (camera, view) in PICTURES.items():
+                if asked.only in name:
+                    _draw(page, tab, camera, view, asked.out / f"{name}.png")
+
+
+@contextmanager
+def _tab(scratch: Path, run: Path) -> Iterator[tuple[Page, Any]]:
+    """The page, and a browser's tab with it."""
+    from playwright.sync_api import sync_playwright
+
+    page = Page(open_session(SCENARIO, (), run), scratch / "page")
+    loop = threading.Thread(target=page.run)
+    loop.start()
+    try:
+        with sync_playwright() as playwright:
+            chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+            browser = playwright.chromium.launch(executable_path=chromium, args=GRAPHICS)
+            tab = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+            tab.goto(page.address)
+            tab.get_by_text("rank 1 of").wait_for(timeout=120_000)
+            tab.wait_for_timeout(4000)
+            _close_warning(tab)
+            yield page, tab
+            browser.close()
+    finally:
+        page.end()
+        loop.join()
+        page.stop()
+
+
+def _close_warning(tab: Any) -> None:
+    """Of drawing in software."""
+    warning = tab.get_by_text("Software WebGL rendering detected")
+    if warning.count():
+        tab.locator("button.mantine-Notification-closeButton").first.click()
+
+
+def _draw(page: Page, tab: Any, camera: Camera, view: dict[str, Any], path: Path) -> None:
+    site = page.session.ranked[0].site
+    pose = view.get("pose", site.pose)
+    changes = {key: value for key, value in view.items() if key != "pose"}
+    blank = {"layer": "none", "beside": "", "frame": 0, "is_dark": False}
+    page.ask(site=replace(site, pose=pose), **{**blank, **changes})
+    assert page.rest(120)
+    (client,) = page._server.get_clients().values()
+    client.camera.position = np.subtract(camera.from_m, page.zero_m)
+    client.camera.look_at = np.subtract(camera.at_m, page.zero_m)
+    tab.wait_for_timeout(6000)
+    tab.screenshot(path=path, timeout=120_000)
+    print(path)
+
+
+if __name__ == "__main__":
+    main()
