@@ -2,7 +2,7 @@
 
 A city is a folder of ordinary scenarios that share one traffic:
 
-    city.toml                      name, seed, [traffic]: the traffic of all junctions
+    city.toml                      name, seed, [traffic], [effects]: the traffic of all junctions
     junctions.csv                  which junctions there are, one a row
     junctions/scenario.toml        what their scenarios have in common
     junctions/<ID>/scenario.toml   an ordinary scenario; its traffic is the file below
@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 from pipeline.core.errors import InputError
 from pipeline.core.reading import documents, limits
 from pipeline.core.strict_model import StrictModel
+from pipeline.scenario.effects import EffectsModel
 from pipeline.scenario.loading import check_acting, default_name
 from pipeline.scenario.messages import explain
 from pipeline.scenario.models import FILE as SCENARIO_FILE
@@ -48,6 +49,7 @@ class CityModel(StrictModel):
     attribution: str = Field("", description="Whose map this is; shown with results")
     seed: int = Field(0, ge=0, le=2**63 - 1, description="Of the traffic")
     traffic: TrafficModel = Field(description="The traffic of all junctions, as in a scenario")
+    effects: EffectsModel = Field(EffectsModel(), description="Effects that add traffic: people on foot, on bicycles")
 
 
 @dataclass(frozen=True)
@@ -82,6 +84,7 @@ class City:
     junctions: tuple[CityJunction, ...]
     attribution: str = ""
     description: str = ""
+    effects: EffectsModel = field(default_factory=EffectsModel)
 
     @property
     def file(self) -> Path:
@@ -113,7 +116,8 @@ def load(folder: str | Path) -> City:
     model = _model(file)
     junctions = tuple(_junctions(file.parent / TABLE))
     city = City(
-        file.parent, model.name, model.seed, model.traffic, junctions, model.attribution, model.description
+        file.parent, model.name, model.seed, model.traffic, junctions, model.attribution, model.description,
+        model.effects,
     )  # fmt: skip
     for junction in junctions:
         if not (its := junction.scenario_folder(city) / SCENARIO_FILE).is_file():
@@ -135,7 +139,7 @@ def _model(file: Path) -> CityModel:
 
 def _junctions(path: Path) -> Iterator[CityJunction]:
     seen = set[str]()
-    for place, row in _rows(path):
+    for place, row in csv_rows(path, COLUMNS, COLUMNS):
         junction = _junction(place, row)
         if junction.id.casefold() in seen:  # folders that some systems do not tell apart
             raise InputError(place, "stands there twice", "a name of its own for each junction")
@@ -145,16 +149,20 @@ def _junctions(path: Path) -> Iterator[CityJunction]:
         raise InputError(path, "holds no junction", "at least one")
 
 
-def _rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
-    """The rows of the table, each with its place for messages."""
+def csv_rows(path: Path, needed: Sequence[str], known: Sequence[str]) -> Iterator[tuple[str, dict[str, str]]]:
+    """The rows of a table of junctions, each with its place for messages.
+
+    InputError where it has not the ``needed`` columns, or others than those ``known``.
+    """
+    right = f"the columns {', '.join(needed)}"
     if not path.is_file():
-        raise InputError(path, "no such file", f"a table with the columns {', '.join(COLUMNS)}")
+        raise InputError(path, "no such file", f"a table with {right}")
     text = limits.read_bytes(path, limits.DOCUMENT)
     try:
         reader = csv.DictReader(text.decode("utf-8-sig").splitlines(), skipinitialspace=True, strict=True)
-        if sorted(reader.fieldnames or ()) != sorted(COLUMNS):
-            shown = ", ".join(reader.fieldnames or ()) or "none"
-            raise InputError(path, f"has the columns {shown}", f"the columns {', '.join(COLUMNS)}, with commas")
+        names = list(reader.fieldnames or ())
+        if not set(needed) <= set(names) <= set(known) or len(set(names)) < len(names):
+            raise InputError(path, f"has the columns {', '.join(names) or 'none'}", f"{right}, with commas")
         for row in reader:
             place = f"{path}: junction {row.get('junction') or '?'}"
             if None in row or None in row.values():
@@ -169,14 +177,15 @@ def _junction(place: str, row: dict[str, str]) -> CityJunction:
         TypeAdapter(Name).validate_python(row["junction"])
     except ValidationError:
         raise InputError(f"{place}: junction", repr(row["junction"])[:80], NAME_IN_WORDS) from None
-    numbers = {key: _number(f"{place}: {key}", row[key], most) for key, most in _MOST.items()}
+    numbers = {key: number(f"{place}: {key}", row[key], most) for key, most in _MOST.items()}
     signalised = _TRUTH.get(row["signalised"].strip().lower())
     if signalised is None:
         raise InputError(f"{place}: signalised", repr(row["signalised"])[:80], "true or false")
     return CityJunction(row["junction"], row["title"], **numbers, signalised=signalised)
 
 
-def _number(place: str, text: str, most: float) -> float:
+def number(place: str, text: str, most: float) -> float:
+    """A number of a table, at most ``most`` either way; InputError where it is none."""
     try:
         value = float(text)
     except ValueError:

@@ -14,17 +14,18 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.city import cutting, regions
-from pipeline.city.model import FILE, TABLE, TRAFFIC, City
+from pipeline.city.model import FILE, JUNCTIONS, TABLE, TRAFFIC, City
 from pipeline.city.regions import Region
 from pipeline.core import code_digest, files
 from pipeline.core.errors import InputError
 from pipeline.core.findings import WARNINGS, Finding
 from pipeline.core.progress import Progress, silent
 from pipeline.core.reading import documents
-from pipeline.effects import on_traffic
+from pipeline.effects import on_traffic, registry
 from pipeline.runs import stage_keys
 from pipeline.runs.locking import alone
 from pipeline.scenario.loading import from_values
+from pipeline.scenario.models import FILE as SCENARIO_FILE
 from pipeline.scenario.models import Scenario
 from pipeline.stages import traffic as stage
 from pipeline.stages.base import Workspace
@@ -82,6 +83,10 @@ def scenario_of(city: City, its_regions: Mapping[str, Region]) -> Scenario:
     """The city's traffic as a scenario, whose region of interest holds all junctions' regions."""
     if city.traffic.periods:
         raise InputError(f"{city.file}: traffic.periods", "a city has one period", "a city for each period")
+    for name in city.effects.named:
+        if not getattr(registry.effect_class(name), "ADDS_TRAFFIC", False):
+            right = f"in {JUNCTIONS}/{SCENARIO_FILE}, for every junction, or in those of some"
+            raise InputError(f"{city.file}: effects.{name}", "adds no traffic", right)
     low = [min(getattr(region, key) for region in its_regions.values()) for key in ("low_x_m", "low_y_m")]
     high = [max(getattr(region, key) for region in its_regions.values()) for key in ("high_x_m", "high_y_m")]
     middle, size = (
@@ -94,6 +99,7 @@ def scenario_of(city: City, its_regions: Mapping[str, Region]) -> Scenario:
         "roi": {"center_m": [*middle, _HEIGHT_M / 2], "size_m": [*size, _HEIGHT_M], "voxel_m": _HEIGHT_M},
         "tpog": {"blocks": 1},
         "traffic": city.traffic.model_dump(mode="json", exclude_unset=True),
+        "effects": city.effects.model_dump(mode="json"),
         "sites": {"file": TABLE},
     }
     scenario = from_values(values, city.folder, str(city.file))
@@ -143,6 +149,7 @@ def _record(
         done = recorded.summary()
         doubts = trajectories.doubts(tally, recorded, scenario.roi.box)
     summary = tally.to_json(recorded.window.period_ms / 1000.0) | ({} if done is None else asdict(done))
+    doubts = [doubt for doubt in doubts if doubt.rule != "overlaps"]  # a share of frames: each junction tells its own
     doubts += [
         Finding(
             "relief", sumo_folder.place_of(scenario), f"{effect.NAME} acts on the network, but not at junctions", _LEVEL
@@ -155,7 +162,13 @@ def _record(
         found = f"no vehicle comes near {', '.join(empty)} in {tally.frames} frames"
         cure = "more traffic, or no row for these junctions in junctions.csv"
         doubts.append(Finding("junctions without traffic", sumo_folder.place_of(scenario), found, cure))
-    summary[WARNINGS] = [*summary.get(WARNINGS, []), *(finding.to_json() for finding in doubts)]
+    told = [*summary.get(WARNINGS, []), *(finding.to_json() for finding in doubts)]
+    summary[WARNINGS] = [{key: _of_city(value) for key, value in warning.items()} for warning in told]
     if notes:
         summary["notes"] = [*summary.get("notes", []), *notes]
     return summary, rows
+
+
+def _of_city(value: Any) -> Any:
+    """A warning's words: what stands for the region of interest is the rectangle round all junctions."""
+    return value.replace("the region of interest", "the city's junctions") if isinstance(value, str) else value

@@ -72,12 +72,12 @@ def host_and_port(text: str) -> tuple[str, int]:
     return host, int(port)
 
 
-def latitude_and_longitude(text: str) -> tuple[float, float]:
-    """``--at``: LAT,LON in degrees."""
+def latitude_and_longitude(text: str, option: str = "--at") -> tuple[float, float]:
+    """``--at``, ``--around``: LAT,LON in degrees."""
     try:
         lat, lon = (float(part) for part in text.split(","))
     except ValueError:
-        raise InputError("--at", repr(text), "LAT,LON in degrees, for example 50.8704,9.7080") from None
+        raise InputError(option, repr(text), "LAT,LON in degrees, for example 50.8704,9.7080") from None
     return lat, lon
 
 
@@ -103,6 +103,15 @@ def radius_m(text: str) -> float | None:
         value = math.nan
     if not 0 < value <= FARTHEST_M:
         raise InputError("--surroundings", repr(text)[:80], "metres, for example 300, or all")
+    return value
+
+
+def length_m(text: str, option: str) -> float:
+    """Metres from 1500, 1500m or 2km."""
+    match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)(m|km)?", text)
+    value = float(match[1]) * (1000.0 if match[2] == "km" else 1.0) if match else math.nan
+    if not 0 < value < math.inf:
+        raise InputError(option, repr(text)[:80], "a length above 0, for example 1500m or 2km")
     return value
 
 

@@ -14,8 +14,10 @@ from __future__ import annotations
 import html
 import math
 from collections.abc import Sequence, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import shapely
@@ -28,6 +30,8 @@ from pipeline.traffic.network import LANE_WIDTH_M, Edge, Network
 from pipeline.traffic.network import Junction as Node
 from pipeline.traffic.network import read as read_network
 from pipeline.world.world_frame import located
+
+T = TypeVar("T")
 
 ROI_LEAST_M, ROI_MOST_M, ROI_STEP_M, ROI_HEIGHT_M = 60.0, 120.0, 10.0, 5.0
 APPROACH_M = 20.0
@@ -93,6 +97,27 @@ class Streets:
         """Longitude and latitude in degrees of positions in the world frame."""
         return [(lon, lat) for lon, lat in self._frame.to_degrees(np.array(points_m)).tolist()]
 
+    def near(self, window: BaseGeometry) -> Streets:
+        """What of them touches a window, in the same order: all that kerbs inside it need, without connections."""
+        names, nodes = list(self.areas), {j.id for j in self._those(self._junction_tree, self.junctions, window)}
+        areas = {name: self.areas[name] for name in self._those(self._area_tree, names, window)}
+        edges = tuple(edge for edge in self.network.all_edges if edge.id in areas)
+        junctions = tuple(node for node in self.network.junctions if window.intersects(Point(node.at_m)))
+        network = replace(self.network, all_edges=edges, connections=(), junctions=junctions)
+        return Streets(network, areas, tuple(j for j in self.junctions if j.id in nodes))
+
+    @staticmethod
+    def _those(tree: shapely.STRtree, things: Sequence[T], window: BaseGeometry) -> list[T]:
+        return [things[i] for i in sorted(tree.query(window, predicate="intersects"))]
+
+    @cached_property
+    def _area_tree(self) -> shapely.STRtree:
+        return shapely.STRtree(list(self.areas.values()))
+
+    @cached_property
+    def _junction_tree(self) -> shapely.STRtree:
+        return shapely.STRtree([junction.area for junction in self.junctions])
+
     @property
     def _frame(self) -> WorldFrame:
         frame = located(self.network.location)
@@ -129,7 +154,11 @@ def read(path: Path) -> Streets:
     areas = {edge.id: _area(edge) for edge in (*network.edges, *inside)}
     nodes = [n for n in network.junctions if n.type not in ("internal", "dead_end") and n.incoming_lanes]
     driven = {f"{e.id}_{i}" for e in network.edges for i, lane in enumerate(e.lanes) if not lane.is_pavement}
-    return Streets(network, areas, tuple(_junction(node, network.edges, driven) for node in nodes))
+    meeting: dict[str, list[Edge]] = {}
+    for road in network.edges:
+        for end in dict.fromkeys(_ends(road)):
+            meeting.setdefault(end, []).append(road)
+    return Streets(network, areas, tuple(_junction(node, meeting.get(node.id, []), driven) for node in nodes))
 
 
 def _area(edge: Edge) -> BaseGeometry:
@@ -141,11 +170,10 @@ def _area(edge: Edge) -> BaseGeometry:
     ])  # fmt: skip
 
 
-def _junction(node: Node, roads: Sequence[Edge], driven: Set[str]) -> Junction:
-    """A node of the network, with what meets there; ``driven`` are the lanes of ``roads`` that are no pavements."""
+def _junction(node: Node, meeting: Sequence[Edge], driven: Set[str]) -> Junction:
+    """A node of the network, with the roads that meet there; ``driven`` are all lanes that are no pavements."""
     corners_m = node.shape_m[:, :2]
     area = shapely.make_valid(Polygon(corners_m)) if len(corners_m) >= 3 else Point(node.at_m).buffer(1.0)
-    meeting = [road for road in roads if node.id in _ends(road)]
     arms = {end for road in meeting for end in _ends(road)} - {node.id}
     names = sorted({html.unescape(road.name) for road in meeting if road.name})  # netconvert escapes names twice
     signalised = node.type.startswith("traffic_light")
