@@ -37,6 +37,8 @@ WIDTH, _TALLEST = 760.0, 560.0
 """Of the maps of a page, in their own units."""
 _LONGEST = 18
 """Letters of a name; longer ones are cut."""
+_GAP = 4.0
+"""Between a spot and its name."""
 _CROWDED = 40
 """With more places than this, a map has no room for numbers and names."""
 _ALONG = (0.5, 0.3, 0.7, 0.15, 0.85)
@@ -316,14 +318,14 @@ def _labels(
     """Names of the ``named`` places, so that they hide little, of ``others`` too; ``radius`` is that of a place's
     innermost ring."""
     taken = [_square(plan.x(p[0].x_m), plan.y(p[0].y_m), _reach(p, radius) + 1) for p in places]
-    spots = [(plan.x(p[0].x_m), plan.y(p[0].y_m), _name(p), _reach(p, radius) + 4.0) for p in named]
+    spots = [(plan.x(p[0].x_m), plan.y(p[0].y_m), _name(p), _reach(p, radius) + _GAP) for p in named]
     return _beside_spots(plan, spots, [*taken, *others])
 
 
 def labels(plan: Plan, spots: Sequence[tuple[float, float, str, float]]) -> list[str]:
     """Texts beside spots (x, y, text, radius; in the figure's units), so that they hide little."""
     taken = [_square(x, y, radius + 1.0) for x, y, _, radius in spots]
-    return _beside_spots(plan, [(x, y, text, radius + 4.0) for x, y, text, radius in spots], taken)
+    return _beside_spots(plan, [(x, y, text, radius + _GAP) for x, y, text, radius in spots], taken)
 
 
 def _beside_spots(plan: Plan, spots: Sequence[tuple[float, float, str, float]], hidden: Sequence[Box]) -> list[str]:
@@ -342,7 +344,9 @@ def _beside_spots(plan: Plan, spots: Sequence[tuple[float, float, str, float]], 
         taken.append(box)
         if away > near:
             end_x, end_y = (box[0] + box[2]) / 2, (box[1] + box[3]) / 2
-            drawn.append(f'<path class="lead" d="M{x:.1f} {y:.1f}L{end_x:.1f} {end_y:.1f}"/>')
+            share = (near - _GAP) / math.hypot(end_x - x, end_y - y)  # from the spot's edge: a rank may stand in it
+            start_x, start_y = x + share * (end_x - x), y + share * (end_y - y)
+            drawn.append(f'<path class="lead" d="M{start_x:.1f} {start_y:.1f}L{end_x:.1f} {end_y:.1f}"/>')
         drawn.append(f'<text class="label" x="{box[0]:.1f}" y="{box[3] - 3:.1f}">{escape(text)}</text>')
     return drawn
 
