@@ -9,13 +9,17 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.artefacts import tables
+from pipeline.artefacts.readers import Tpog
 from pipeline.artefacts.run_record import RECORD, RunRecord
 from pipeline.core.errors import InputError
 from pipeline.formats.crs import WorldFrame
 from pipeline.runs import stages
 from pipeline.scenario.loading import from_values
 from pipeline.scenario.models import Scenario
+from pipeline.scoring.scorer import Scorer
+from pipeline.stages import score
 from pipeline.stages.base import Workspace
+from pipeline.stages.shared.scene import scene_of
 from pipeline.world import world_frame
 
 _READ = ("statics", "tpog", "score")
@@ -80,6 +84,19 @@ class FinishedRun:
         else:  # a run of an older version, or of before the scenario said it
             found = "its sites have no longitude and latitude, and the scenario, or its network, has a place by now"
         raise InputError(path, found, "egvs run makes it anew")
+
+    def scorer(self, tpog: Tpog) -> Scorer:
+        """What counts the voxels that sites see, as the run did it.
+
+        InputError where an artefact, or a file of the scenario that scores were made from, is another by now: what a
+        site sees would not be what its score says.
+        """
+        trajectories, then = self.artefact("trajectories.parquet"), self.record.stages["score"].files
+        for name, digest in score.inputs(self.work).files.items():
+            if then.get(name) != digest:
+                found = f"{name} is not what scores were made from"
+                raise InputError(self.work.path(RECORD), found, "egvs run makes them anew")
+        return Scorer(scene_of(self.work), tpog, trajectories)
 
     def artefact(self, name: str) -> Path:
         """The path of an artefact that is the one that ``run.json`` names; InputError where it is not."""

@@ -18,9 +18,7 @@ from pipeline.artefacts.readers import read_tpog
 from pipeline.export.finished_run import FinishedRun
 from pipeline.report.site_views import columns_of
 from pipeline.scoring.egvs import EntropyField
-from pipeline.scoring.scorer import Scorer
 from pipeline.stages.shared.scans import scans
-from pipeline.stages.shared.scene import SCANS, scene_of
 
 Cells = NDArray[np.float64]
 
@@ -63,10 +61,7 @@ def rasters_of(run: FinishedRun, sites: Collection[str]) -> Iterator[Raster]:
     summed = np.where(traffic, tpog.counts.sum(axis=2) / tpog.frames, np.nan)
     words = "Occupied voxels in the column on average"
     yield Raster(OCCUPIED, words, "voxel", summed, origin_m, voxel_m, _peak(summed))
-    run.artefact("trajectories.parquet")
-    if run.scenario.scan.keep:
-        run.artefact(SCANS)
-    scorer = Scorer(scene_of(run.work), tpog, run.work.path("trajectories.parquet"))
+    scorer = run.scorer(tpog)
     field = scorer.field
     whole = _uncertain(field, np.ones(len(field.cells), dtype=np.bool_))
     has_entropy, peak = whole > 0, _peak(whole)

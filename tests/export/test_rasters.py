@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -11,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+import pipeline
 from pipeline.artefacts.blindspots import read as read_blindspots
 from pipeline.artefacts.readers import read_scores, read_tpog
 from pipeline.export.exporting import export
@@ -19,6 +21,8 @@ from tests.export.conftest import OFFSET_M
 from tests.export.readers import utm32
 
 pytest.importorskip("rasterio", reason="the extra egvs[gis] is not installed")
+
+Call = Callable[..., tuple[int, str, str]]
 
 SCALE, TIE, NODATA, KEYS, WORDS, SCALED = 33550, 33922, 42113, 34735, 270, 42112
 """TIFF tags of GeoTIFF 1.1: size of a cell, place of the north-western corner, GDAL's no data, the system; a
@@ -121,6 +125,20 @@ def test_in_degrees_each_cell_has_the_value_of_its_place(located: Path, tmp_path
         assert values[row, column] == pytest.approx(expected, rel=1e-6)
         checked += has
     assert checked > 300
+
+
+def test_what_was_not_kept_is_cast_from_what_the_scores_were_made_from(mini: Path, tmp_path: Path, egvs: Call) -> None:
+    """A site that hangs elsewhere by now would be shown with views that its score does not say."""
+    run = tmp_path / "run"
+    pipeline.run(pipeline.load(mini, ["scan.keep=false"]), run)
+    code, told, _ = egvs("export", run, "--to", "geotiff", "--out", tmp_path / "a")
+    assert code == 0
+    (mini / "sites.csv").write_text((mini / "sites.csv").read_text().replace("pole_a,10,", "pole_a,11,"))
+    told = f"egvs: {run / 'run.json'}: sites.csv is not what scores were made from; egvs run makes them anew\n"
+    assert egvs("export", run, "--to", "geotiff", "--out", tmp_path / "b") == (2, "", told)
+    assert not (tmp_path / "b").exists()
+    assert egvs("figure", run, "--what", "seen", "--format", "svg", "--out", tmp_path / "b.svg") == (2, "", told)
+    assert egvs("export", run, "--to", "csv", "--out", tmp_path / "b")[0] == 0
 
 
 def test_the_same_bytes_twice(located: Path, tmp_path: Path) -> None:

@@ -26,9 +26,7 @@ from pipeline.report.drawing.maps import Backdrop, SiteView
 from pipeline.report.drawing.ranking_chart import Bar, chart
 from pipeline.report.ranking import Ranking, ScoredSite
 from pipeline.report.site_views import columns_of
-from pipeline.scoring.scorer import Scorer
 from pipeline.stages.shared.scans import scans
-from pipeline.stages.shared.scene import SCANS, scene_of
 from pipeline.stages.shared.world import STATICS
 
 WHAT = ("ranking", "map", "tpog", "seen", "missed")
@@ -126,10 +124,7 @@ def _view(
     run: FinishedRun, what: str, site: ScoredSite, tpog: Tpog, ranking: Ranking, backdrop: Backdrop, units: float
 ) -> str:
     """What a site sees or misses of the entropy, SVG text."""
-    run.artefact("trajectories.parquet")
-    if run.scenario.scan.keep:
-        run.artefact(SCANS)
-    scorer = Scorer(scene_of(run.work), tpog, run.work.path("trajectories.parquet"))
+    scorer = run.scorer(tpog)
     field, scan = scorer.field, next(scans(run.work, (site.site,)))
     if not len(field.cells):
         raise InputError(f"--what {what}", "nothing is uncertain in this run", "a run with traffic in its region")
