@@ -129,6 +129,7 @@ _PROMISED: dict[str, tuple[str, ...]] = {
     "accuracy": ("inputs", "tolerance", "stages"),
     "placement": ("inputs", "stages", "plan"),
     "curve": ("inputs", "stages", "plan"),
+    "city_plan": ("inputs", "plan"),
     "detection": ("inputs", "frames", "stages"),
     "fused": ("inputs", "frames", "shown"),
     "correlation": ("inputs", "frames", "stages", "own_score", "shown"),

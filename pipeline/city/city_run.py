@@ -7,18 +7,22 @@ stages, and share what they make through the store.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pipeline.city import traffic
 from pipeline.city.model import City, CityJunction
-from pipeline.city.results import junctions, page
+from pipeline.city.results import junctions, page, plan
 from pipeline.city.results.junctions import JunctionResult
 from pipeline.city.running import clusters, running
 from pipeline.city.running.jobs import Done, Job
 from pipeline.core.findings import Finding, warnings_of
 from pipeline.core.progress import Progress, silent
 from pipeline.runs.locking import alone
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 
 @dataclass(frozen=True)
@@ -63,16 +67,29 @@ def run(
     RunError
         Where the traffic or a run cannot keep its promise, or the cluster is lost; what is done is kept then.
     """
-    chosen = choose(city, only)
-    folder = Path(out) if out is not None else default_folder(city)
+    chosen, folder = choose(city, only), folder_of(city, out)
     with alone(folder):
         clusters.check(where)
-        made = traffic.make(city, progress)
         with clusters.connected(where) as client:
-            running.run(client, jobs_of(city, folder, chosen, sets), heard=heard, progress=progress)
-        results, warnings = junctions.read_runs(folder, chosen), tuple(warnings_of([made.summary]))
-        written = *junctions.write(folder, city, results), page.write(folder, city, results, warnings)
-        return CityRun(folder, results, written, warnings)
+            ran = run_on(client, city, folder, chosen, sets, progress, heard)
+        planned = plan.read(folder, [junction.id for junction in chosen])
+        return replace(ran, files=(*ran.files, page.write(folder, city, ran.results, ran.warnings, planned)))
+
+
+def run_on(
+    client: Client,
+    city: City,
+    folder: Path,
+    chosen: Sequence[CityJunction],
+    sets: Sequence[str],
+    progress: Progress,
+    heard: Callable[[Done], None],
+) -> CityRun:
+    """Run junctions on a cluster that is there, and bring their scores together; for those who hold the folder."""
+    made = traffic.make(city, progress)
+    running.run(client, jobs_of(city, folder, chosen, sets), heard=heard, progress=progress)
+    results = junctions.read_runs(folder, chosen)
+    return CityRun(folder, results, junctions.write(folder, city, results), tuple(warnings_of([made.summary])))
 
 
 def choose(city: City, only: Collection[str]) -> tuple[CityJunction, ...]:
@@ -89,6 +106,6 @@ def jobs_of(city: City, out: Path, chosen: Sequence[CityJunction], sets: Sequenc
     ]
 
 
-def default_folder(city: City) -> Path:
-    """Where a city run goes when no folder is given."""
-    return Path("runs") / city.name
+def folder_of(city: City, out: str | Path | None) -> Path:
+    """Where a city run goes: ``runs/<city's name>`` where no folder is given."""
+    return Path(out) if out is not None else Path("runs") / city.name

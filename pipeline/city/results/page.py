@@ -14,25 +14,35 @@ from pipeline.city.model import NETWORK, City
 from pipeline.city.results import map as drawing
 from pipeline.city.results.junctions import RUNS, JunctionResult
 from pipeline.city.results.map import MapJunction
+from pipeline.city.results.plan import CityPlan
 from pipeline.core import files
 from pipeline.core.findings import Finding
 from pipeline.core.version import __version__
 from pipeline.report import page as report
 from pipeline.report import wording
 from pipeline.report.drawing.colours import STYLE_SHEET
+from pipeline.report.drawing.placement import CurveStep, curve
 
 PAGE = "city.html"
 
 TEMPLATES = Path(__file__).parent / "templates"
 
 
-def write(out: Path, city: City, results: Sequence[JunctionResult], warnings: Sequence[Finding]) -> Path:
+def write(
+    out: Path,
+    city: City,
+    results: Sequence[JunctionResult],
+    warnings: Sequence[Finding],
+    plan: CityPlan | None = None,
+) -> Path:
     """Write the page; its path."""
-    files.write_text(out / PAGE, page(city, results, warnings))
+    files.write_text(out / PAGE, page(city, results, warnings, plan))
     return out / PAGE
 
 
-def page(city: City, results: Sequence[JunctionResult], warnings: Sequence[Finding]) -> str:
+def page(
+    city: City, results: Sequence[JunctionResult], warnings: Sequence[Finding], plan: CityPlan | None = None
+) -> str:
     """The whole page, HTML text."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
@@ -50,7 +60,9 @@ def page(city: City, results: Sequence[JunctionResult], warnings: Sequence[Findi
         by_is_egvs=by.name == "egvs",
         headline=headline(results),
         links={its.junction.id: link(its) for its in results},
-        maps=figures(city, results),
+        maps=figures(city, results, plan),
+        plan=plan,
+        curve=_curve(plan),
         most=max(its.gain for its in results),
         sites=sum(its.sites for its in results),
         warnings=warnings,
@@ -79,23 +91,44 @@ def link(its: JunctionResult) -> str:
     return f"{RUNS}/{quote(its.junction.id)}/report.html"
 
 
-def figures(city: City, results: Sequence[JunctionResult]) -> list[tuple[str, str, str]]:
-    """Key, title and figure of each map: by what the best pole would see, and by what it brings."""
+def figures(city: City, results: Sequence[JunctionResult], plan: CityPlan | None = None) -> list[tuple[str, str, str]]:
+    """Key, title and figure of each map: by what it brings, by what the best pole would see, by the plan."""
     box = drawing.box_of([(its.junction.x_m, its.junction.y_m) for its in results])
     streets, by = drawing.street_paths(_network(city), box), results[0].best.by
     values = [("gain", f"by gain: {by.noun}", by.label, [its.gain for its in results])]
     seen = [its.best.entropy_seen for its in results]
     values.append(("seen", "by what the best pole would see", "share of the traffic’s uncertainty seen", seen))
+    if plan is not None:
+        counts = [float(plan.by_junction.get(its.junction.id, 0)) for its in results]
+        values.append(("plan", "by the sensors of the plan", "sensors", counts))
     return [
-        (key, title, drawing.junction_map(_marks(results, its), streets, box, key, label, f"Junctions {title}"))
+        (
+            key,
+            title,
+            drawing.junction_map(
+                _marks(results, its, by_count=key == "plan"), streets, box, key, label, f"Junctions {title}"
+            ),
+        )
         for key, title, label, its in values
     ]
 
 
-def _marks(results: Sequence[JunctionResult], values: Sequence[float]) -> list[MapJunction]:
+def _curve(plan: CityPlan | None) -> str:
+    """How much 1, 2, ... sensors of the city are worth; nothing of a budget."""
+    if plan is None or len(plan.curve) < 2:
+        return ""
+    steps = [
+        CurveStep(number, best / plan.together, bound / plan.together)
+        for number, (best, bound) in enumerate(plan.curve)
+        if number
+    ]
+    return curve(steps, "How much so many sensors are worth, as a share of all candidates together")
+
+
+def _marks(results: Sequence[JunctionResult], values: Sequence[float], *, by_count: bool) -> list[MapJunction]:
     return [
         MapJunction(
-            its.junction.id, its.junction.x_m, its.junction.y_m, value, str(its.rank),
+            its.junction.id, its.junction.x_m, its.junction.y_m, value, f"{value:g}" if by_count else str(its.rank),
             f"{its.rank}. {its.junction.title or its.junction.id}: {its.best.site}, {its.best.by.told(its.score)}, "
             f"sees {wording.share(its.best.entropy_seen)}",
             link(its),

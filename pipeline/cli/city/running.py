@@ -41,18 +41,19 @@ def run(
     from pipeline.cli.progress import Screen
 
     with Screen("city") as screen:
-
-        def heard(done: Done) -> None:
-            made = ", ".join(done.made) or "nothing"
-            screen.say(f"{done.junction:<14} {done.seconds:>8.2f} s   {done.sites} sites; made {made}")
-
         ran = city_run.run(
             model.load(city), out, where=cluster, only=junction or (), sets=set_ or (), progress=screen.progress,
-            heard=heard,
+            heard=lambda done: screen.say(told_done(done)),
         )  # fmt: skip
         for warning in ran.warnings:
             screen.say(f"warning: {warning}")
     print_junctions(ran)
+
+
+def told_done(done: Done) -> str:
+    """A junction that is done, in one line."""
+    made = ", ".join(done.made) or "nothing, all was there"
+    return f"{done.junction:<14} {done.seconds:>8.2f} s   {done.sites} sites; made {made}"
 
 
 def print_junctions(ran: CityRun) -> None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from pipeline.city.running import clusters
 from pipeline.city.running.jobs import Job
 from tests.conftest import write_mini
 
@@ -34,3 +36,14 @@ def jobs(tmp_path: Path) -> list[Job]:
         (folder / "sites.csv").write_text((folder / "sites.csv").read_text() + more)
         made.append(Job(name, folder, tmp_path / "out" / name))
     return made
+
+
+@pytest.fixture
+def here(client: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """City runs take the cluster of this process."""
+
+    @contextmanager
+    def connected(_where: str) -> Iterator[Any]:
+        yield client
+
+    monkeypatch.setattr(clusters, "connected", connected)

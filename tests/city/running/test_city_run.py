@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
@@ -16,20 +13,8 @@ from pipeline.artefacts import tables
 from pipeline.city import city_run, model, traffic
 from pipeline.city.model import City
 from pipeline.city.results import junctions
-from pipeline.city.running import clusters
 from pipeline.core.errors import InputError
 from pipeline.runs import workflow
-
-
-@pytest.fixture
-def here(client: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """City runs take the cluster of this process."""
-
-    @contextmanager
-    def connected(_where: str) -> Iterator[Any]:
-        yield client
-
-    monkeypatch.setattr(clusters, "connected", connected)
 
 
 def files_of(out: Path) -> dict[str, bytes]:

@@ -1,0 +1,64 @@
+"""``egvs city place``: parses, calls, and prints the sensors of a city in the order in which they would be put up."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pipeline.cli.arguments import Set
+from pipeline.cli.city.running import CityOut, CityPath, Cluster, Junctions, told_done
+
+if TYPE_CHECKING:
+    from pipeline.city.city_place import CityPlacement
+
+
+def place(
+    city: CityPath,
+    out: CityOut = None,
+    count: Annotated[int | None, typer.Option(metavar="K", min=1, help="The best K sensors of the whole city.")] = None,
+    budget: Annotated[
+        float | None, typer.Option(metavar="COST", help="The best sensors that cost no more, see \\[costs].")
+    ] = None,
+    cluster: Cluster = "local",
+    junction: Junctions = None,
+    set_: Set = None,
+) -> None:
+    """Which poles over all junctions together: the best plan of the whole city."""
+    from pipeline.city import city_place, model
+    from pipeline.cli.progress import Screen
+
+    with Screen("city") as screen:
+        placed = city_place.place(
+            model.load(city), out, count=count, budget=budget, where=cluster, only=junction or (), sets=set_ or (),
+            progress=screen.progress, heard=lambda done: screen.say(told_done(done)),
+        )  # fmt: skip
+        for warning in placed.ran.warnings:
+            screen.say(f"warning: {warning}")
+    print_plan(placed)
+
+
+def print_plan(placed: CityPlacement) -> None:
+    """The sensors, what is proved of them, and what was written."""
+    from pipeline.cli.terminal import WIDE, console, table
+
+    out, plan = console(WIDE), placed.plan
+    names = ["", "junction", "site", "z m", "yaw deg", "pitch deg", "sensor", "adds bit", "together bit", "cost"]
+    rows = table(names, left=("junction", "site", "sensor"), whole=names)
+    for s in plan.sensors:
+        rows.add_row(
+            f"{s.order}*" if s.forced else str(s.order), s.junction, s.site, f"{s.z_m:g}", f"{s.yaw_deg:.1f}",
+            f"{s.pitch_deg:.1f}", s.sensor, f"{s.gain:,.0f}", f"{s.score:,.0f}", f"{s.cost:g}",
+        )  # fmt: skip
+    out.print(rows)
+    if any(sensor.forced for sensor in plan.sensors):
+        out.print("* is there already")
+    cost = f" for {plan.cost:g}" if plan.cost else ""
+    out.print(
+        f"{len(plan.sensors)} sensors at {len(plan.by_junction)} of {plan.junctions} junctions{cost}: joint EGVS "
+        f"{plan.joint:,.0f} bit, {plan.joint / plan.together:.1%} of what all {plan.candidates:,} candidates would; "
+        f"proved: at least {math.floor(plan.certificate * 1e4) / 1e2:.2f} % of the best possible"
+    )
+    for path in placed.files:
+        out.print(str(path))
