@@ -62,6 +62,7 @@ fuzz: $(VENV)/.installed-dev
 
 schema: $(VENV)/.installed
 	$(BIN)/python -c "from pipeline.scenario.loading import json_schema; print(json_schema(), end='')" > data_schemas/scenario.schema.json
+	$(BIN)/python -c "from pipeline.city.model import json_schema; print(json_schema(), end='')" > data_schemas/city_file.schema.json
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	@$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11) and 'egvs needs Python 3.11 or newer; name one with: make PYTHON=...')"

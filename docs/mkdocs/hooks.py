@@ -49,7 +49,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     del config, files
     if page.file.src_uri == "artefacts.md":
         told = {name for what, name in _INSERT.findall(markdown) if what == "columns of"}
-        untold = {p.name.split(".")[0] for p in tables.SCHEMAS.glob("*.schema.json")} - {"scenario"} - told
+        untold = {p.name.split(".")[0] for p in tables.SCHEMAS.glob("*.schema.json")} - {"scenario", "city_file"} - told
         if untold:
             raise ValueError(f"docs/artefacts.md says nothing of {', '.join(sorted(untold))}")
     return _INSERT.sub(lambda m: _MAKE[m[1]](m[2]), markdown)

@@ -14,6 +14,7 @@ Positions are in the network's x, y in metres, and in degrees (WGS 84).
 from __future__ import annotations
 
 import csv
+import json
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -124,6 +125,11 @@ def load(folder: str | Path) -> City:
             right = f"a scenario there, or no row {junction.id} in {TABLE}"
             raise InputError(its, "no such file", right)
     return city
+
+
+def json_schema() -> str:
+    """The JSON Schema that editors use to complete and check a city.toml."""
+    return json.dumps(CityModel.model_json_schema(), indent=2, ensure_ascii=False) + "\n"
 
 
 def _model(file: Path) -> CityModel:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.artefacts import schemas
 from pipeline.city import model
 from pipeline.core.errors import InputError
 
@@ -102,3 +103,8 @@ def test_a_file_that_is_missing_is_named(tmp_path: Path) -> None:
     (folder / "junctions.csv").unlink()
     with pytest.raises(InputError, match=r"junctions\.csv: no such file; a table with the columns"):
         model.load(folder)
+
+
+def test_editor_schema_is_not_stale() -> None:
+    kept = schemas.folder() / "city_file.schema.json"
+    assert kept.read_text(encoding="utf-8") == model.json_schema(), "run: make schema"

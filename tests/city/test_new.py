@@ -18,7 +18,9 @@ from pipeline.city import traffic as city_traffic
 from pipeline.core.errors import InputError
 from pipeline.formats import osm as osm_reader
 from pipeline.importers import junctions, openstreetmap, street_network
+from pipeline.stages import traffic
 from pipeline.world import world_frame
+from tests.stages import run_stage
 
 pytestmark = pytest.mark.system
 LAT, LON = 50.0, 10.0
@@ -198,7 +200,7 @@ def test_wrong_input_is_one_message_and_leaves_nothing(extract: Path, tmp_path: 
 
 
 def test_from_a_map_to_a_junctions_scores(extract: Path, tmp_path: Path, egvs) -> None:
-    code, printed, said = egvs("city", "new", tmp_path / "town", "--osm", extract)
+    code, printed, said = egvs("city", "new", tmp_path / "town", "--osm", extract, "--walk")
     assert code == 0, said
     assert "j02" in printed and "next: egvs city traffic" in printed
     file = tmp_path / "town" / "city.toml"
@@ -210,7 +212,7 @@ def test_from_a_map_to_a_junctions_scores(extract: Path, tmp_path: Path, egvs) -
     ):
         assert old in text
         text = text.replace(old, now)
-    file.write_text(text)
+    file.write_text(text + "\n[effects.pedestrians_bicycles]\npedestrians_per_h = 2000\n")
     code, printed, said = egvs("city", "traffic", tmp_path / "town")
     assert code == 0, said
     assert "frames: 40" in printed
@@ -222,6 +224,10 @@ def test_from_a_map_to_a_junctions_scores(extract: Path, tmp_path: Path, egvs) -
     folder = tmp_path / "town" / "junctions" / "j01"
     code, _, said = egvs("check", folder)
     assert code == 0, said
+    summary = run_stage(traffic, pipeline.load(folder), tmp_path / "run")
+    assert summary["frames"] == 40
+    boxes = pipeline.read_trajectories(tmp_path / "run" / "trajectories.parquet")
+    assert {"pedestrian", "passenger"} <= set(boxes["kind"].to_pylist())
     city = model.load(tmp_path / "town")
     (tmp_path / "town" / "traffic" / city_traffic.SEAL).unlink()
     assert city_traffic.make(city).anew  # SUMO runs again: the same bytes

@@ -174,6 +174,8 @@ def test_the_files_are_what_sumo_writes(city: City) -> None:
         ("city.toml", "frames = 60", "frames = 61", "city.toml: traffic: frames = 61: fcd.csv has 60 frames"),
         ("city.toml", "[[traffic.kinds]]", '[[traffic.periods]]\nname = "night"\n\n[[traffic.kinds]]',
          "city.toml: traffic.periods: a city has one period"),
+        ("city.toml", "seed = 7", "seed = 7\n[effects.rain]\nrate_mm_h = 20.0\n",
+         "city.toml: effects.rain: adds no traffic; in junctions/scenario.toml"),
         ("city.toml", 'name = "bus"', 'name = "coach"', "vehicle type 'bus' of fcd.csv has no known size"),
     ],
 )  # fmt: skip
