@@ -31,8 +31,9 @@ def explore(
 
     plugins.require("egvs explore", "explore", "viser")
     from pipeline.explore.opening import open_session
-    from pipeline.explore.page import Page
+    from pipeline.explore.page import Page, refuse_taken
 
+    refuse_taken(port)
     with Screen("explore") as screen:
         session = open_session(
             place, set_ or (), out, jobs=jobs, progress=screen.progress, listener=screen.stage_event

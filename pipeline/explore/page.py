@@ -7,9 +7,11 @@ of the pose that rests, however fast somebody drags.
 
 from __future__ import annotations
 
+import errno
 import gc
 import io
 import shlex
+import socket
 import threading
 from collections.abc import Sequence
 from contextlib import redirect_stdout
@@ -45,6 +47,20 @@ FRAME_S = 0.25
 
 LET_GO_EVERY = 32
 """After so many moves memory that is kept for later is given back: it grows as arrays of many sizes come and go."""
+
+
+_GOOD_BYE_S = 5.0
+
+
+def refuse_taken(port: int) -> None:
+    """InputError where no page can be served on a port: told before long work is done for it."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((HOST, port))
+        except OSError as error:
+            found = "is taken" if error.errno == errno.EADDRINUSE else f"cannot be used ({error.strerror})"
+            raise InputError("--port", f"{port} {found}", "another one, or 0 for any that is free") from None
 
 
 class _Server(viser.ViserServer):
@@ -92,7 +108,7 @@ class Page:
         if not self.guard.stands:
             self.stop()
             raise RunError("viser serves pages in another way than egvs explore knows how to guard")
-        if port and self._server.get_port() != port:
+        if port and self._server.get_port() != port:  # it has looked for another one
             self.stop()
             raise InputError("--port", f"{port} is taken", "another one, or 0 for any that is free")
         self._draw()
@@ -142,8 +158,10 @@ class Page:
 
     def stop(self) -> None:
         """Serve no more."""
-        with redirect_stdout(io.StringIO()):
+        with redirect_stdout(io.StringIO()):  # it says good-bye in its own words, at the end of its thread
             self._server.stop()
+            if (thread := self._server._websock_server._server_thread) is not None:
+                thread.join(_GOOD_BYE_S)
 
     def present(self, candidate: Site) -> Site:
         """Where a candidate's sensor is in the plan now; the candidate itself where it is in none."""

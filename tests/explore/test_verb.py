@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import urllib.error
@@ -77,6 +78,18 @@ def test_without_the_extra_it_says_how_to_install_it(egvs, mini: Path, monkeypat
     code, out, err = egvs("explore", mini)
     assert (code, out) == (2, "")
     assert err == "egvs: egvs explore needs viser, which is not installed: pip install 'egvs[explore]'\n"
+    assert not Path("runs").exists()
+
+
+def test_a_port_that_is_taken_is_one_message_before_any_work(egvs, mini: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(mini.parent)
+    with socket.socket() as other:
+        other.bind((pages.HOST, 0))
+        other.listen()
+        port = other.getsockname()[1]
+        code, out, err = egvs("explore", mini, "--port", port)
+    assert (code, out) == (2, "")
+    assert err == f"egvs: --port: {port} is taken; another one, or 0 for any that is free\n"
     assert not Path("runs").exists()
 
 
