@@ -28,19 +28,20 @@ from pipeline.sensing.sites import Pose
 SCENARIO = Path("scenarios/nishishinjuku")
 GRAPHICS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 WIDTH, HEIGHT = 1200, 720
-ABOVE = Camera((196.0, 168.0, 86.0), (198.0, 230.0, 0.0))
-NEAR = Camera((172.0, 196.0, 30.0), (196.0, 232.0, 0.0))
-HIGHER = Pose(190.0, 255.0, 5.5)
+ABOVE = Camera((203.0, 188.0, 48.0), (197.0, 237.0, 0.0))
+NEAR = Camera((216.0, 212.0, 24.0), (191.0, 240.0, 0.0))
+MOVED = Pose(196.6, 251.7, 2.0, 0.0, 1.0)
 
 PICTURES: dict[str, tuple[Camera, dict[str, Any]]] = {
-    "explore": (ABOVE, {"layer": "missed", "pose": HIGHER}),
-    "explore-dark": (ABOVE, {"layer": "missed", "pose": HIGHER, "is_dark": True}),
-    "explore-1-opened": (ABOVE, {}),
-    "explore-2-dragged": (ABOVE, {"layer": "seen", "pose": HIGHER}),
-    "explore-3-lanes": (ABOVE, {"layer": "blindspots", "pose": HIGHER}),
-    "explore-4-difference": (ABOVE, {"layer": "difference", "pose": HIGHER, "beside": "c10"}),
-    "explore-5-traffic": (NEAR, {"layer": "replay", "pose": HIGHER, "frame": 120}),
+    "explore": (ABOVE, {"layer": "missed", "pose": MOVED}),
+    "explore-dark": (ABOVE, {"layer": "missed", "pose": MOVED, "is_dark": True}),
+    "explore-1-opened": (ABOVE, {"layer": "traffic"}),
+    "explore-2-moved": (ABOVE, {"layer": "seen", "pose": MOVED}),
+    "explore-3-lanes": (ABOVE, {"layer": "blindspots", "pose": MOVED}),
+    "explore-4-difference": (ABOVE, {"layer": "difference", "pose": MOVED, "beside": "c05"}),
+    "explore-5-traffic": (NEAR, {"layer": "replay", "pose": MOVED, "frame": 300}),
 }
+"""File, from where, and what is shown."""
 
 
 def main() -> None:
@@ -62,7 +63,7 @@ def main() -> None:
 
 @contextmanager
 def _tab(scratch: Path, run: Path) -> Iterator[tuple[Page, Any]]:
-    """The page, and a browser's tab with it."""
+    """The page, and a tab of a browser that shows it."""
     from playwright.sync_api import sync_playwright
 
     page = Page(open_session(SCENARIO, (), run), scratch / "page")
@@ -76,20 +77,13 @@ def _tab(scratch: Path, run: Path) -> Iterator[tuple[Page, Any]]:
             tab.goto(page.address)
             tab.get_by_text("rank 1 of").wait_for(timeout=120_000)
             tab.wait_for_timeout(4000)
-            _close_warning(tab)
+            tab.add_style_tag(content=".mantine-Notifications-root { display: none }")  # drawn in software, it warns
             yield page, tab
             browser.close()
     finally:
         page.end()
         loop.join()
         page.stop()
-
-
-def _close_warning(tab: Any) -> None:
-    """Of drawing in software."""
-    warning = tab.get_by_text("Software WebGL rendering detected")
-    if warning.count():
-        tab.locator("button.mantine-Notification-closeButton").first.click()
 
 
 def _draw(page: Page, tab: Any, camera: Camera, view: dict[str, Any], path: Path) -> None:
@@ -102,7 +96,7 @@ def _draw(page: Page, tab: Any, camera: Camera, view: dict[str, Any], path: Path
     (client,) = page._server.get_clients().values()
     client.camera.position = np.subtract(camera.from_m, page.zero_m)
     client.camera.look_at = np.subtract(camera.at_m, page.zero_m)
-    tab.wait_for_timeout(6000)
+    tab.wait_for_timeout(15_000)  # drawn in software
     tab.screenshot(path=path, timeout=120_000)
     print(path)
 

@@ -78,10 +78,10 @@ class Controls:
         self._site = gui.add_dropdown("site", ("",), hint="Candidates, the best first.")
         self._site.on_update(self._chosen)
         self.told = gui.add_markdown("")
-        with gui.add_folder("pose"):
-            self._draw_pose(session)
         with gui.add_folder("layer"):
             self._draw_layer(session, frames)
+        with gui.add_folder("pose"):
+            self._draw_pose(session)
         with gui.add_folder("scored by", expand_by_default=False):
             self._draw_settings(session, effects)
         for name, pressed in buttons.items():

@@ -187,16 +187,16 @@ class Page:
 
     def _draw(self) -> None:
         scene, session = self._server.scene, self.session
-        surroundings.draw_world(scene, session, self.zero_m)
+        self._world = surroundings.World.drawn(scene, session, self.zero_m)
         surroundings.draw_sites(scene, session, self.zero_m, self._choose)
-        surroundings.draw_plan(scene, self.plan, self.zero_m, self._choose)
+        surroundings.draw_plan(scene, self.plan, self.view.site.name, self.zero_m, self._choose)
         self._gizmo = scene.add_transform_controls("/sensor", scale=GIZMO_M, depth_test=False)
-        self._label = scene.add_label("/sensor/label", "")
+        self._label = scene.add_label("/sensor/label", "", anchor="top-center")
         self._gizmo.on_update(self._dragged)
         self._server.on_client_disconnect(self._lost)
         reach_m = max(session.scene.roi.size_m)
         x, y, z = self.zero_m
-        self.look_from(Camera((x, y - 0.45 * reach_m, z + 0.85 * reach_m), self.zero_m))
+        self.look_from(Camera((x, y - 0.4 * reach_m, z + 0.6 * reach_m), self.zero_m))
         buttons = {"Keep this pose": self._keep, "Link to this view": self._link, "Picture (PNG)": self._picture}
         effects, frames = settings.offered(session), self._playback.frames
         self.controls = Controls(self._server.gui, session, self.view, self, effects, frames, buttons)
@@ -269,7 +269,7 @@ class Page:
 
     def _show(self, view: View) -> None:
         """Show what is wanted, and bring controls and gizmo to it."""
-        session_before, plan_before = self.session, self.plan
+        session_before, plan_before, before = self.session, self.plan, self.view
         view = self._settled(view)
         site, is_new, rests = view.site, self.session is not session_before, self._dragging is None
         is_another = is_new or site.sensor != self.rating.site.sensor
@@ -281,8 +281,10 @@ class Page:
         with self._server.atomic():
             if is_new:
                 surroundings.draw_sites(self._server.scene, self.session, self.zero_m, self._choose)
-            if self.plan is not plan_before:
-                surroundings.draw_plan(self._server.scene, self.plan, self.zero_m, self._choose)
+            if self.plan is not plan_before or site.name != before.site.name:
+                surroundings.draw_plan(self._server.scene, self.plan, site.name, self.zero_m, self._choose)
+            if view.is_dark != before.is_dark:
+                self._world.colour(view.is_dark)
             self._label.text = f"{site.name}  rank {rating.rank}" if rating.stands else f"{site.name}: cannot stand"
             legend = None
             if rests:  # else it would be pulled out of a hand

@@ -28,7 +28,7 @@ def in_words(rating: Rating, rank_by: str, candidate: Rating, candidates: int) -
     score, before = rating.scores[rank_by], candidate.scores[rank_by]
     more = f" ({score / before - 1.0:+.1%})" if before > 0.0 and rating.site.pose != candidate.site.pose else ""
     rows = "\n".join(f"| {plain(name)} | {value_in_words(name, value)} |" for name, value in rating.scores.items())
-    head = f"## {value_in_words(rank_by, score)}{more}\n\nrank {rating.rank} of {candidates}"
+    head = f"## {value_in_words(rank_by, score)}{more}\n\nrank {rating.rank} of {candidates} by {plain(rank_by)}"
     return f"{head}\n\n| score | value |\n|---|---|\n{rows}\n\n{told}"
 
 

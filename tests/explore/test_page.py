@@ -111,6 +111,17 @@ def test_controls_and_gizmo_follow(page: Page) -> None:
     assert page._label.text == f"pole_a  rank {page.rating.rank}"
 
 
+def test_in_the_dark_the_world_is_dark(page: Page) -> None:
+    by_day = {kind: mesh.color for kind, mesh in page._world.meshes.items()}
+    page.ask(is_dark=True)
+    assert page.rest(30)
+    assert page.controls._dark.value
+    assert all(sum(mesh.color) < sum(by_day[kind]) for kind, mesh in page._world.meshes.items())
+    page.ask(is_dark=False)
+    assert page.rest(30)
+    assert {kind: mesh.color for kind, mesh in page._world.meshes.items()} == by_day
+
+
 def test_where_none_can_stand_no_score_is_left(page: Page) -> None:
     settled(page, "pole_a", Pose(16, 6, 3))
     assert page.controls.told.content.startswith("## no score")
@@ -262,7 +273,7 @@ def test_a_plan_moves_with_its_sensors(mini: Path, tmp_path: Path) -> None:
             f"**plan** pole\\_b: together {placed.joint:,.1f}; best for one more: pole\\_a"
             in served.controls.told.content
         )
-        assert served._server.scene.get_handle_by_name("/plan/label0").text == "pole_b: in the plan"
+        assert served._server.scene.get_handle_by_name("/plan/label0") is None  # it is chosen
         assert served._server.scene.get_handle_by_name("/plan/label1").text == "pole_a: best for one more"
         there = replace(site, pose=replace(site.pose, z_m=4.5))
         served._show(replace(served.view, site=there))
@@ -273,6 +284,8 @@ def test_a_plan_moves_with_its_sensors(mini: Path, tmp_path: Path) -> None:
         assert (balls.batched_positions[0] + served.zero_m).tolist() == [*there.pose.position_m]
         other = served.session.candidates["pole_a"].site
         served._show(replace(served.view, site=other))
+        assert served._server.scene.get_handle_by_name("/plan/label0").text == "pole_b: in the plan"
+        assert served._server.scene.get_handle_by_name("/plan/label1") is None
         assert served.plan.sites["pole_b"] == there
         assert served.present(served.session.candidates["pole_b"].site) == there
         served._show(replace(served.view, settings=Settings(1.0, "egvs", frozenset())))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import trimesh
@@ -14,23 +15,50 @@ from pipeline.explore.plan import MovingPlan
 from pipeline.explore.session import Session
 from pipeline.sensing.sites import Site
 
-_COLOURS = {"building": (205, 208, 216), "ground": (225, 222, 214), "tree_crown": (150, 190, 165)}
-_OTHER_SOLID, _LANE, _ROI = (150, 154, 166), (112, 118, 130), (232, 89, 12)
+Colour = tuple[int, int, int]
+
+_BY_DAY: dict[str, Colour] = {
+    "building": (205, 208, 216), "ground": (225, 222, 214), "tree_crown": (150, 190, 165), "lanes": (112, 118, 130),
+    "other": (150, 154, 166),
+}  # fmt: skip
+_DARK: dict[str, Colour] = {
+    "building": (66, 70, 82), "ground": (34, 36, 42), "tree_crown": (52, 88, 66), "lanes": (52, 56, 66),
+    "other": (92, 96, 108),
+}  # fmt: skip
+_ROI = (232, 89, 12)
 _SITE_RADIUS_M, _PLAN_RADIUS_M = 0.9, 1.3
 _OF_PLAN, _NEXT = (214, 40, 120), (120, 60, 200)
 
 
-def draw_world(scene: viser.SceneApi, session: Session, zero_m: Vec3) -> None:
-    """Solids, lanes and the region of interest; drawn once."""
-    scene.configure_default_lights(cast_shadow=False)  # a graphics card in software has no time for it
-    for kind, mesh in shapes.solids(session.scene.world, zero_m).items():
-        colour = _COLOURS.get(kind, _OTHER_SOLID)
-        scene.add_mesh_simple(f"/world/{kind}", mesh.points, mesh.faces, color=colour, flat_shading=True,
-                              side="double", cast_shadow=False)  # fmt: skip
-    if session.carriageway is not None:
-        road = shapes.lanes(session.carriageway, zero_m)
-        scene.add_mesh_simple("/lanes", road.points, road.faces, color=_LANE, side="double", cast_shadow=False)
-    scene.add_line_segments("/roi", shapes.edges(session.scene.roi, zero_m), _ROI, thickness=0.15)
+@dataclass(frozen=True)
+class World:
+    """Solids, lanes and the region of interest, as they were drawn: each mesh by its kind."""
+
+    meshes: dict[str, viser.MeshHandle]
+
+    @classmethod
+    def drawn(cls, scene: viser.SceneApi, session: Session, zero_m: Vec3) -> World:
+        """Draw it, by day."""
+        scene.configure_default_lights(cast_shadow=False)  # a graphics card in software has no time for it
+        shown = shapes.solids(session.scene.world, zero_m)
+        if session.carriageway is not None:
+            shown["lanes"] = shapes.lanes(session.carriageway, zero_m)
+        scene.add_line_segments("/roi", shapes.edges(session.scene.roi, zero_m), _ROI, thickness=0.15)
+        meshes = {
+            kind: scene.add_mesh_simple(f"/world/{kind}", mesh.points, mesh.faces, color=_colour(kind, _BY_DAY),
+                                        flat_shading=kind != "lanes", side="double", cast_shadow=False)
+            for kind, mesh in shown.items()
+        }  # fmt: skip
+        return cls(meshes)
+
+    def colour(self, is_dark: bool) -> None:
+        """By day, or in the dark."""
+        for kind, mesh in self.meshes.items():
+            mesh.color = _colour(kind, _DARK if is_dark else _BY_DAY)
+
+
+def _colour(kind: str, colours: dict[str, Colour]) -> Colour:
+    return colours.get(kind, colours["other"])
 
 
 def draw_sites(scene: viser.SceneApi, session: Session, zero_m: Vec3, choose: Callable[[Site], None]) -> None:
@@ -40,8 +68,11 @@ def draw_sites(scene: viser.SceneApi, session: Session, zero_m: Vec3, choose: Ca
     _balls(scene, "/sites", sites, colours, _SITE_RADIUS_M, zero_m, choose)
 
 
-def draw_plan(scene: viser.SceneApi, plan: MovingPlan | None, zero_m: Vec3, choose: Callable[[Site], None]) -> None:
-    """The sensors of a plan where they are now, and the pole that would be best for one more."""
+def draw_plan(
+    scene: viser.SceneApi, plan: MovingPlan | None, chosen: str, zero_m: Vec3, choose: Callable[[Site], None]
+) -> None:
+    """The sensors of a plan where they are now, and the pole that would be best for one more; labelled, but for the one
+    that is chosen."""
     scene.remove_by_name("/plan")
     if plan is None:
         return
@@ -53,6 +84,8 @@ def draw_plan(scene: viser.SceneApi, plan: MovingPlan | None, zero_m: Vec3, choo
     scene.add_frame("/plan", show_axes=False)
     _balls(scene, "/plan/balls", sites, np.array(colours, dtype=np.uint8), _PLAN_RADIUS_M, zero_m, choose)
     for number, (site, its) in enumerate(zip(sites, said, strict=True)):
+        if site.name == chosen:  # it has a label of its own
+            continue
         at_m = np.subtract(site.pose.position_m, zero_m)
         at_m[2] += 1.5 * _PLAN_RADIUS_M
         scene.add_label(f"/plan/label{number}", f"{site.name}: {its}", position=at_m, anchor="bottom-center",

@@ -78,7 +78,20 @@ def test_a_rating_is_told_in_words() -> None:
     candidate = Rating(site, {"egvs": 200.0, "entropy_seen": 0.5}, 2)
     moved = Rating(Site("a_b", Pose(0, 0, 4), "small"), {"egvs": 250.0, "entropy_seen": 0.6}, 1)
     text = wording.in_words(moved, "egvs", candidate, 7)
-    assert text.startswith("## 250.0 (+25.0%)\n\nrank 1 of 7\n")
+    assert text.startswith("## 250.0 (+25.0%)\n\nrank 1 of 7 by egvs\n")
     assert "| entropy\\_seen | 60.00% |" in text
     assert "a\\_b" in wording.ranking([candidate], "egvs")
     assert wording.in_words(candidate, "egvs", candidate, 7).startswith("## 200.0\n")
+
+
+def test_a_difference_has_the_colour_of_who_sees_more() -> None:
+    grid = Grid((0.0, 0.0, 0.0), 1.0, (4, 1, 2))
+    tpog = Tpog(grid, 10, np.zeros(grid.shape, dtype=np.int64))
+    this, other = np.zeros(grid.shape), np.zeros(grid.shape)
+    this[0, 0] = 1.0, 1.0  # 2 bits more
+    this[1, 0, 0] = other[1, 0, 1] = 0.5  # as much
+    other[2, 0, 1] = 1.0  # 1 bit less
+    colours = (0, 0, 200), (200, 0, 0), (100, 100, 100)
+    points, found = shapes.differences(tpog, this, other, (0.0, 0.0, 0.0), colours)
+    assert points[:, 0].tolist() == [0.5, 1.5, 2.5]
+    assert found.tolist() == [[0, 0, 200], [100, 100, 100], [150, 50, 50]]
