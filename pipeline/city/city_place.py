@@ -88,7 +88,8 @@ def place(
             if not wanted:
                 raise InputError(city.file, "no pole sees anything of the traffic", "a city with traffic")
             shared, of = _share(client, wanted, count, budget, progress)
-        told = _told(wanted, of, shared, {"count": count} if budget is None else {"budget": budget})
+        rank_by = ran.results[0].best.rank_by
+        told = _told(wanted, of, shared, rank_by, {"count": count} if budget is None else {"budget": budget})
         ids = [junction.id for junction in chosen]
         warnings = (*ran.warnings, *overlaps(jobs), *_unseen(city, [i for i in ids if i not in seen]))
         written = plan.write(folder, city, told, ids), page.write(folder, city, ran.results, warnings, told)
@@ -150,7 +151,7 @@ def _is_short(its: Options, at: int, limit: int) -> bool:
 
 
 def _told(
-    jobs: Sequence[Job], of: Mapping[str, Options], shared: Shared, asked: Mapping[str, float | None]
+    jobs: Sequence[Job], of: Mapping[str, Options], shared: Shared, rank_by: str, asked: Mapping[str, float | None]
 ) -> CityPlan:
     """The plan of the city in the order in which its sensors would be put up."""
     plans = {job.junction: of[job.junction].plans[at] for job, at in zip(jobs, shared.chosen, strict=True)}
@@ -168,7 +169,9 @@ def _told(
     together, candidates = sum(its.together for its in every), sum(len(its.least_costs) - 1 for its in every)
     curve = tuple((float(best), float(bound)) for best, bound in shared.curve)
     numbers = {key: float(value) for key, value in asked.items() if value is not None}
-    return CityPlan(tuple(sensors), numbers, shared.value, shared.bound, together, candidates, len(jobs), curve)
+    return CityPlan(
+        tuple(sensors), rank_by, numbers, shared.value, shared.bound, together, candidates, len(jobs), curve
+    )
 
 
 def _in_order(plans: Mapping[str, Plan]) -> Iterator[tuple[str, options.Pick]]:

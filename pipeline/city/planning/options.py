@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pipeline.city.results.junctions import per_score, vehicles_in
 from pipeline.city.running.jobs import Job, Order, told
 from pipeline.city.running.keeping import KEPT
 from pipeline.core.errors import InputError
@@ -86,6 +87,17 @@ class Options:
             return self.bounds[-1]
         return min(self.together, self.bounds[-1] * count / max(1, self.most)) if self.most else self.together
 
+    def times(self, factor: float) -> Options:
+        """The same where all that is added up counts so much more."""
+        if factor == 1.0:
+            return self
+        plans = (
+            replace(plan, value=plan.value * factor, picks=tuple(replace(p, gain=p.gain * factor) for p in plan.picks))
+            for plan in self.plans
+        )
+        bounds = tuple(bound * factor for bound in self.bounds)
+        return replace(self, plans=tuple(plans), bounds=bounds, together=self.together * factor)
+
 
 def check(scenario: Scenario) -> None:
     """InputError where a scenario asks for what cannot be added up over junctions."""
@@ -98,9 +110,6 @@ def check(scenario: Scenario) -> None:
     if named := [key for key, is_there in idle.items() if is_there]:
         found = "a plan of the whole city adds up joint scores, and shares one count or budget"
         raise InputError(f"{scenario.file}: placement.{named[0]}", found, f"no such key; egvs place {scenario.folder}")
-    if scenario.score.rank_by != "egvs":
-        found = f"{scenario.score.rank_by} is a share of a junction's own vehicles or voxels, no sum over junctions"
-        raise InputError(f"{scenario.file}: score.rank_by", found, 'rank_by = "egvs"')
 
 
 @told
@@ -115,7 +124,8 @@ def options(job: Job, order: Order, most: int, costs_count: bool) -> Options:
             placement = scenario.placement.model_copy(update={"budget": _ENDLESS})
             scenario = scenario.model_copy(update={"placement": placement})
         work = Workspace(scenario, built.work.folder, jobs=1)
-        return solved(asking.ask(work, lambda _: None), job.junction, most, singles=costs_count)
+        factor = per_score(scenario.score.rank_by, vehicles_in(job.out))
+        return solved(asking.ask(work, lambda _: None), job.junction, most, singles=costs_count).times(factor)
 
 
 _ENDLESS = 1e15

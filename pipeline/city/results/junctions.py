@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ import numpy as np
 import pyarrow as pa
 
 from pipeline.artefacts import schemas, tables
+from pipeline.artefacts.run_record import RunRecord
 from pipeline.city.model import City, CityJunction
 from pipeline.core import files
 from pipeline.core.errors import InputError
@@ -32,11 +33,12 @@ _FILE, _KEY = "scores.parquet", "junction="
 
 @dataclass(frozen=True)
 class JunctionResult:
-    """What came of one junction: its best site, and how many there are."""
+    """What came of one junction: how many sites, the best one, and the vehicles in its region at a time."""
 
     junction: CityJunction
     sites: int
     best: ScoredSite
+    vehicles: float
     rank: int = 0
 
     @property
@@ -46,8 +48,19 @@ class JunctionResult:
 
     @property
     def gain(self) -> float:
-        """What it brings: its score, and nothing where that is not defined."""
-        return 0.0 if math.isnan(self.score) else self.score
+        """What it brings to the city, see :func:`per_score`; nothing where its score is not defined."""
+        return 0.0 if math.isnan(self.score) else self.score * per_score(self.best.rank_by, self.vehicles)
+
+
+def per_score(rank_by: str, vehicles: float) -> float:
+    """What a score is multiplied by, so that junctions can be compared and added up: EGVS are bits; means over a
+    junction's own vehicles or voxels count by how many vehicles are there at a time."""
+    return 1.0 if rank_by == "egvs" else vehicles
+
+
+def vehicles_in(run: Path) -> float:
+    """Vehicles in the region at a time, of a junction's run."""
+    return float(RunRecord.read(run).stages["tpog"].summary["boxes_in_roi"])
 
 
 def run_folder(out: Path, junction: str) -> Path:
@@ -66,11 +79,12 @@ def read_runs(out: Path, junctions: Sequence[CityJunction]) -> tuple[JunctionRes
     found = []
     for junction in junctions:
         sites = ScoredSite.read(run_folder(out, junction.id) / _FILE)
-        found.append(JunctionResult(junction, len(sites), min(sites, key=lambda site: site.rank)))
+        best, vehicles = min(sites, key=lambda site: site.rank), vehicles_in(run_folder(out, junction.id))
+        found.append(JunctionResult(junction, len(sites), best, vehicles))
     _check_alike(out, found)
     values = np.array([its.gain for its in found])
     ranked = zip(found, ranks(values).tolist(), strict=True)
-    by_rank = [JunctionResult(its.junction, its.sites, its.best, rank) for its, rank in ranked]
+    by_rank = [replace(its, rank=rank) for its, rank in ranked]
     return tuple(sorted(by_rank, key=lambda its: its.rank))
 
 
@@ -100,6 +114,8 @@ def write(out: Path, city: City, results: Sequence[JunctionResult]) -> tuple[Pat
         "sites": np.array([its.sites for its in results], dtype=np.uint32),
         "best": [site.site for site in best],
         "sensor": [site.sensor for site in best],
+        "gain": [its.gain for its in results],
+        "vehicles": [its.vehicles for its in results],
         **{key: [getattr(site, key) for site in best] for key in ("score", "egvs", "egvs_limit", "entropy_seen")},
     }
     digests = {row.id: files.sha256_of(run_folder(out, row.id) / _FILE) for row in rows}

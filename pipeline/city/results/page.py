@@ -6,6 +6,7 @@ nothing; its links lead to the reports of the junctions beside it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import quote
@@ -15,6 +16,7 @@ from pipeline.city.results import map as drawing
 from pipeline.city.results.junctions import RUNS, JunctionResult
 from pipeline.city.results.map import MapJunction
 from pipeline.city.results.plan import CityPlan
+from pipeline.city.results.words import gain_words
 from pipeline.core import files
 from pipeline.core.findings import Finding
 from pipeline.core.version import __version__
@@ -22,6 +24,7 @@ from pipeline.report import page as report
 from pipeline.report import wording
 from pipeline.report.drawing.colours import STYLE_SHEET
 from pipeline.report.drawing.placement import CurveStep, curve
+from pipeline.report.score_words import ScoreWords
 
 PAGE = "city.html"
 
@@ -58,6 +61,7 @@ def page(
         results=results,
         by=by,
         by_is_egvs=by.name == "egvs",
+        gain=gain_words(by.name),
         headline=headline(results),
         links={its.junction.id: link(its) for its in results},
         maps=figures(city, results, plan),
@@ -95,9 +99,9 @@ def figures(city: City, results: Sequence[JunctionResult], plan: CityPlan | None
     """Key, title and figure of each map: by what it brings, by what the best pole would see, by the plan."""
     box = drawing.box_of([(its.junction.x_m, its.junction.y_m) for its in results])
     streets, by = drawing.street_paths(_network(city), box), results[0].best.by
-    values = [("gain", f"by gain: {by.noun}", by.label, [its.gain for its in results])]
-    seen = [its.best.entropy_seen for its in results]
-    values.append(("seen", "by what the best pole would see", "share of the traffic’s uncertainty seen", seen))
+    gain = gain_words(by.name)
+    values = [("gain", f"by gain: {gain.label}", gain.label, [its.gain for its in results])]
+    values.append(("seen", f"by what the best pole would see: {_seen_label(by)}", _seen_label(by), _seen(results)))
     if plan is not None:
         counts = [float(plan.by_junction.get(its.junction.id, 0)) for its in results]
         values.append(("plan", "by the sensors of the plan", "sensors", counts))
@@ -111,6 +115,16 @@ def figures(city: City, results: Sequence[JunctionResult], plan: CityPlan | None
         )
         for key, title, label, its in values
     ]
+
+
+def _seen(results: Sequence[JunctionResult]) -> list[float]:
+    """What the best pole of each junction would see of it: by the score that ranks where that is a share."""
+    return [0.0 if math.isnan(its.score) else its.score if its.best.by.is_share else its.best.entropy_seen
+            for its in results]  # fmt: skip
+
+
+def _seen_label(by: ScoreWords) -> str:
+    return by.noun if by.is_share else "the share of the traffic’s uncertainty"
 
 
 def _curve(plan: CityPlan | None) -> str:

@@ -51,6 +51,8 @@ class CityPlan:
     ----------
     sensors
         In the order in which they would be put up.
+    rank_by
+        The score that is added up, see :func:`pipeline.city.results.junctions.per_score`.
     asked
         ``{"count": n}`` or ``{"budget": cost}``.
     joint, bound, together
@@ -62,6 +64,7 @@ class CityPlan:
     """
 
     sensors: tuple[PlannedSensor, ...]
+    rank_by: str
     asked: Mapping[str, float]
     joint: float
     bound: float

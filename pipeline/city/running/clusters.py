@@ -66,8 +66,8 @@ def connected(where: str, *, memory_limit: str = "auto") -> Iterator[Client]:
             return
         with (
             LocalCluster(
-                n_workers=count, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None,
-                memory_limit=memory_limit,
+                n_workers=count, threads_per_worker=1, processes=True, host="127.0.0.1", memory_limit=memory_limit,
+                dashboard_address="127.0.0.1:0",
             ) as cluster,
             Client(cluster, set_as_default=False) as client,
         ):  # fmt: skip

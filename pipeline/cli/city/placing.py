@@ -41,24 +41,30 @@ def place(
 
 def print_plan(placed: CityPlacement) -> None:
     """The sensors, what is proved of them, and what was written."""
+    from pipeline.city.results.words import gain_words
     from pipeline.cli.terminal import WIDE, console, table
 
     out, plan = console(WIDE), placed.plan
-    names = ["", "junction", "site", "z m", "yaw deg", "pitch deg", "sensor", "adds bit", "together bit", "cost"]
+    words = gain_words(plan.rank_by)
+    names = ["", "junction", "site", "z m", "yaw deg", "pitch deg", "sensor", "adds", "together", "cost"]
     rows = table(names, left=("junction", "site", "sensor"), whole=names)
     for s in plan.sensors:
         rows.add_row(
             f"{s.order}*" if s.forced else str(s.order), s.junction, s.site, f"{s.z_m:g}", f"{s.yaw_deg:.1f}",
-            f"{s.pitch_deg:.1f}", s.sensor, f"{s.gain:,.0f}", f"{s.score:,.0f}", f"{s.cost:g}",
+            f"{s.pitch_deg:.1f}", s.sensor, words.value(s.gain), words.value(s.score), f"{s.cost:g}",
         )  # fmt: skip
     out.print(rows)
     if any(sensor.forced for sensor in plan.sensors):
         out.print("* is there already")
     cost = f" for {plan.cost:g}" if plan.cost else ""
-    out.print(
-        f"{len(plan.sensors)} sensors at {len(plan.by_junction)} of {plan.junctions} junctions{cost}: joint EGVS "
-        f"{plan.joint:,.0f} bit, {plan.joint / plan.together:.1%} of what all {plan.candidates:,} candidates would; "
-        f"proved: at least {math.floor(plan.certificate * 1e4) / 1e2:.2f} % of the best possible"
-    )
+    share = plan.joint / plan.together if plan.together > 0 else 0.0
+    where = f"{len(plan.sensors)} sensors at {len(plan.by_junction)} of {plan.junctions} junctions{cost}"
+    worth = f"{words.label} {words.value(plan.joint)}, {share:.1%} of what all {plan.candidates:,} candidates would"
+    out.print(f"{where}: {worth}; proved: at least {_floored(plan.certificate)} % of the best possible")
     for path in placed.files:
         out.print(str(path))
+
+
+def _floored(share: float) -> str:
+    """A share that is proved in per cent, never rounded up."""
+    return f"{math.floor(share * 1e4) / 1e2:.2f}"

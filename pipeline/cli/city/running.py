@@ -58,16 +58,20 @@ def told_done(done: Done) -> str:
 
 def print_junctions(ran: CityRun) -> None:
     """The junctions, the best first, and what was written."""
+    from pipeline.city.results.words import gain_words
     from pipeline.cli.terminal import WIDE, console, table
 
     out, by = console(WIDE), ran.results[0].best.by
-    names = [*dict.fromkeys(("rank", "junction", "title", "best site", by.head, "entropy seen", "sites"))]
+    gain = gain_words(by.name)
+    shown = ("rank", "junction", "title", "best site", gain.head, by.head, "entropy seen", "vehicles", "sites")
+    names = [*dict.fromkeys(shown)]
     rows = table(names, left=("junction", "title", "best site"), whole=[name for name in names if name != "title"])
     for its in ran.results:
         best = its.best
         cells = {
             "rank": str(its.rank), "junction": its.junction.id, "title": its.junction.title, "best site": best.site,
             "entropy seen": f"{best.entropy_seen:.1%}", "sites": str(its.sites), by.head: by.value(its.score),
+            gain.head: gain.value(its.gain), "vehicles": f"{its.vehicles:.1f}",
         }  # fmt: skip
         rows.add_row(*(cells[name] for name in names))
     out.print(rows)

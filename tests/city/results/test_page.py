@@ -19,7 +19,7 @@ HOSTILE = '<script>alert("x")</script> & "Sons"'
 def result(name: str, rank: int, egvs: float, title: str = "") -> JunctionResult:
     """A junction with one site."""
     best = ScoredSite("pole", 0.0, 0.0, 3.0, egvs, 1, "pole", 0.0, 0.0, 0.0, "VLP-16", 1e3, 10, 5, 0.25)
-    return JunctionResult(CityJunction(name, title, 10.0 * rank, 5.0, 50.0, 9.0, True), 3, best, rank)
+    return JunctionResult(CityJunction(name, title, 10.0 * rank, 5.0, 50.0, 9.0, True), 3, best, 4.0, rank)
 
 
 def city(*results: JunctionResult) -> City:

@@ -76,13 +76,21 @@ def test_a_budget_needs_costs_and_is_kept(city: City, tmp_path: Path) -> None:
     assert not city_place.place(city, tmp_path / "out", budget=11.0, sets=costs).plan.sensors
 
 
+@pytest.mark.parametrize("score", ["expected_detections", "coverage"])
+def test_shares_count_by_the_vehicles_that_are_there(city: City, tmp_path: Path, score: str) -> None:
+    placed = city_place.place(city, tmp_path / "out", count=1, sets=[f'score.rank_by="{score}"'])
+    first, (sensor,) = placed.ran.results[0], placed.plan.sensors
+    assert first.gain == first.score * first.vehicles > 0
+    assert (sensor.junction, sensor.site) == (first.junction.id, first.best.site)
+    assert sensor.gain == pytest.approx(first.gain, rel=1e-12)
+
+
 @pytest.mark.parametrize(
     ("asked", "message"),
     [
         ({}, "--count, --budget: neither is given"),
         ({"count": 1, "budget": 5.0}, "--count, --budget: both are given"),
         ({"budget": -1.0}, "--budget: -1; a cost above 0"),
-        ({"count": 1, "sets": ['score.rank_by="coverage"']}, "score.rank_by: coverage is a share of a junction's own"),
         ({"count": 1, "sets": ["placement.survives=1"]}, "placement.survives: a plan of the whole city adds up"),
         ({"count": 1, "sets": ['placement.forced=["pole_a", "pole_b"]']}, "--count 1: 4 sensors are there already"),
     ],
