@@ -31,6 +31,7 @@ def named(scenario: Scenario) -> Iterator[tuple[str, str]]:
     yield from (("traffic.vtypes", name) for name in traffic.vtypes)
     for key, name in (
         ("traffic.network", traffic.network), ("traffic.sumocfg", traffic.sumocfg), ("traffic.fcd", traffic.fcd),
+        ("traffic.roads", traffic.roads),
         ("sites.file", of_sites.file), ("sites.points", of_sites.points),
     ):  # fmt: skip
         if name is not None:

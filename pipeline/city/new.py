@@ -30,7 +30,7 @@ from pipeline.importers.junctions import HEIGHTS_M, Junction, KerbPlace, Region,
 from pipeline.importers.mapped_solids import ImportCounts, MappedSolid
 from pipeline.importers.openstreetmap import check_at
 from pipeline.importers.scenario_folder import PITCHES_DEG, SENSOR, SITES, STATICS
-from pipeline.importers.street_network import ATTRIBUTION, NETWORK
+from pipeline.importers.street_network import ATTRIBUTION, NETWORK, Pieces
 from pipeline.scenario.loading import load
 from pipeline.scenario.models import FILE as SCENARIO_FILE
 from pipeline.sensing.sensors import CATALOGUE
@@ -46,7 +46,8 @@ NO_PLACE = "no place for a pole is free along the kerbs"
 COUNTS = "import.json"
 """What was made, assumed and left out, in the city's folder."""
 
-_LOCAL_M = 60.0
+_LOCAL_M, _ROADS_M = 60.0, 100.0
+"""How far round a region kerbs look at what is there, and streets are drawn."""
 
 
 @dataclass(frozen=True)
@@ -155,9 +156,13 @@ def _told(left_out: dict[str, list[str]]) -> str:
 def _junction(its_id: str, junction: Junction, streets: Streets, areas: shapely.STRtree) -> NewJunction:
     """The region round a junction, and places for poles; the solids are those of ``areas``."""
     roi = junctions.region_round(junction)
-    local = box(*roi.area.bounds).buffer(_LOCAL_M, join_style="mitre")
+    local = _window(roi, _LOCAL_M)
     objects = list(areas.geometries[sorted(areas.query(local))])
     return NewJunction(its_id, junction, roi, junctions.kerb_places(streets.near(local), junction, roi, objects))
+
+
+def _window(roi: Region, margin_m: float) -> shapely.Geometry:
+    return box(*roi.area.bounds).buffer(margin_m, join_style="mitre")
 
 
 def _texts(
@@ -168,12 +173,14 @@ def _texts(
     yield NETWORK, network
     yield TABLE, texts.table(_rows(city))
     yield COUNTS, files.json_text(city.to_json() | {"left_out": city.left_out}, indent=1) + "\n"
-    yield f"{JUNCTIONS}/{SCENARIO_FILE}", texts.common(city.streets)
+    yield f"{JUNCTIONS}/{SCENARIO_FILE}", texts.common()
+    pieces = Pieces(network)
     for its in city.junctions:
         near = [mapped[i] for i in sorted(areas.query(_reach(its), predicate="intersects"))]
         folder = f"{JUNCTIONS}/{its.id}"
         yield f"{folder}/{STATICS}", scenario_folder.geojson(near, texts.counts_of(near))
         yield f"{folder}/{SITES}", scenario_folder.sites_csv(its.places)
+        yield f"{folder}/{texts.ROADS}", pieces.near(city.streets.near(_window(its.roi, _ROADS_M)))
         yield f"{folder}/{SCENARIO_FILE}", texts.junction(its.id, its.junction.title, its.roi)
 
 

@@ -12,13 +12,10 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-import numpy as np
 import tomlkit
 
 from pipeline.city import model
 from pipeline.city.model import TRAFFIC, CityJunction
-from pipeline.core.errors import InputError
-from pipeline.formats.crs import WorldFrame, parsed
 from pipeline.importers import junctions, scenario_folder
 from pipeline.importers.junctions import Region, Streets
 from pipeline.importers.mapped_solids import ImportCounts, MappedSolid
@@ -26,7 +23,6 @@ from pipeline.importers.scenario_folder import Table
 from pipeline.importers.street_network import ATTRIBUTION, NETWORK
 from pipeline.scenario.traffic import FRAMES, WARMUP_S, TrafficModel
 from pipeline.traffic.demand import trips
-from pipeline.world.world_frame import located
 
 _ACROSS_M_S, _ROUND_S = 8.0, 60.0
 """A network is full once one could have crossed it at this speed."""
@@ -34,7 +30,9 @@ _ACROSS_M_S, _ROUND_S = 8.0, 60.0
 _TRIP_S = 100.0
 """Trips last longer than this: so many a second keep the vehicles of a network."""
 
-_AGREE_M = 1e-3
+ROADS = "roads.net.xml"
+"""Of a junction: the streets near it, for maps, lanes and checks."""
+
 _SOURCE = f"Made from OpenStreetMap. Map data {ATTRIBUTION} (openstreetmap.org/copyright)."
 _FRAME = f"World frame: x east, y north in metres as in {NETWORK}, z up from the flat ground."
 
@@ -65,12 +63,10 @@ def city(name: str, streets: Streets, count: int) -> str:
     return tomlkit.dumps(document)
 
 
-def common(streets: Streets) -> str:
+def common() -> str:
     """``junctions/scenario.toml``: what every junction's scenario extends."""
     period_s = TrafficModel.model_fields["frame_period_s"].default
-    crs = _crs(streets)
     tables: dict[str, Table] = {
-        **({"crs": ("where the world frame lies", crs)} if crs else {}),
         "roi": ("", scenario_folder.voxels()),
         "traffic": (f"as in {model.FILE}, or a multiple of it", {"frame_period_s": period_s}),
         "sites": ("", scenario_folder.mounts()),
@@ -85,7 +81,13 @@ def junction(its_id: str, title: str, roi: Region) -> str:
     values = {"extends": "..", "description": title[0].upper() + title[1:]}
     tables = {
         "roi": scenario_folder.roi_table(roi),
-        "traffic": ("the city's, cut to this junction", {"fcd": f"../../{TRAFFIC}/{its_id}.parquet"}),
+        "traffic": (
+            "the city's, cut to this junction",
+            {
+                "fcd": f"../../{TRAFFIC}/{its_id}.parquet",
+                "roads": ROADS,
+            },
+        ),
         "statics": scenario_folder.statics_table(),
         "sites": scenario_folder.sites_table(),
     }
@@ -115,21 +117,3 @@ def notes(larger: int, counts: ImportCounts) -> list[str]:
             f"{larger} junctions are larger than their regions of interest ({junctions.ROI_MOST_M:g} m at most)"
         )
     return found
-
-
-def _crs(streets: Streets) -> dict[str, Any]:
-    """``[crs]`` that says the same as the network, which junctions do not name; empty where no code does."""
-    own, found = located(streets.network.location), ""
-    if own is None:
-        return {}
-    code = parsed(own.projection, NETWORK).to_epsg()
-    if code is None:
-        return {}
-    try:
-        stated = WorldFrame.of(f"EPSG:{code}", own.offset_m, found)
-    except InputError:  # counts to the north and east
-        return {}
-    spots = np.array([node.at_m for node in streets.junctions])
-    if np.abs(stated.from_degrees(own.to_degrees(spots)) - spots).max() > _AGREE_M:
-        return {}
-    return {"epsg": code, "offset_m": list(own.offset_m)}

@@ -5,6 +5,7 @@ Frame: the network's own x, y in metres. Neither dates nor paths get into the ne
 
 from __future__ import annotations
 
+import html
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -56,6 +57,45 @@ def network(extract: Extract, osm: Path, flags: Sequence[str]) -> tuple[str, Str
                 raise InputError(osm, f"holds streets that cannot be used: {error}", "another extract") from None
             raise
         return _without_header((work / NETWORK).read_text(encoding="utf-8")), streets
+
+
+class Pieces:
+    """A network's text in pieces, to write parts of it: roads for maps and checks, nothing that SUMO could run.
+
+    Elements stay as netconvert wrote them, one below the other.
+    """
+
+    def __init__(self, text: str) -> None:
+        found = list(_ELEMENT.finditer(text))
+        self._head = text[: found[0].start()] if found else text
+        self._head = re.sub(r"^    <type .*\n", "", self._head, flags=re.MULTILINE)
+        self._of_edges = {_attribute(m[0], "id"): m[0] for m in found if m[1] == "edge"}
+        self._of_junctions = {_attribute(m[0], "id"): m[0] for m in found if m[1] == "junction"}
+        self._connections = [
+            (_attribute(m[0], "from"), _attribute(m[0], "to"), m[0]) for m in found if m[1] == "connection"
+        ]
+
+    def near(self, streets: Streets) -> str:
+        """The part with these streets (:meth:`pipeline.importers.junctions.Streets.near`)."""
+        nodes = {node.id for node in streets.network.junctions}
+        roads = {edge.id for edge in streets.network.edges}
+        edges = {its: text for its, text in self._of_edges.items() if its in roads or _node(its, 1) in nodes}
+        kept = (text for its, text in self._of_junctions.items() if its in nodes or _node(its, 2) in nodes)
+        links = (text for start, end, text in self._connections if start in edges and end in edges)
+        return "".join([self._head, *edges.values(), *kept, *links, "\n</net>\n"])
+
+
+_ELEMENT = re.compile(r"^    <(edge|junction|connection) [^\n]*?(?:/>|>\n.*?^    </\1>)\n", re.MULTILINE | re.DOTALL)
+
+
+def _attribute(element: str, name: str) -> str:
+    found = re.search(rf' {name}="([^"]*)"', element)
+    return html.unescape(found[1]) if found else ""
+
+
+def _node(its_id: str, numbers: int) -> str:
+    """The junction of an edge inside it (":J_3"), or of a point on such an edge (":J_3_0"), which has two numbers."""
+    return its_id[1:].rsplit("_", numbers)[0] if its_id.startswith(":") else ""
 
 
 def cropped(

@@ -149,7 +149,7 @@ def idle_beside(source: str) -> frozenset[str]:
     simulated = frozenset({"vehicles", "hold", "step_s", "lateral_resolution_m", "max_depart_delay_s"})
     if source == "fcd":
         return simulated | drawn - {"kinds"} | {"routes"}
-    return {"sumocfg": drawn | {"routes"}, "routes": drawn}.get(source, frozenset()) | {"vtypes"}
+    return {"sumocfg": drawn | {"routes"}, "routes": drawn}.get(source, frozenset()) | {"vtypes", "roads"}
 
 
 class TrafficModel(StrictModel):
@@ -173,6 +173,11 @@ class TrafficModel(StrictModel):
     fcd: str | None = Field(
         default_factory=lambda given: _of_first_period(given, "fcd"),
         description="A finished FCD file (XML, CSV or Parquet, may be gzipped); nothing is simulated",
+    )
+    roads: str | None = Field(
+        None,
+        description="The network on which the vehicles of a finished FCD file drove (as `network`): maps show it, blind"
+        " spots name its lanes, checks hold sites against it",
     )
     vtypes: tuple[str, ...] = Field(
         (), description="SUMO files with <vType>s: the sizes in a finished FCD file; kinds come before them"

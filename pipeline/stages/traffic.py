@@ -70,7 +70,8 @@ def _sources(scenario: Scenario) -> list[Path]:
     """The files that one period's traffic comes from."""
     traffic = scenario.traffic
     if traffic.fcd is not None:
-        return [scenario.find(traffic.fcd, "traffic.fcd"), *sizes.files(scenario)]
+        roads = sumo_folder.network_path(scenario)
+        return [scenario.find(traffic.fcd, "traffic.fcd"), *sizes.files(scenario), *([] if roads is None else [roads])]
     own = [scenario.find(traffic.sumocfg, "traffic.sumocfg")] if traffic.sumocfg is not None else []
     return [*own, *sumo_folder.sources(scenario).all()]
 

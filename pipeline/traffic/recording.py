@@ -117,17 +117,18 @@ def record(
     for refusal in filter(None, (extension.refuses(scenario) for extension in extensions)):
         raise refusal
     if scenario.traffic.fcd is not None:
-        return _finished(scenario, world)
+        return _finished(scenario, folder, world)
     if traci is not None:
         return _running(scenario, *traci, extensions)
     return _simulated(scenario, folder, progress, extensions)
 
 
 @contextmanager
-def _finished(scenario: Scenario, world: Georeference) -> Iterator[Recording]:
+def _finished(scenario: Scenario, folder: Path, world: Georeference) -> Iterator[Recording]:
     """From a file; nothing is simulated, so nothing is promised about it."""
     name, place = scenario.traffic.fcd, sumo_folder.place_of(scenario)
     assert name is not None
+    sumo_folder.lay_roads(scenario, folder)
     when, held = survey.window(scenario)
     path, sizes = scenario.find(name, "traffic.fcd"), finished_sizes.of_types(scenario, held.types, held.sizes)
     rows = fcd.read(path) if held.stated is not None else fcd.located(fcd.read(path), world, path)

@@ -125,8 +125,11 @@ def sources(scenario: Scenario) -> Sources:
 
 
 def network_path(scenario: Scenario) -> Path | None:
-    """The network that a scenario or its configuration simulates; None where it names a finished file."""
+    """The network that a scenario or its configuration simulates, or the roads that it names beside a finished file;
+    None where it names none."""
     traffic = scenario.traffic
+    if traffic.fcd is not None:
+        return None if traffic.roads is None else scenario.find(traffic.roads, "traffic.roads")
     if traffic.network is not None:
         return scenario.find(traffic.network, "traffic.network")
     if traffic.sumocfg is None:
@@ -135,7 +138,7 @@ def network_path(scenario: Scenario) -> Path | None:
 
 
 def roads(scenario: Scenario) -> network.Network | None:
-    """The network that a scenario simulates, a map of OpenStreetMap converted first; None of a finished file.
+    """The network of :func:`network_path`, a map of OpenStreetMap converted first.
 
     InputError when the scenario, its configuration or its network is wrong.
     """
@@ -145,6 +148,19 @@ def roads(scenario: Scenario) -> network.Network | None:
     with files.scratch() as folder:
         convert_osm(path, folder / NETWORK)
         return network.read(folder / NETWORK, path)
+
+
+def lay_roads(scenario: Scenario, folder: Path) -> None:
+    """A fresh folder with a copy of the roads that a scenario names beside a finished file, if it does."""
+    if (path := network_path(scenario)) is None:
+        return
+    assert scenario.traffic.fcd is not None, "what is simulated is laid out otherwise"
+    own = [scenario.find(scenario.traffic.fcd, "traffic.fcd"), path]
+    _make_fresh(folder, [*own, *(scenario.find(name, "traffic.vtypes") for name in scenario.traffic.vtypes)])
+    if network.is_osm(path):
+        convert_osm(path, folder / NETWORK)
+    else:
+        copies.copy(path, folder / NETWORK)
 
 
 def may_have_heights(scenario: Scenario) -> bool:
@@ -204,7 +220,7 @@ def prepare(scenario: Scenario, folder: Path, extensions: Iterable[TrafficExtens
     when = timing(traffic, given.begin_s, place)
     adding = [extension for extension in extensions if extension.ADDS_TRAFFIC]
     others = [OTHERS.replace("others", f"others{number or ''}") for number in range(len(adding))]
-    _make_fresh(folder, given)
+    _make_fresh(folder, given.all())
     named, left_out = _copies(given, folder, others)
     roads = network.read(folder / named["net-file"], given.files["net-file"][0])
     demand_seed, sumo_seed, *other_seeds = np.random.SeedSequence(scenario.seed).spawn(2 + len(adding))
@@ -239,9 +255,9 @@ def prepare(scenario: Scenario, folder: Path, extensions: Iterable[TrafficExtens
     )  # fmt: skip
 
 
-def _make_fresh(folder: Path, given: Sources) -> None:
+def _make_fresh(folder: Path, given: Iterable[Path]) -> None:
     """An empty folder, so that nothing of an earlier run, nor a SUMO that still writes, gets into this one."""
-    for path in given.all():
+    for path in given:
         if path.resolve().is_relative_to(folder.resolve()):
             what = "lies in the folder that is made anew for SUMO"
             raise InputError(path, what, "another --out, or the file elsewhere")

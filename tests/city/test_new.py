@@ -13,12 +13,14 @@ import pytest
 from shapely.geometry import box, shape
 
 import pipeline
+from pipeline.artefacts import tables
 from pipeline.city import model, new
 from pipeline.city import traffic as city_traffic
 from pipeline.core.errors import InputError
 from pipeline.formats import osm as osm_reader
 from pipeline.importers import junctions, openstreetmap, street_network
 from pipeline.stages import traffic
+from pipeline.traffic import network
 from pipeline.world import world_frame
 from tests.stages import run_stage
 
@@ -130,6 +132,31 @@ def test_near_streets_give_the_same_kerbs_as_all(extract: Path) -> None:
         assert junctions.kerb_places(near, junction, roi, []) == junctions.kerb_places(streets, junction, roi, [])
 
 
+def test_a_part_of_a_network_has_its_streets_as_they_are(extract: Path, tmp_path: Path) -> None:
+    read = osm_reader.read(extract)
+    text, streets = street_network.network(read, extract, street_network.flags(read, lefthand=False, walk=True))
+    pieces, whole = street_network.Pieces(text), streets.network
+    (tmp_path / "whole.net.xml").write_text(text)
+    for junction in (junction for junction in streets.junctions if junction.arms >= 3):
+        window = junctions.region_round(junction).area.buffer(80.0, join_style="mitre")
+        path = tmp_path / "part.net.xml"
+        path.write_text(pieces.near(streets.near(window)))
+        part = network.read(path)
+        assert part.location == whole.location
+        ours, all_edges = {e.id: e for e in part.all_edges}, {e.id: e for e in whole.all_edges}
+        assert len(ours) < len(all_edges)
+        for its_id, edge in ours.items():
+            assert [lane.text for lane in edge.lanes] == [lane.text for lane in all_edges[its_id].lanes]
+        reached = {its for its, area in streets.areas.items() if area.intersects(window) and not its.startswith(":")}
+        assert reached <= ours.keys()
+        inside = {its for its in all_edges if its.startswith(f":{junction.id}_")}
+        assert inside and inside <= ours.keys()  # lanes, crossings and walking areas of the junction
+        assert {j.id for j in part.junctions} >= {junction.id}
+        mine = {(part.edges[c.source].id, part.edges[c.target].id, c.via) for c in part.connections}
+        every = {(whole.edges[c.source].id, whole.edges[c.target].id, c.via) for c in whole.connections}
+        assert mine == {c for c in every if c[0] in ours and c[1] in ours}
+
+
 def test_the_same_map_gives_the_same_bytes(made: new.NewCity, extract: Path, tmp_path: Path) -> None:
     again = new.new(tmp_path / "town", extract)
     assert contents(again.folder) == contents(made.folder)
@@ -228,6 +255,11 @@ def test_from_a_map_to_a_junctions_scores(extract: Path, tmp_path: Path, egvs) -
     assert summary["frames"] == 40
     boxes = pipeline.read_trajectories(tmp_path / "run" / "trajectories.parquet")
     assert {"pedestrian", "passenger"} <= set(boxes["kind"].to_pylist())
+    overrides = ["sites.heights_m=[4.5]", "sites.pitch_deg=['aim']", "sites.sensor='VLP-16'", "roi.voxel_m=1"]
+    pipeline.run(pipeline.load(folder, overrides), tmp_path / "run", jobs=1)
+    spots, _ = tables.read(tmp_path / "run" / "blindspots.parquet", "blindspots")
+    assert "lane" in spots["by"].to_pylist()
+    assert "A Road" in (tmp_path / "run" / "report.html").read_text()
     city = model.load(tmp_path / "town")
     (tmp_path / "town" / "traffic" / city_traffic.SEAL).unlink()
     assert city_traffic.make(city).anew  # SUMO runs again: the same bytes

@@ -223,3 +223,46 @@ def test_sizes_are_missed_by_the_check(mini: Path, egvs) -> None:
     code, said, _ = egvs("check", mini)
     assert code == 2
     assert "vehicle types 'lorry', 'tram' of fcd.csv have no known size" in said
+
+
+# ---- on which roads
+
+
+def test_roads_beside_a_file_are_the_networks(mini: Path, tmp_path: Path, egvs) -> None:
+    (mini / "net.net.xml").write_text(net_xml())
+    roads = ["--set", "traffic.roads='net.net.xml'"]
+    assert egvs("run", mini, "--out", tmp_path / "plain")[0] == 0
+    code, _, said = egvs("run", mini, "--out", tmp_path / "roads", *roads)
+    assert code == 0, said
+    ours, its = (pipeline.read_trajectories(tmp_path / way / "trajectories.parquet") for way in ("roads", "plain"))
+    assert ours.equals(its)
+    assert (tmp_path / "roads" / "sumo" / "network.net.xml").read_text() == net_xml()
+    named = {way: set(tables.read(tmp_path / way / "blindspots.parquet", "blindspots")[0]["by"].to_pylist())
+             for way in ("roads", "plain")}  # fmt: skip
+    assert "lane" in named["roads"] - named["plain"]
+    assert egvs("verify", tmp_path / "roads")[0] == 0
+    (mini / "net.net.xml").write_text(net_xml().replace("</net>", "<!-- another --></net>"))
+    assert "traffic" in egvs("run", mini, "--out", tmp_path / "roads", *roads)[1]
+    assert "another" in (tmp_path / "roads" / "sumo" / "network.net.xml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        (["traffic.roads='no.net.xml'"], "traffic.roads = 'no.net.xml': no such file"),
+        (["traffic.roads='fcd.csv'"], "fcd.csv: is not well-formed XML"),
+        (["traffic.network='net.net.xml'", "traffic.roads='net.net.xml'"], "roads would act on nothing beside network"),
+    ],
+)
+def test_wrong_roads_are_told(mini: Path, tmp_path: Path, egvs, settings: list[str], told: str) -> None:
+    (mini / "net.net.xml").write_text(net_xml())
+    code, _, said = egvs("run", mini, "--out", tmp_path / "run", *(word for s in settings for word in ("--set", s)))
+    assert code == 2 and told in said, said
+
+
+def test_roads_that_lie_where_they_would_be_copied_to_are_refused(mini: Path, egvs) -> None:
+    (mini / "sumo").mkdir()
+    (mini / "sumo" / "mine.net.xml").write_text(net_xml())
+    code, _, said = egvs("run", mini, "--out", mini, "--set", "traffic.roads='sumo/mine.net.xml'")
+    assert code == 2 and "holds sumo/mine.net.xml, which the scenario names (traffic.roads)" in said, said
+    assert (mini / "sumo" / "mine.net.xml").is_file()

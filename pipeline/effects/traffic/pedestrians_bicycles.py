@@ -98,7 +98,7 @@ class PedestriansBicycles(Traffic[PedestriansBicyclesParameters]):
     def seen(self, scene: Scene) -> str:
         """Where people could walk."""
         path = sumo_folder.network_path(scene.scenario)
-        if path is None or network.is_osm(path):
+        if path is None or network.is_osm(path) or scene.scenario.traffic.fcd is not None:
             return ""
         ways = network.read(path).walkways
         if not ways.sidewalks or not ways.areas:

@@ -1,9 +1,9 @@
 """The roads under a map: lanes as wide as they are, junctions, street names, in world-frame metres (x east, y north).
 
-Steps: take the network that SUMO drove on from the run's folder; keep what lies within the map; sort lanes by who may
-use them; choose for each street name the longest straight piece, where it is written.
+Steps: take the network that vehicles drove on from the run's folder; keep what lies within the map; sort lanes by who
+may use them; choose for each street name the longest straight piece, where it is written.
 
-Where nothing was simulated (a finished FCD file) there is no network, and maps have no roads.
+A finished FCD file whose scenario names no ``traffic.roads`` has no network, and maps have no roads then.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Roads:
 
 
 def network_file(folder: Path) -> Path | None:
-    """The network in a run's folder; None where SUMO did not run."""
+    """The network in a run's folder; None where there is none."""
     names = (sumo_folder.NETWORK, f"{sumo_folder.NETWORK}.gz")
     found = (path for name in names for path in sorted((folder / FOLDER).rglob(name)))
     return next(found, None)

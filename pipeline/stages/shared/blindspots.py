@@ -40,9 +40,7 @@ def spots_of(work: Workspace, record: TargetRecord, recorded: list[int], weight:
 
 
 def _network_path(scenario: Scenario) -> Path | None:
-    """The network that all the traffic was simulated on; None where some is a finished file, or periods have networks
-    of their own."""
-    if scenario.is_recorded:
-        return None
+    """The network that all the traffic drove on; None where a finished file names none, or periods have networks of
+    their own."""
     paths = {sumo_folder.network_path(alone) for alone in scenario.by_period().values()}
     return paths.pop() if len(paths) == 1 else None
