@@ -23,6 +23,9 @@ end of a chord by :math:`2 u R` and its length by :math:`4 u R` and less than a 
 the segment's start to that end. For R up to 1e7 m that is 4.5e-9 m: right wherever the chord differs from ``CHORD_M``
 by more than 1e-8 m. The segment may end anywhere, up to the largest float64. Any other finite input is walked in as
 many steps, with :math:`4 u R` in place of 1e-8 m.
+
+Where nothing but hits is asked for, most beams take a shorter way to the same voxels, which says where it is not
+certain of them: :mod:`pipeline.kernels.hits.sure_march`.
 """
 
 from __future__ import annotations
@@ -30,6 +33,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.kernels.compile_cache import compiled
+from pipeline.kernels.hits import sure_march
 
 CHORD_M = 1e-6
 """A shared chord up to this length is no contact."""
@@ -106,40 +110,9 @@ def _scratch(shape):  # type: ignore[no-untyped-def]
 
 
 @_inlined
-def _count(hits, amount, times_x, times_y, times_z, cell, step_x, step_y, step_z, t, t_last, shortest):  # type: ignore[no-untyped-def]
-    """Merge the crossings of the three axes and add ``amount`` to what is crossed. A loop of its own, beside that of
-    :func:`_walk`, since most time is spent here: no branch on whether a chord is long enough, it nearly always is."""
-    one = np.uint64(1)
-    ix, iy, iz = np.uint64(0), np.uint64(0), np.uint64(0)
-    tx, ty, tz = times_x[ix], times_y[iy], times_z[iz]
-    while True:
-        if tx < ty and tx < tz:
-            hits[cell] += amount * (tx - t > shortest)
-            t = tx
-            cell += step_x
-            ix += one
-            tx = times_x[ix]
-        elif ty < tz:
-            hits[cell] += amount * (ty - t > shortest)
-            t = ty
-            cell += step_y
-            iy += one
-            ty = times_y[iy]
-        elif tz < np.inf:
-            hits[cell] += amount * (tz - t > shortest)
-            t = tz
-            cell += step_z
-            iz += one
-            tz = times_z[iz]
-        else:
-            break
-    hits[cell] += amount * (t_last - t > shortest)
-
-
-@_inlined
 def _count_falling(hits, falls, times_x, times_y, times_z, cell, step_x, step_y, step_z, t, t_last, shortest):  # type: ignore[no-untyped-def]
-    """As :func:`_count`, with an amount that changes: ``falls`` are two arrays: where, as shares of the segment,
-    ascending, infinity last; and the amounts of voxels entered before each."""
+    """Merge the crossings of the three axes and add a changing amount to what is crossed. ``falls`` are two arrays:
+    where, as shares of the segment, ascending, infinity last; and the amounts of voxels entered before each."""
     t_falls, amounts = falls
     one = np.uint64(1)
     ix, iy, iz, at = np.uint64(0), np.uint64(0), np.uint64(0), np.uint64(0)
@@ -200,11 +173,8 @@ def _walk(o, d, shape, voxel_m, hits, amount, falls, cells, t_cells, times):  # 
     ix, iy, iz = np.uint64(0), np.uint64(0), np.uint64(0)
     tx, ty, tz = times_x[ix], times_y[iy], times_z[iz]
     t_first, count = t, 0
-    if cells is None:
-        if falls is None:
-            _count(hits, amount, times_x, times_y, times_z, cell, step_x, step_y, step_z, t, t_last, shortest)
-        else:
-            _count_falling(hits, falls, times_x, times_y, times_z, cell, step_x, step_y, step_z, t, t_last, shortest)
+    if falls is not None:
+        _count_falling(hits, falls, times_x, times_y, times_z, cell, step_x, step_y, step_z, t, t_last, shortest)
         return 0, t_first, t_last
     following, on = cell, True
     while on:
@@ -223,8 +193,11 @@ def _walk(o, d, shape, voxel_m, hits, amount, falls, cells, t_cells, times):  # 
         else:
             t_next, on = t_last, False
         crossed = t_next - t > shortest
-        cells[count], t_cells[count, 0], t_cells[count, 1] = cell, t, t_next
-        count += crossed
+        if cells is None:
+            hits[cell] += amount * crossed
+        else:
+            cells[count], t_cells[count, 0], t_cells[count, 1] = cell, t, t_next
+            count += crossed
         t, cell = t_next, following
     return count, t_first, t_last
 
@@ -273,17 +246,27 @@ def count_hits(o, d, shape, voxel_m, hits):  # type: ignore[no-untyped-def]
     hits
         Counters, (nx * ny * nz,) uint32, added to.
     """
-    times = _scratch(shape)
-    for beam in range(d.shape[0]):
-        _walk(o, d[beam], shape, voxel_m, hits, np.uint32(1), None, None, None, times)
+    _count_beams(o, d, shape, voxel_m, None, hits)
 
 
 @_kernel
 def add_hits(o, d, shape, voxel_m, weights, hits):  # type: ignore[no-untyped-def]
     """As :func:`count_hits`, for beams that weigh ``weights`` (n,) int64; ``hits`` are int64."""
-    times = _scratch(shape)
+    _count_beams(o, d, shape, voxel_m, weights, hits)
+
+
+@_inlined
+def _count_beams(o, d, shape, voxel_m, weights, hits):  # type: ignore[no-untyped-def]
+    """Add each beam by the march that multiplies, where that is certain, else by :func:`_walk`."""
+    times, cells = _scratch(shape), sure_march.scratch(shape)
+    near = sure_march.room(o, shape, CHORD_M / voxel_m)
     for beam in range(d.shape[0]):
-        _walk(o, d[beam], shape, voxel_m, hits, weights[beam], None, None, None, times)
+        amount = np.uint32(1) if weights is None else weights[beam]
+        count = sure_march.crossed(o, d[beam], shape, near, cells)
+        if count < 0:
+            _walk(o, d[beam], shape, voxel_m, hits, amount, None, None, None, times)
+        for i in range(count):
+            hits[cells[i]] += amount
 
 
 @_kernel

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core.grid import Grid
-from pipeline.kernels import thinning as kernels
+from pipeline.kernels.hits import thinning as kernels
 
 Floats = NDArray[np.float64]
 ByRange = Callable[[Floats], Floats]
@@ -44,7 +44,8 @@ class RangeTable:
     near_m, piece_m
         Where the first piece begins, and how long each is.
     cubics
-        Coefficients of each piece, see :func:`pipeline.kernels.thinning.thin`; NaN where a cubic is not good enough.
+        Coefficients of each piece, see :func:`pipeline.kernels.hits.thinning.thin`; NaN where a cubic is not good
+        enough.
     """
 
     function: ByRange
@@ -78,7 +79,7 @@ class RangeTable:
         grid: Grid,
         thinned: NDArray[np.int64],
     ) -> None:
-        """Fill ``thinned`` with hits * ``whole`` * function(range), see :func:`pipeline.kernels.thinning.thin`."""
+        """Fill ``thinned`` with hits * ``whole`` * function(range), see :func:`pipeline.kernels.hits.thinning.thin`."""
         shape = np.asarray(grid.shape, dtype=np.int64)
         per_m = 1.0 / self.piece_m
         if not kernels.thin(hits, whole, o, shape, grid.voxel_m, self.near_m, per_m, self.cubics, thinned):
