@@ -9,6 +9,8 @@ An entry is written aside, then renamed: it is there whole or not at all, whenev
 hash is checked when it is taken, and that of entry.json whenever it is read; an entry that is damaged is removed, so
 that it is made again. The entries used longest ago go first when all of them take more than a bound. What else lies in
 the folder is left alone. A store that cannot be written is named once, and done without.
+
+Behind the folder there may be another store that machines share (:mod:`pipeline.runs.remote`).
 """
 
 from __future__ import annotations
@@ -31,10 +33,12 @@ from pipeline.core.errors import InputError
 from pipeline.core.progress import Progress, silent
 from pipeline.runs import locking, store_settings
 from pipeline.runs.locking import locked
+from pipeline.runs.remote import ENTRY as _ENTRY
+from pipeline.runs.remote import Remote
 from pipeline.runs.stages import Made
 
-_ENTRY, _HASH = "entry.json", "sha256"
-"""What the store notes of an entry, and the note's key for the hash of all else in it."""
+_HASH = "sha256"
+"""The key, in what the store notes of an entry, of the hash of all else in it."""
 
 KINDS = (*STAGES, "points", "detections", "part")
 """What entries are of: stages, what was found from a site, and parts of a score."""
@@ -88,6 +92,8 @@ class Store:
         What all entries together may take.
     note
         Called with what a user should know: that an entry was damaged, or that the store cannot be written.
+    remote
+        Where entries come from that are not in the folder, and where those go that are put into it.
     """
 
     def __init__(
@@ -95,9 +101,10 @@ class Store:
         folder: Path | None,
         bound_bytes: float = store_settings.DEFAULT_MAX_GB * 1e9,
         note: Callable[[str], None] = _to_stderr,
+        remote: Remote | None = None,
     ) -> None:
         self.folder, self.bound_bytes, self._note = folder, bound_bytes, note
-        self._can_write = folder is not None
+        self._can_write, self._remote = folder is not None, remote
         if folder is not None:
             with suppress(OSError):  # which is named where it is in the way
                 self._clear_work(folder)
@@ -105,7 +112,8 @@ class Store:
     @classmethod
     def default(cls) -> Store:
         """Where ``EGVS_STORE`` says, else beside the runs."""
-        return cls(*store_settings.read())
+        url = store_settings.remote_url()
+        return cls(*store_settings.read(), remote=None if url is None else Remote(url))
 
     def check(self, *, changed: bool) -> None:
         """InputError where the folder is a file, or where there is no store that could be ``changed``."""
@@ -137,6 +145,29 @@ class Store:
         with suppress(OSError), locked(self.folder / ".lock"):
             self._remove(folder)
         return None
+
+    def fetch(self, stage: str, key: str) -> None:
+        """Have an entry from the remote store in the folder, where it is there and not here; for its :meth:`maker`."""
+        if self._remote is None or not self._can_write or self.folder is None:
+            return
+        if (final := self._place(stage, key)).exists():
+            return
+        work = self.folder / ".work" / final.name
+        try:
+            shutil.rmtree(work, ignore_errors=True)
+            work.mkdir(parents=True)
+            if self._remote.fetch(final.name, work):
+                _read(work)
+                with self._shared():
+                    work.rename(final)
+        except _Damaged as damage:
+            self._note(f"{self._remote.url}: the kept {stage} is damaged ({damage}), and made again")
+        except InputError as error:
+            self._do_without_remote(error)
+        except OSError as error:
+            self._do_without(error)
+        finally:
+            shutil.rmtree(work, ignore_errors=True)
 
     @contextmanager
     def maker(self, stage: str, key: str, *, wait: bool = True, progress: Progress = silent) -> Iterator[bool]:
@@ -176,7 +207,11 @@ class Store:
             (work / _ENTRY).write_text(_to_json(stage, key, work, made), encoding="utf-8")
             with self._shared():
                 work.rename(final)
+            if self._remote is not None:
+                self._remote.put(final.name, final, made.files)
             self.prune(self.bound_bytes)
+        except InputError as error:
+            self._do_without_remote(error)
         except OSError as error:
             self._do_without(error)
         finally:
@@ -248,6 +283,10 @@ class Store:
             with suppress(OSError), locked(folder / ".locks" / name, wait=False, remove=True) as free:
                 if free:
                     shutil.rmtree(folder / ".work" / name, ignore_errors=True)
+
+    def _do_without_remote(self, error: InputError) -> None:
+        self._remote = None
+        self._note(f"{error}; the run goes on without it")
 
     def _do_without(self, error: OSError) -> None:
         self._can_write = False

@@ -12,7 +12,8 @@ from pathlib import Path
 from pipeline.core.errors import InputError
 
 PLACE, MAX_GB = "EGVS_STORE", "EGVS_STORE_MAX_GB"
-"""Environment variables: where the store is (empty for none), and how much it may hold."""
+"""Environment variables: where the store is (empty for none; a folder, or a URL that machines share), and how much its
+folder may hold."""
 
 DEFAULT_PLACE = Path("runs", ".store")
 DEFAULT_MAX_GB = 10.0
@@ -32,17 +33,39 @@ def using(place: str, bound_bytes: float) -> Iterator[None]:
 
 
 def read() -> tuple[Path | None, float]:
-    """The store's folder, None for no store; and its bound in bytes."""
+    """The store's folder on this machine, None for no store; and its bound in bytes."""
     if (ordered := _ORDERED.get()) is not None:
-        return Path(ordered[0]), ordered[1]
-    place, most = os.environ.get(PLACE), os.environ.get(MAX_GB)
+        return _folder(ordered[0]), ordered[1]
+    most = os.environ.get(MAX_GB)
     try:
         bound_gb = DEFAULT_MAX_GB if most is None else float(most)
     except ValueError:
         bound_gb = math.nan
     if not 0 <= bound_gb < math.inf:
         raise InputError(MAX_GB, f"{most!r}", "how many GB the store may hold, for example 10")
-    return (DEFAULT_PLACE if place is None else Path(place) if place else None), bound_gb * 1e9
+    return _folder(_place()), bound_gb * 1e9
+
+
+def remote_url() -> str | None:
+    """The URL of the store that machines share; None where it is a folder, or there is none."""
+    place = _place()
+    return place if place is not None and _is_url(place) else None
+
+
+def _place() -> str | None:
+    ordered = _ORDERED.get()
+    return os.environ.get(PLACE) if ordered is None else ordered[0]
+
+
+def _folder(place: str | None) -> Path | None:
+    """The folder on this machine: beside the runs where the store's place is a URL, or is not said."""
+    if place is None or _is_url(place):
+        return DEFAULT_PLACE
+    return Path(place) if place else None
+
+
+def _is_url(place: str) -> bool:
+    return "://" in place
 
 
 def keep_out(folder: Path) -> None:

@@ -154,6 +154,7 @@ def fetch_or_make(
     work.forget(*stages.written_by(name))
     if (entry := store.take(name, key, out, link=link)) is None:
         with store.maker(name, key, progress=work.progress):
+            store.fetch(name, key)
             if (entry := store.take(name, key, out, link=link)) is None:  # nor has another one made it meanwhile
                 made = make()
                 store.put(name, key, out, made, link=link)

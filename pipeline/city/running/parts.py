@@ -52,6 +52,7 @@ def _bring(scoring: SiteScoring, score_key: str, names: tuple[str, ...], folder:
     key = files.hash_of({"score": score_key, "sites": names, "program": program})
     if store.take(KIND, key, folder) is None:
         with store.maker(KIND, key):
+            store.fetch(KIND, key)
             if store.take(KIND, key, folder) is None:  # nor has another one made it meanwhile
                 with measured() as cost:
                     scored_parts.write(path, list(scoring.all_sites(only=names)))

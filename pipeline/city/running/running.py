@@ -9,7 +9,6 @@ from __future__ import annotations
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from pipeline.city.running import graph, tasks
@@ -17,6 +16,7 @@ from pipeline.city.running.jobs import Done, Failed, Job, Order, program
 from pipeline.core.errors import EgvsError, InputError, RunError
 from pipeline.core.progress import Progress, silent
 from pipeline.runs import store_settings
+from pipeline.runs.remote import Remote
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -70,12 +70,14 @@ def each(
 
 
 def give_order() -> Order:
-    """What holds for all tasks: this program, and the store; InputError where there is none."""
+    """What holds for all tasks: this program, and the store; InputError where there is none, or it is out of reach."""
     place, most_bytes = store_settings.read()
     if place is None:
         found = "empty, so that there is no store: what workers make for one another is kept there"
         raise InputError(store_settings.PLACE, found, "a folder that all workers see")
-    return Order(uuid.uuid4().hex[:8], program(), str(Path(place).absolute()), most_bytes)
+    if (url := store_settings.remote_url()) is not None:
+        Remote(url).check()
+    return Order(uuid.uuid4().hex[:8], program(), url or str(place.absolute()), most_bytes)
 
 
 def tell(failed: Sequence[Failed], junctions: int) -> None:

@@ -1,0 +1,123 @@
+"""A store that machines share: what one made another one fetches, and what is damaged there is made again.
+
+Evidence: two folders stand for two machines, fsspec's file system in memory for what they share."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import fsspec
+import pytest
+
+import pipeline
+from pipeline.core.errors import InputError
+from pipeline.runs import store_settings, workflow
+from pipeline.runs.remote import Remote
+from pipeline.runs.store import Store
+from tests.runs.test_store import digests, states
+
+URL = "memory://shared/store"
+
+
+@pytest.fixture
+def shared(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """The file system of the shared store, empty."""
+    fs = fsspec.filesystem("memory")
+    monkeypatch.setenv("EGVS_STORE", URL)
+    yield fs
+    fs.store.clear()
+    fs.pseudo_dirs[:] = [""]
+
+
+def machine(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Another machine: a folder to work in, with nothing of a store in it."""
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    return folder
+
+
+def test_what_one_machine_made_another_one_fetches(
+    mini: Path, tmp_path: Path, shared: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenario = pipeline.load(mini)
+    one = machine(tmp_path / "one", monkeypatch)
+    assert set(states(scenario, one / "out").values()) == {"done"}
+    other = machine(tmp_path / "other", monkeypatch)
+    assert set(states(scenario, other / "out").values()) == {"fetched"}
+    assert digests(other / "out") == digests(one / "out")
+    names = {path.rpartition("/")[2] for path in shared.ls("/shared/store", detail=False)}
+    assert names == {entry.folder.name for entry in Store(Path("runs/.store")).entries()}
+    assert set(states(scenario, other / "again").values()) == {"fetched"}  # from this machine's folder
+
+
+@pytest.mark.parametrize("damage", ["bytes", "missing", "record", "climbs"])
+def test_what_is_damaged_there_is_made_again(
+    damage: str, mini: Path, tmp_path: Path, shared: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenario = pipeline.load(mini)
+    one = machine(tmp_path / "one", monkeypatch)
+    states(scenario, one / "out")
+    (tpog,) = shared.glob("/shared/store/tpog-*")
+    match damage:
+        case "bytes":
+            shared.pipe_file(f"{tpog}/tpog.parquet", b"other")
+        case "missing":
+            shared.rm_file(f"{tpog}/tpog.parquet")
+        case "record":
+            shared.pipe_file(f"{tpog}/entry.json", b"{")
+        case "climbs":
+            record = json.loads(shared.cat_file(f"{tpog}/entry.json"))
+            record["artefacts"] = {"../../../tpog.parquet": "0" * 64}
+            shared.pipe_file(f"{tpog}/entry.json", json.dumps(record).encode())
+    other = machine(tmp_path / "other", monkeypatch)
+    seen = states(scenario, other / "out")
+    assert (seen.pop("tpog"), seen.pop("report")) == ("done", "done")  # the report shows what each stage cost
+    assert set(seen.values()) == {"fetched"}
+    third = machine(tmp_path / "third", monkeypatch)
+    assert states(scenario, third / "out")["tpog"] == "fetched"
+    assert digests(third / "out") == digests(one / "out")
+    assert not (tmp_path / "tpog.parquet").exists()
+
+
+def test_an_entry_without_its_record_is_none(shared: Any, tmp_path: Path) -> None:
+    shared.pipe_file("/shared/store/tpog-x/tpog.parquet", b"half")
+    assert not Remote(URL).fetch("tpog-x", tmp_path)
+
+
+def test_a_place_that_cannot_be_reached_is_told_once(
+    mini: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine(tmp_path / "one", monkeypatch)
+    (tmp_path / "file").write_text("no folder")
+    url = f"file://{tmp_path / 'file'}/store"
+    monkeypatch.setenv("EGVS_STORE", url)
+    workflow.run(pipeline.load(mini), tmp_path / "out")
+    told = [line for line in capsys.readouterr().err.splitlines() if url in line]
+    assert told and all("the run goes on without it" in line for line in told)
+    with pytest.raises(InputError, match="cannot be written"):
+        Remote(url).check()
+
+
+def test_an_unknown_kind_is_refused() -> None:
+    with pytest.raises(InputError, match=r"nowhere://x: cannot be reached .*; a place that this machine may read and"):
+        Remote("nowhere://x")
+
+
+def test_what_the_environment_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("EGVS_STORE", "s3://bucket/store")
+    assert store_settings.read()[0] == store_settings.DEFAULT_PLACE
+    assert store_settings.remote_url() == "s3://bucket/store"
+    with store_settings.using("/a/folder", 5.0):
+        assert store_settings.read() == (Path("/a/folder"), 5.0)
+        assert store_settings.remote_url() is None
+    monkeypatch.setenv("EGVS_STORE", "")
+    assert store_settings.read()[0] is None
+    assert store_settings.remote_url() is None
+
+
+def test_a_place_is_probed_and_left_as_it_was(shared: Any) -> None:
+    Remote(URL).check()
+    assert not shared.find("/shared")
