@@ -93,10 +93,10 @@ def _walk(page: Page, asked: argparse.Namespace) -> None:
 
 def _walked(page: Page, moves: list[Site], sensors: int, periods: int) -> list[float]:
     """So many moves, changes of sensor and of period; milliseconds of each move."""
-    taken_ms = [_shown_ms(page, site) for site in moves]
+    taken_ms = [shown_ms(page, site) for site in moves]
     for sensor in (list(CATALOGUE) * sensors)[:sensors]:
-        _shown_ms(page, replace(page.view.site, sensor=sensor))
-    _shown_ms(page, moves[-1])
+        shown_ms(page, replace(page.view.site, sensor=sensor))
+    shown_ms(page, moves[-1])
     names = ("", *page.session.periods)
     for number in range(periods if page.session.periods else 0):
         page.ask(period=names[(number + 1) % len(names)])
@@ -104,7 +104,7 @@ def _walked(page: Page, moves: list[Site], sensors: int, periods: int) -> list[f
     return taken_ms
 
 
-def _shown_ms(page: Page, site: Site) -> float:
+def shown_ms(page: Page, site: Site) -> float:
     """From the end of a move until all is shown."""
     begin = time.perf_counter()
     page.ask(site=site)

@@ -1,6 +1,6 @@
 """Draws the pictures of the explorer in the docs and in the README: the page over nishishinjuku, in a headless browser.
 
-    python -m benchmarks.explorer_pictures [--only lanes] [--out docs/images]
+    python -m benchmarks.explorer_pictures [--only explore-3-lanes] [--out docs/images]
 
 Needs Chromium and playwright. Drawing is done in software, so it takes a minute or two.
 """
@@ -47,7 +47,7 @@ PICTURES: dict[str, tuple[Camera, dict[str, Any]]] = {
 def main() -> None:
     """Draw them all, or some."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", default="")
+    parser.add_argument("--only", nargs="*", choices=list(PICTURES), default=list(PICTURES))
     parser.add_argument("--run", type=Path, help="a folder of a run, with a plan; a fresh one when left out")
     parser.add_argument("--out", type=Path, default=Path("docs/images"))
     asked = parser.parse_args()
@@ -57,7 +57,7 @@ def main() -> None:
             pipeline.place(pipeline.load(SCENARIO, ["placement.count=2"]), run)
         with _tab(Path(scratch), run) as (page, tab):
             for name, (camera, view) in PICTURES.items():
-                if asked.only in name:
+                if name in asked.only:
                     _draw(page, tab, camera, view, asked.out / f"{name}.png")
 
 
@@ -76,7 +76,7 @@ def _tab(scratch: Path, run: Path) -> Iterator[tuple[Page, Any]]:
             tab = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
             tab.goto(page.address)
             tab.get_by_text("rank 1 of").wait_for(timeout=120_000)
-            tab.wait_for_timeout(4000)
+            tab.wait_for_timeout(30_000)
             tab.add_style_tag(content=".mantine-Notifications-root { display: none }")  # drawn in software, it warns
             yield page, tab
             browser.close()

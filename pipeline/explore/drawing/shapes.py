@@ -28,7 +28,7 @@ _ABOVE_ROAD_M = 0.03
 ABOVE_LANES_M = 2.0 * _ABOVE_ROAD_M
 """So high lies what is laid over the road."""
 
-_SCALE_STEPS = 255
+_SCALE_STEPS, _LEAST = 255, 0.4
 
 
 @dataclass(frozen=True)
@@ -106,12 +106,14 @@ def differences(
     colours: tuple[Sequence[int], Sequence[int], Sequence[int]],
 ) -> tuple[Points, NDArray[np.uint8]]:
     """Two fields of voxels (nx, ny, nz) added up along z, where one of them is more: points as of :func:`columns`, and
-    colours from the third of ``colours``, where both are alike, to the first or second, where one is most more."""
+    colours from the third of ``colours``, where both are alike, to the first or second, where one is most more; the
+    least difference has a good part of its colour, else few large ones would hide all others."""
     grid, more = tpog.grid, this.sum(axis=2) - other.sum(axis=2)
     ix, iy = np.nonzero((this.sum(axis=2) > 0.0) | (other.sum(axis=2) > 0.0))
     middle = np.column_stack([ix + 0.5, iy + 0.5, np.zeros(len(ix))]) * grid.voxel_m
     points = middle + grid.origin_m - zero_m + (0.0, 0.0, ABOVE_LANES_M)
     share = np.abs(more[ix, iy]) / max(float(np.abs(more).max(initial=0.0)), np.finfo(np.float64).tiny)
+    share[share > 0.0] = _LEAST + (1.0 - _LEAST) * share[share > 0.0]
     ends = np.where((more[ix, iy] >= 0.0)[:, None], colours[0], colours[1])
     mixed = np.asarray(colours[2]) + share[:, None] * (ends - np.asarray(colours[2]))
     return points.astype(np.float32), np.rint(mixed).astype(np.uint8)

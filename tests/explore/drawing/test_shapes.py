@@ -94,4 +94,4 @@ def test_a_difference_has_the_colour_of_who_sees_more() -> None:
     colours = (0, 0, 200), (200, 0, 0), (100, 100, 100)
     points, found = shapes.differences(tpog, this, other, (0.0, 0.0, 0.0), colours)
     assert points[:, 0].tolist() == [0.5, 1.5, 2.5]
-    assert found.tolist() == [[0, 0, 200], [100, 100, 100], [150, 50, 50]]
+    assert found.tolist() == [[0, 0, 200], [100, 100, 100], [170, 30, 30]]
