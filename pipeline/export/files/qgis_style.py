@@ -11,10 +11,11 @@ from __future__ import annotations
 from xml.etree import ElementTree as ET
 
 from pipeline.export.colouring import OTHER, PLAIN, Shade, shades
-from pipeline.export.layers import FOOTPRINTS, MISSED_LANES, PLAN, REGION, SITES, Layer
+from pipeline.export.layers import FOOTPRINTS, MISSED, MISSED_LANES, PLAN, REGION, SITES, Layer
 
 _LABELS = {SITES: ("site", "TR,TL,R,L,T"), PLAN: ("order", "BR,BL,B")}
 """The column that a thing is labelled with, and where, the best place first: a plan's sensor hangs where a site is."""
+_SIZES_MM = {PLAN: "4.4", SITES: "3.4", MISSED: "2"}
 _INK, _PAPER = "29,36,48,255", "255,255,255,255"
 
 
@@ -89,7 +90,7 @@ def _symbol(symbols: ET.Element, name: str, layer: Layer, colour: str) -> None:
         shape = "square" if layer.name == PLAN else "circle"
         kind, drawn = "marker", "SimpleMarker"
         options = {"color": f"{rgb},255", "name": shape, "outline_color": _INK, "outline_width": "0.3",
-                   "size": "4.4" if layer.name == PLAN else "3.4", "size_unit": "MM"}  # fmt: skip
+                   "size": _SIZES_MM[layer.name], "size_unit": "MM"}  # fmt: skip
     elif layer.name == MISSED_LANES:
         kind, drawn = "line", "SimpleLine"
         options = {"line_color": f"{rgb},255", "line_width": "1.2", "line_width_unit": "MM", "capstyle": "flat"}
