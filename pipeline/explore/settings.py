@@ -55,8 +55,8 @@ class Settings:
         """Those of a scenario as it is."""
         return cls(None, scenario.score.rank_by, frozenset(scenario.effects.named))
 
-    def over(self, scenario: Scenario) -> Scenario:
-        """The scenario with these settings; InputError where one of them is wrong."""
+    def over(self, scenario: Scenario, place: str = "") -> Scenario:
+        """The scenario with these settings; InputError, naming ``place`` or its file, where one of them is wrong."""
         if self == Settings.of(scenario):
             return scenario
         values = scenario.model_dump(mode="json")
@@ -65,7 +65,7 @@ class Settings:
         values["score"]["rank_by"] = self.rank_by
         named = values["effects"]
         values["effects"] = {name: named[name] if name in named else trial_of(name) for name in sorted(self.effects)}
-        return from_values(values, scenario.folder, str(scenario.file))
+        return from_values(values, scenario.folder, place or str(scenario.file))
 
     def in_words(self, scenario: Scenario) -> tuple[str, ...]:
         """What ``egvs run --set`` takes for them, one a setting that is another than the scenario's."""

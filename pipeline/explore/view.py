@@ -14,6 +14,7 @@ from urllib.parse import parse_qsl, urlencode
 
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Vec3
+from pipeline.effects import registry
 from pipeline.explore.session import Session
 from pipeline.explore.settings import Settings
 from pipeline.sensing.sites import Pose, Site
@@ -133,7 +134,7 @@ def of_text(text: str | Mapping[str, str], session: Session, opened: View, place
         read.one_of("beside", ("", *session.candidates), ""),
         said.get("dark", "") == "1",
     )
-    view.settings.over(session.scenario)
+    view.settings.over(session.scenario, place)
     camera = read.numbers("camera", 6, "x,y,z,x,y,z: from where, and at what")
     unknown = sorted(said.keys() - read.known)
     if unknown:
@@ -184,7 +185,12 @@ class _Reader:
     def effects(self, default: frozenset[str]) -> frozenset[str]:
         """Names, with commas between them."""
         self.known.add("effects")
-        return frozenset(filter(None, self.said["effects"].split(","))) if "effects" in self.said else default
+        if "effects" not in self.said:
+            return default
+        found, known = frozenset(filter(None, self.said["effects"].split(","))), registry.names()
+        for name in sorted(found.difference(known)):
+            raise InputError(f"{self.place}: effects", repr(name), f"one of {', '.join(known)}")
+        return found
 
     def _number(self, key: str, text: str, kind: Callable[[str], T], right: str) -> T:
         try:
