@@ -224,9 +224,9 @@ def _rasters(
     taken: set[str] = set()
     for number, raster in enumerate(rasters_of(run, sites), start=1):
         name = file_name(raster.name)
-        while name.lower() in taken:  # two sites whose names differ in signs that no file can have
+        while taken & (its := {name.lower(), f"{name.lower()}_colours"}):  # of sites whose names differ in signs alone
             name += "_"
-        taken.add(name.lower())
+        taken |= its
         yield from geotiff.write(aside, raster, reference, name)
         progress(f"{raster.name} written", number, 1 + 3 * len(sites))
 

@@ -141,6 +141,17 @@ def test_what_was_not_kept_is_cast_from_what_the_scores_were_made_from(mini: Pat
     assert egvs("export", run, "--to", "csv", "--out", tmp_path / "b")[0] == 0
 
 
+def test_sites_of_nearly_the_same_name_have_files_of_their_own(mini: Path, tmp_path: Path) -> None:
+    """Signs that no file can have, capitals, and what pictures are called."""
+    names = ["a.b", "A_B", "a_b_colours"]
+    (mini / "sites.csv").write_text("site,x_m,y_m,z_m\n" + "".join(f"{n},{10 + i},12,3\n" for i, n in enumerate(names)))
+    pipeline.run(pipeline.load(mini), tmp_path / "run")
+    done = export(tmp_path / "run", "geotiff", out=tmp_path / "out", sites=names)
+    assert len({path.name.lower() for path in done.paths}) == len(done.paths) == 3 * (1 + 3 * len(names))
+    with Image.open(tmp_path / "out" / "seen_a_b_colours.tif") as image:
+        assert image.mode == "P"
+
+
 def test_the_same_bytes_twice(located: Path, tmp_path: Path) -> None:
     for name in ("a", "b"):
         export(located, "geotiff", out=tmp_path / name)
