@@ -6,7 +6,8 @@ A city is a folder of ordinary scenarios that share one traffic:
     junctions.csv                  which junctions there are, one a row
     junctions/scenario.toml        what their scenarios have in common
     junctions/<ID>/scenario.toml   an ordinary scenario; its traffic is the file below
-    traffic/<ID>.parquet           the city's traffic, cut to the junction (pipeline.city.traffic makes it)
+    traffic/<ID>.parquet           the city's traffic, cut to the junction (pipeline.city.traffic makes it); where it
+                                   has periods, traffic/periods/<NAME>/<ID>.parquet
 
 Positions are in the network's x, y in metres, and in degrees (WGS 84).
 """
@@ -34,7 +35,7 @@ from pipeline.scenario.traffic import TrafficModel
 from pipeline.scenario.types import FARTHEST_M, NAME_IN_WORDS, Name
 
 FILE, NETWORK, TABLE = "city.toml", "network.net.xml", "junctions.csv"
-JUNCTIONS, TRAFFIC = "junctions", "traffic"
+JUNCTIONS, TRAFFIC, PERIODS = "junctions", "traffic", "periods"
 COLUMNS = ("junction", "title", "x_m", "y_m", "lat_deg", "lon_deg", "signalised")
 """Of ``junctions.csv``."""
 
@@ -69,9 +70,10 @@ class CityJunction:
         """The folder of its scenario."""
         return city.folder / JUNCTIONS / self.id
 
-    def traffic_file(self, city: City) -> Path:
-        """The city's traffic, cut to this junction."""
-        return city.folder / TRAFFIC / f"{self.id}.parquet"
+    def traffic_file(self, city: City, period: str = "") -> Path:
+        """The city's traffic, or that of a period of it, cut to this junction."""
+        folder = city.folder / TRAFFIC
+        return (folder / PERIODS / period if period else folder) / f"{self.id}.parquet"
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from pipeline.city.model import TRAFFIC, City, CityJunction
+from pipeline.city.model import City, CityJunction
 from pipeline.core.errors import InputError
 from pipeline.effects import on_traffic
 from pipeline.scenario.loading import load
@@ -50,13 +50,16 @@ class Region:
         return on_traffic.followed_types(self.scenario, sizes)
 
 
-def of(city: City) -> dict[str, Region]:
-    """The region of each junction; InputError where a scenario is wrong, or has other traffic than the city's."""
-    return {junction.id: _of_junction(city, junction) for junction in city.junctions}
+def of(city: City, sets: Sequence[str] = ()) -> dict[str, Region]:
+    """The region of each junction, with ``sets`` laid over its scenario.
+
+    InputError where a scenario is wrong, or has other traffic than the city's.
+    """
+    return {junction.id: _of_junction(city, junction, sets) for junction in city.junctions}
 
 
-def _of_junction(city: City, junction: CityJunction) -> Region:
-    scenario = load(junction.scenario_folder(city))
+def _of_junction(city: City, junction: CityJunction, sets: Sequence[str]) -> Region:
+    scenario = load(junction.scenario_folder(city), sets)
     _check_traffic(city, junction, scenario)
     roi = scenario.roi.box
     spots = [(site.pose.x_m, site.pose.y_m) for site in sites.of(scenario)]
@@ -69,12 +72,22 @@ def _of_junction(city: City, junction: CityJunction) -> Region:
 
 def _check_traffic(city: City, junction: CityJunction, scenario: Scenario) -> None:
     """InputError where a junction's scenario does not take the city's traffic as it is."""
-    traffic, its = scenario.traffic, junction.traffic_file(city)
-    right = f'fcd = "../../{TRAFFIC}/{junction.id}.parquet"'
-    if traffic.fcd is None or os.path.realpath(scenario.folder / traffic.fcd) != os.path.realpath(its):
-        source = traffic.fcd or traffic.network or traffic.sumocfg
-        raise InputError(f"{scenario.file}: traffic", f"comes from {source}, not from the city's", right)
+    traffic, alone = scenario.traffic, scenario.by_period()
+    its = {period.name for period in city.traffic.periods} or {""}
+    if alone.keys() != its:
+        found = f"has {_periods(alone)}, the city {_periods(its)}"
+        raise InputError(f"{scenario.file}: traffic", found, f"a period for each of {city.file}, with the city's files")
+    for name, of_period in alone.items():
+        wanted, given = junction.traffic_file(city, name), of_period.traffic
+        if given.fcd is None or os.path.realpath(scenario.folder / given.fcd) != os.path.realpath(wanted):
+            source = given.fcd or given.network or given.sumocfg
+            right = f'fcd = "../../{wanted.relative_to(city.folder).as_posix()}"'
+            raise InputError(f"{scenario.file}: traffic", f"comes from {source}, not from the city's", right)
     strides = traffic.frame_period_s / city.traffic.frame_period_s
     if abs(strides - round(strides)) > 1e-9 or round(strides) < 1:
         found = f"{traffic.frame_period_s:g} s, but {city.file} has a frame each {city.traffic.frame_period_s:g} s"
         raise InputError(f"{scenario.file}: traffic.frame_period_s", found, "the same, or a multiple of it")
+
+
+def _periods(names: Iterable[str]) -> str:
+    return f"the periods {', '.join(sorted(names))}" if any(names) else "no periods"

@@ -116,7 +116,7 @@ def run(work: Workspace, inputs: StageInputs, traci: tuple[str, int] | None = No
         if work.scenario.traffic.periods:
             about["periods"] = described
         file.describe(work.metadata(inputs, **about, sumo=inputs.more["sumo"]))
-    return _together(summaries, first_frame) if work.scenario.traffic.periods else summaries[""]
+    return together(summaries) if work.scenario.traffic.periods else summaries[""]
 
 
 def _record(
@@ -141,9 +141,9 @@ def _record(
     return recorded.window, result | reports
 
 
-def _together(summaries: dict[str, Summary], frames: int) -> Summary:
+def together(summaries: dict[str, Summary]) -> Summary:
     """The summaries of periods as one; what is of SUMO stands where it does without periods."""
-    together: Summary = {"frames": frames, "periods": summaries}
+    together: Summary = {"frames": sum(its["frames"] for its in summaries.values()), "periods": summaries}
     if flags := {name: summary.pop("flags", None) for name, summary in summaries.items()}:
         together["flags"] = flags
     if seconds := [summary.pop("sumo_seconds", None) or 0.0 for summary in summaries.values()]:

@@ -40,7 +40,7 @@ def uncut(city: City, name: str, monkeypatch: pytest.MonkeyPatch) -> bytes:
     wide = regions.of(city)
     wide[name] = replace(wide[name], low_x_m=-1e4, low_y_m=-1e4, high_x_m=1e4, high_y_m=1e4)
     with monkeypatch.context() as patch:
-        patch.setattr(traffic.regions, "of", lambda _: wide)
+        patch.setattr(traffic.regions, "of", lambda *_: wide)
         assert traffic.make(city).rows[name] == 3 * FRAMES
     return city.junction(name).traffic_file(city).read_bytes()
 
@@ -146,7 +146,7 @@ def test_nothing_is_half_written_where_it_ends_in_the_middle(city: City, monkeyp
     with pytest.raises(Killed):
         traffic.make(again, killed)
     left = sorted(path.name for path in (city.folder / "traffic").iterdir())
-    assert left == [".lock", "east.parquet", "west.parquet"]  # those of before, without a seal
+    assert left == [".lock", "east.parquet", "traffic.json", "west.parquet"]  # those of before, with their seal
     assert contents(city) == whole
     assert traffic.make(again).anew
     assert contents(city) == whole  # the seed changes nothing in a finished file
@@ -167,13 +167,14 @@ def test_the_files_are_what_sumo_writes(city: City) -> None:
 @pytest.mark.parametrize(
     ("file", "old", "new", "told"),
     [
-        ("junctions/west/scenario.toml", "west.parquet", "east.parquet", 'fcd = "../../traffic/west.parquet"'),
+        ("junctions/west/scenario.toml", "../../traffic/west.parquet", "mine.parquet",
+         'fcd = "../../traffic/west.parquet"'),
         ("junctions/west/scenario.toml", "frame_period_s = 0.5", "frame_period_s = 0.75",
          "traffic.frame_period_s: 0.75 s, but"),
         ("junctions/east/scenario.toml", "gamma = 4", "gamma = -4", "score.gamma"),
         ("city.toml", "frames = 60", "frames = 61", "city.toml: traffic: frames = 61: fcd.csv has 60 frames"),
-        ("city.toml", "[[traffic.kinds]]", '[[traffic.periods]]\nname = "night"\n\n[[traffic.kinds]]',
-         "city.toml: traffic.periods: a city has one period"),
+        ("city.toml", "[[traffic.kinds]]", '[[traffic.periods]]\nname = "a/b"\n\n[[traffic.kinds]]',
+         "city.toml: traffic.periods.0.name: 'a/b'"),
         ("city.toml", "seed = 7", "seed = 7\n[effects.rain]\nrate_mm_h = 20.0\n",
          "city.toml: effects.rain: adds no traffic; in junctions/scenario.toml"),
         ("city.toml", 'name = "bus"', 'name = "coach"', "vehicle type 'bus' of fcd.csv has no known size"),
@@ -186,6 +187,73 @@ def test_what_is_wrong_is_told_in_one_message(city: City, file: str, old: str, n
         traffic.make(load(city.folder))
     assert told in str(caught.value)
     assert not list((city.folder / "traffic").glob("*.parquet"))
+
+
+PERIODS = """
+[[traffic.periods]]
+name = "day"
+weight = 3.0
+
+[[traffic.periods]]
+name = "night"
+fcd = "night.csv"
+length_s = 20.0
+"""
+
+
+def test_each_period_is_recorded_and_cut(city: City) -> None:
+    toml, night = city.folder / "city.toml", city.folder / "night.csv"
+    its, plain = city.junctions[0].scenario_folder(city) / "scenario.toml", toml.read_text()
+    add(its, "[traffic] # the city's\n", "[traffic]\n")
+    before = its.read_text()
+    night.write_text((city.folder / "fcd.csv").read_text())
+    toml.write_text(plain.replace("[[traffic.kinds]]", PERIODS + "\n[[traffic.kinds]]", 1))
+    made = traffic.make(load(city.folder))
+    assert made.anew and made.linked == ("west", "east") and made.frames == FRAMES + 40
+    assert made.rows["west"] == sum(
+        pq.read_metadata(city.folder / "traffic" / "periods" / name / "west.parquet").num_rows
+        for name in ("day", "night")
+    )
+    assert (
+        "[traffic] # the city's" in its.read_text()
+        and 'fcd = "../../traffic/periods/day/west.parquet"' in its.read_text()
+    )
+    record = pipeline.run(pipeline.load(its.parent), city.folder / "run", jobs=1)
+    assert {name: s["frames"] for name, s in record.stages["traffic"].summary["periods"].items()} == {
+        "day": FRAMES, "night": 40,
+    }  # fmt: skip
+    by_period = pipeline.read_scores_by_period(city.folder / "run" / "scores_by_period.parquet")
+    assert set(by_period["period"].to_pylist()) == {"day", "night"}
+    again = traffic.make(load(city.folder))
+    assert not again.anew and not again.linked
+    toml.write_text(plain)
+    back = traffic.make(load(city.folder))
+    assert back.linked == ("west", "east")
+    assert its.read_text().replace("\n\n", "\n") == reordered(before)
+    assert (city.folder / "traffic" / "west.parquet").is_file()
+
+
+def reordered(text: str) -> str:
+    """The scenario as it was, with ``fcd`` behind the other keys of its table, and no empty lines."""
+    fcd_line = next(line for line in text.splitlines() if line.startswith("fcd = "))
+    text = text.replace(f"{fcd_line}\n", "").replace("frame_period_s = 0.5\n", f"frame_period_s = 0.5\n{fcd_line}\n")
+    return text.replace("\n\n", "\n")
+
+
+def test_what_a_set_asks_for_is_recorded(city: City) -> None:
+    traffic.make(city)
+    assert not traffic.make(city, sets=["effects.rain.rate_mm_h=20", "score.gamma=3"]).anew
+    assert traffic.make(city, sets=["roi.center_m=[20, 100, 2.5]", "roi.size_m=[40, 300, 5]"]).anew
+    assert traffic.make(city, sets=["effects.articulated.kinds={bus={parts_m=[9.0, 8.0]}}"]).rows["east"] == FRAMES + 7
+
+
+def test_a_scenario_of_other_traffic_is_left_as_it_is(city: City) -> None:
+    path = city.junctions[0].scenario_folder(city) / "scenario.toml"
+    add(path, 'fcd = "mine.csv"', 'fcd = "../../traffic/west.parquet"')
+    text = path.read_text()
+    with pytest.raises(InputError, match=r"comes from mine\.csv, not from the city's"):
+        traffic.make(city)
+    assert path.read_text() == text
 
 
 def test_two_processes_do_not_make_it_at_once(city: City) -> None:

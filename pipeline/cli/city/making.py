@@ -77,12 +77,17 @@ def _print_new(made: NewCity) -> None:
 
 
 def _print_traffic(folder: Path, made: CityTraffic) -> None:
+    from pipeline.city import model
     from pipeline.cli.terminal import console
     from pipeline.core.findings import WARNINGS, warnings_of
 
     out = console(_WIDTH)
     shown = ("frames", "vehicles", "mean_speed_m_s", "share_standing", "frames_with_overlap", "collisions", "notes")
     _print_json({key: made.summary[key] for key in shown if made.summary.get(key) not in (None, [])})
+    for name, summary in made.summary.get("periods", {}).items():
+        _print_json({name: {key: summary[key] for key in shown if summary.get(key) not in (None, [])}})
+    if made.linked:
+        out.print(f"{model.JUNCTIONS}/*/scenario.toml: the city's files and periods put into {', '.join(made.linked)}")
     if WARNINGS in made.summary:
         for warning in warnings_of([made.summary]):
             out.print(f"warning: {warning}")

@@ -60,7 +60,7 @@ class Slope(Traffic[SlopeParameters]):
         """Where the network has relief, whoever names it."""
         path = sumo_folder.network_path(scenario)
         if path is None:
-            return False, "a finished FCD file names no network; its own heights and slopes are taken as they are"
+            return False, "no network is named (traffic.roads) beside the finished FCD file, whose own z and slope hold"
         if not network.may_have_heights(path):
             return False, "the network is flat"
         span_m, off_m = terrain.relief_m(network.read(path))
