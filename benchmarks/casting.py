@@ -43,10 +43,19 @@ def _work(name: str) -> tuple[dict[str, Callable[[], Any]], int, int]:
         position = np.asarray(site.pose.position_m)
         d = directions[caster.scan(site.pose.position_m, directions, sensor.range_m).beam]
         start, single = np.tile((position - origin).astype(np.float32), (len(d), 1)), d.astype(np.float32)
-        proposed = caster._owner[caster._scene.run(start, single)]
+        nearest = caster._scene.run(start, single)
         ranges, met, doubtful = np.empty(len(d)), *(np.empty(len(d), dtype=np.int64) for _ in range(2))
         count = rays.settle(
-            proposed, caster._triangles, caster._planes, position - origin, d, sensor.range_m, ranges, met, doubtful
+            nearest,
+            caster._owner,
+            caster._triangles,
+            caster._planes,
+            position - origin,
+            d,
+            sensor.range_m,
+            ranges,
+            met,
+            doubtful,
         )
         jobs.append(
             (
@@ -57,7 +66,7 @@ def _work(name: str) -> tuple[dict[str, Callable[[], Any]], int, int]:
                 d,
                 start,
                 single,
-                proposed,
+                nearest,
                 ranges,
                 met,
                 doubtful,
@@ -66,11 +75,11 @@ def _work(name: str) -> tuple[dict[str, Callable[[], Any]], int, int]:
         )
 
     def settle() -> None:
-        for _, _, range_m, o, d, _start, _single, proposed, ranges, met, doubtful, _count in jobs:
-            rays.settle(proposed, caster._triangles, caster._planes, o, d, range_m, ranges, met, doubtful)
+        for _, _, range_m, o, d, _start, _single, nearest, ranges, met, doubtful, _count in jobs:
+            rays.settle(nearest, caster._owner, caster._triangles, caster._planes, o, d, range_m, ranges, met, doubtful)
 
     def search() -> None:
-        for *_, o, d, _start, _single, _proposed, ranges, met, doubtful, count in jobs:
+        for *_, o, d, _start, _single, _nearest, ranges, met, doubtful, count in jobs:
             rays.search(
                 doubtful[:count], caster._triangles, caster._planes, caster._boxes, caster._starts, o, d, ranges, met
             )

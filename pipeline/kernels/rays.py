@@ -40,6 +40,8 @@ CHORD_M = 1e-6
 FIN = -2
 """Stands for a fin, which is no triangle: a ray that meets it first is doubtful."""
 
+_AT_ONCE = 256  # segments whose components are laid out one beside the other
+
 GROUP = 8
 """Boxes that share the next larger box in :func:`search`."""
 
@@ -124,14 +126,15 @@ def meet(triangle, plane, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-de
 
 
 @_kernel
-def settle(proposed, triangles, planes, o, d, range_m, ranges, met, doubtful):  # type: ignore[no-untyped-def]
+def settle(nearest, owner, triangles, planes, o, d, range_m, ranges, met, doubtful):  # type: ignore[no-untyped-def]
     """Place the hits that were proposed, and tell which proposals float32 cannot be trusted with.
 
     Parameters
     ----------
-    proposed
-        Index of the triangle that each ray meets first in slightly enlarged form, -1 for none, ``FIN`` for a fin, (n,)
-        int64.
+    nearest
+        What each ray meets first in slightly enlarged form, as an index into ``owner``, -1 for none, (n,) int32.
+    owner
+        The triangle behind each, ``FIN`` for a fin; the last is none, -1. int64.
     triangles, planes
         All triangles (m, 3, 3) and their planes (m, 4, 4), float64.
     o, d
@@ -152,17 +155,32 @@ def settle(proposed, triangles, planes, o, d, range_m, ranges, met, doubtful):  
         How many rays are doubtful; :func:`search` settles them.
     """
     ox, oy, oz, count = o[0], o[1], o[2], 0
-    for ray in range(proposed.shape[0]):
-        ranges[ray], k = np.inf, proposed[ray]
+    for ray in range(nearest.shape[0]):
+        k = owner[nearest[ray]]
         met[ray] = k
-        if k >= 0:
-            ranges[ray], depth, sine = meet(triangles[k], planes[k], ox, oy, oz, d[ray, 0], d[ray, 1], d[ray, 2])
-            if depth >= SURE_M and (sine >= SHALLOW or ranges[ray] > range_m + 1.0):
-                continue
-        if k != -1:
+        t, sure = _plainly_met(planes[max(k, 0)], ox, oy, oz, d[ray, 0], d[ray, 1], d[ray, 2], range_m)
+        ranges[ray] = t if sure and k >= 0 else np.inf
+        if (not sure and k != -1) or k < -1:
+            if k >= 0:
+                ranges[ray], _, _ = meet(triangles[k], planes[k], ox, oy, oz, d[ray, 0], d[ray, 1], d[ray, 2])
             doubtful[count] = ray
             count += 1
     return count
+
+
+@_inlined
+def _plainly_met(plane, ox, oy, oz, dx, dy, dz, range_m):  # type: ignore[no-untyped-def]
+    """Range at which a ray meets one triangle, and whether :func:`settle` can trust it: as :func:`meet`, for what is
+    well inside and not seen too flat. Without a branch, since whether a beam meets anything cannot be foretold."""
+    facing = plane[0, 0] * dx + plane[0, 1] * dy + plane[0, 2] * dz
+    away = plane[0, 3] - (plane[0, 0] * ox + plane[0, 1] * oy + plane[0, 2] * oz)
+    t, sine = away / facing, abs(facing)
+    x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+    first = plane[1, 0] * x + plane[1, 1] * y + plane[1, 2] * z - plane[1, 3] >= SURE_M
+    second = plane[2, 0] * x + plane[2, 1] * y + plane[2, 2] * z - plane[2, 3] >= SURE_M
+    third = plane[3, 0] * x + plane[3, 1] * y + plane[3, 2] * z - plane[3, 3] >= SURE_M
+    met = (sine >= GRAZE) & (abs(away) > EDGE_M) & (t >= 0.0) & first & second & third
+    return t, met & ((sine >= SHALLOW) | (t > range_m + 1.0))
 
 
 @_inlined
@@ -182,11 +200,13 @@ def search(rays, triangles, planes, boxes, starts, o, d, ranges, met):  # type: 
         Boxes round the triangles, round each ``GROUP`` consecutive boxes of those, and so on to a single one: (b, 6)
         float64, low and high corner; where each level starts, (levels + 1,) int64.
     triangles, planes, o, d, ranges, met
-        As in :func:`settle`; ``ranges`` and ``met`` are filled for these rays.
+        As in :func:`settle`, which came before; ``ranges`` and ``met`` are filled for these rays. Nothing is looked for
+        behind the hits that it placed.
     """
     ox, oy, oz, top = o[0], o[1], o[2], starts.shape[0] - 2
     for r in range(rays.shape[0]):
         ray, best, level, k = rays[r], np.inf, top, 0
+        behind = ranges[ray]
         dx, dy, dz = d[ray, 0], d[ray, 1], d[ray, 2]
         per_x, per_y, per_z = _inverse(dx), _inverse(dy), _inverse(dz)
         while True:
@@ -195,7 +215,7 @@ def search(rays, triangles, planes, boxes, starts, o, d, ranges, met):  # type: 
             y0, y1 = (box[1] - oy) * per_y, (box[4] - oy) * per_y
             z0, z1 = (box[2] - oz) * per_z, (box[5] - oz) * per_z
             first = max(max(min(x0, x1), min(y0, y1)), max(min(z0, z1), 0.0))
-            last = min(min(max(x0, x1), max(y0, y1)), min(max(z0, z1), best))
+            last = min(min(max(x0, x1), max(y0, y1)), min(max(z0, z1), behind))
             if first <= last and level > 0:
                 level, k = level - 1, k * GROUP
                 continue
@@ -203,6 +223,7 @@ def search(rays, triangles, planes, boxes, starts, o, d, ranges, met):  # type: 
                 t, _, _ = meet(triangles[k], planes[k], ox, oy, oz, dx, dy, dz)
                 if t < best:
                     best, met[ray] = t, k
+                    behind = min(behind, t)
             k += 1
             while level < top and (k % GROUP == 0 or k == starts[level + 1] - starts[level]):
                 level, k = level + 1, (k - 1) // GROUP + 1
@@ -222,28 +243,66 @@ def stands_on(triangles, planes, point, touched):  # type: ignore[no-untyped-def
         touched[m] = on and abs(away) <= EDGE_M
 
 
+@_inlined
+def _within(o, high, flat, d, first, last):  # type: ignore[no-untyped-def]
+    """Cut [first, last] to one axis of the box, which ends ``high`` ahead of the sensor, and at ``flat`` for a segment
+    that stays where the sensor is. Nothing but selections: several segments are done at once."""
+    t0, t1 = (0.0 - o) / d, high / d
+    low_t, high_t = t0 if t0 < t1 else t1, t1 if t0 < t1 else t0
+    low_t, high_t = 0.0 if d == 0.0 else low_t, flat if d == 0.0 else high_t
+    return low_t if low_t > first else first, high_t if high_t < last else last
+
+
 @_kernel
-def can_meet(o, ends, size, reaches):  # type: ignore[no-untyped-def]
+def can_meet(o, ends, size, reaches, range_m=1.0):  # type: ignore[no-untyped-def]
     """Tell which segments share a piece longer than CHORD_M with the box [0, size], its faces included.
 
     Parameters
     ----------
     o, ends
-        The sensor (3,) in the box's frame, and where the segments end seen from it (n, 3), float64 metres.
+        The sensor (3,) in the box's frame, and where the segments end seen from it (n, 3), in ``range_m``; float64.
     size
         Of the box, (3,) float64.
     reaches
         Filled, (n,) bool.
     """
-    for n in range(ends.shape[0]):
-        first, last, length2 = 0.0, 1.0, 0.0
-        for a in range(3):
-            d = ends[n, a]
-            length2 += d * d
-            if d == 0.0:
-                if not 0.0 <= o[a] <= size[a]:
-                    last = -1.0
-            else:
-                t0, t1 = (0.0 - o[a]) / d, (size[a] - o[a]) / d
-                first, last = max(first, min(t0, t1)), min(last, max(t0, t1))
-        reaches[n] = (last - first) * math.sqrt(length2) > CHORD_M
+    ox, oy, oz, high_x, high_y, high_z = o[0], o[1], o[2], size[0] - o[0], size[1] - o[1], size[2] - o[2]
+    flat_x = 1.0 if ox >= 0.0 and high_x >= 0.0 else -1.0
+    flat_y = 1.0 if oy >= 0.0 and high_y >= 0.0 else -1.0
+    flat_z = 1.0 if oz >= 0.0 and high_z >= 0.0 else -1.0
+    x, y, z = np.empty(_AT_ONCE), np.empty(_AT_ONCE), np.empty(_AT_ONCE)
+    for start in range(0, ends.shape[0], _AT_ONCE):
+        some = ends[start : start + _AT_ONCE]
+        for n in range(some.shape[0]):
+            x[n], y[n], z[n] = some[n, 0] * range_m, some[n, 1] * range_m, some[n, 2] * range_m
+        found = reaches[start : start + _AT_ONCE]
+        for n in range(some.shape[0]):
+            first, last = _within(ox, high_x, flat_x, x[n], 0.0, 1.0)
+            first, last = _within(oy, high_y, flat_y, y[n], first, last)
+            first, last = _within(oz, high_z, flat_z, z[n], first, last)
+            found[n] = (last - first) * math.sqrt(x[n] * x[n] + y[n] * y[n] + z[n] * z[n]) > CHORD_M
+
+
+@_kernel
+def take(reaches, directions, beam, d, single):  # type: ignore[no-untyped-def]
+    """Take the beams that reach: filled are their indices ``beam`` (k,) uint32, their directions ``d`` (k, 3) float64,
+    and ``single``, these as float32."""
+    k = 0
+    for n in range(directions.shape[0]):
+        if reaches[n]:
+            x, y, z = directions[n, 0], directions[n, 1], directions[n, 2]
+            beam[k] = n
+            d[k, 0], d[k, 1], d[k, 2] = x, y, z
+            single[k, 0], single[k, 1], single[k, 2] = x, y, z
+            k += 1
+
+
+@_kernel
+def end(ranges, d, range_m, ends, returned):  # type: ignore[no-untyped-def]
+    """Fill where each ray ends, ``ends`` (n, 3), seen from the sensor: at its hit, or at ``range_m`` where that is
+    nearer; and whether it is a hit, ``returned`` (n,) bool."""
+    for ray in range(ranges.shape[0]):
+        t = ranges[ray]
+        returned[ray] = t <= range_m
+        t = t if t <= range_m else range_m
+        ends[ray, 0], ends[ray, 1], ends[ray, 2] = d[ray, 0] * t, d[ray, 1] * t, d[ray, 2] * t

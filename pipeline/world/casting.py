@@ -118,9 +118,11 @@ class Caster:
         """
         o = np.asarray(position_m, dtype=np.float64) - self._origin_m
         reaches = np.empty(len(directions), dtype=np.bool_)
-        rays.can_meet(o, directions * range_m, self._size_m, reaches)
-        beam = np.flatnonzero(reaches)
-        return self._ended(beam, o, directions[beam], range_m)[0]
+        rays.can_meet(o, directions, self._size_m, reaches, range_m)
+        count = int(np.count_nonzero(reaches))
+        beam, d, single = np.empty(count, np.uint32), np.empty((count, 3)), np.empty((count, 3), np.float32)
+        rays.take(reaches, directions, beam, d, single)
+        return self._ended(beam, o, d, single, range_m)[0]
 
     def sweep(self, position_m: tuple[float, float, float], directions: Floats, range_m: float) -> EmptyScan:
         """Cast every beam, whether or not it can meet the region of interest; as :meth:`scan`, and what is met.
@@ -128,19 +130,20 @@ class Caster:
         Beams may leave the region anywhere: for a caster without ``sites_m``.
         """
         o = np.asarray(position_m, dtype=np.float64) - self._origin_m
-        scan, met = self._ended(np.arange(len(directions)), o, directions, range_m)
+        beam, single = np.arange(len(directions), dtype=np.uint32), directions.astype(np.float32)
+        scan, met = self._ended(beam, o, directions, single, range_m)
         face = np.full(len(directions), -1, dtype=np.int64)
         face[scan.returned] = self._faces[met[scan.returned]]
         return replace(scan, face=face)
 
     def _ended(
-        self, beam: NDArray[np.int64], o: Floats, d: Floats, range_m: float
+        self, beam: NDArray[np.uint32], o: Floats, d: Floats, single: NDArray[np.float32], range_m: float
     ) -> tuple[EmptyScan, NDArray[np.int64]]:
         """Where some beams end, and what they meet."""
-        ranges, met, doubtful = self._first(o, d, range_m)
-        returned = ranges <= range_m
-        ends = d * np.where(returned, ranges, range_m)[:, None]
-        return EmptyScan(beam.astype(np.uint32), ends, returned, doubtful), met
+        ranges, met, doubtful = self._first(o, d, single, range_m)
+        ends, returned = np.empty_like(d), np.empty(len(d), dtype=np.bool_)
+        rays.end(ranges, d, range_m, ends, returned)
+        return EmptyScan(beam, ends, returned, doubtful), met
 
     def first_hits(self, o_roi_m: Floats, d: Floats, range_m: float = float("inf")) -> tuple[Floats, int]:
         """Range of each ray's first hit (infinity for none), and how many rays had to be searched in float64.
@@ -148,19 +151,20 @@ class Caster:
         ``o_roi_m`` is the sensor in the ROI's frame, (3,); ``d`` are unit directions (n, 3); hits beyond ``range_m`` do
         not matter.
         """
-        ranges, _, count = self._first(o_roi_m, d, range_m)
+        ranges, _, count = self._first(o_roi_m, d, d.astype(np.float32), range_m)
         return ranges, count
 
-    def _first(self, o_roi_m: Floats, d: Floats, range_m: float) -> tuple[Floats, NDArray[np.int64], int]:
-        """As :meth:`first_hits`, and which of the kept triangles each ray meets."""
-        ranges, met = np.full(len(d), np.inf), np.full(len(d), -1, dtype=np.int64)
+    def _first(
+        self, o_roi_m: Floats, d: Floats, single: NDArray[np.float32], range_m: float
+    ) -> tuple[Floats, NDArray[np.int64], int]:
+        """As :meth:`first_hits`, and which of the kept triangles each ray meets; ``single`` is ``d`` in float32."""
         if self._scene is None or len(d) == 0:
-            return ranges, met, 0
-        start = np.broadcast_to(o_roi_m.astype(np.float32), d.shape)
-        nearest = self._scene.run(np.ascontiguousarray(start), d.astype(np.float32))
-        proposed = self._owner[nearest]
-        doubtful = np.empty(len(d), dtype=np.int64)
-        count = rays.settle(proposed, self._triangles, self._planes, o_roi_m, d, range_m, ranges, met, doubtful)
+            return np.full(len(d), np.inf), np.full(len(d), -1, dtype=np.int64), 0
+        nearest = self._scene.run(np.broadcast_to(o_roi_m.astype(np.float32), d.shape), single)
+        ranges, (met, doubtful) = np.empty(len(d)), np.empty((2, len(d)), dtype=np.int64)
+        count = rays.settle(
+            nearest, self._owner, self._triangles, self._planes, o_roi_m, d, range_m, ranges, met, doubtful
+        )
         some = doubtful[:count]
         rays.search(some, self._triangles, self._planes, self._boxes, self._starts, o_roi_m, d, ranges, met)
         return ranges, met, int(count)

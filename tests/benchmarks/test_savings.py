@@ -16,7 +16,7 @@ from pipeline.sensing.scanner import Scanner
 def test_beams_that_cannot_meet_the_region_are_not_cast_and_would_change_nothing(mini: Path, monkeypatch) -> None:
     scene = pipeline.build_scene(pipeline.load(mini))
     lean = [Scanner(scene).scan_site(site).rows for site in scene.sites]
-    monkeypatch.setattr(rays, "can_meet", lambda o, ends, size, reaches: reaches.fill(True))
+    monkeypatch.setattr(rays, "can_meet", lambda o, ends, size, reaches, range_m=1.0: reaches.fill(True))
     for site, few in zip(scene.sites, lean, strict=True):
         every = Scanner(scene).scan_site(site).rows
         assert len(few.beam) < len(every.beam)

@@ -77,7 +77,8 @@ def test_float32_is_not_trusted_near_edges_and_at_shallow_angles(end, range_m, d
     o = np.array([0.0, 0.0, 0.5])
     d = towards(o, [[*end, 0.0]])
     ranges, found = np.empty(1), np.empty(1, np.int64)
-    count = rays.settle(np.zeros(1, np.int64), triangles, planes, o, d, range_m, ranges, np.empty(1, np.int64), found)
+    nearest, owner = np.zeros(1, np.int32), np.array([0, -1])
+    count = rays.settle(nearest, owner, triangles, planes, o, d, range_m, ranges, np.empty(1, np.int64), found)
     assert ranges[0] == pytest.approx(np.linalg.norm([*end, 0.5]), abs=1e-9)
     assert bool(count) == doubtful
 
