@@ -82,7 +82,7 @@ def junction(its_id: str, title: str, roi: Region) -> str:
     tables = {
         "roi": scenario_folder.roi_table(roi),
         "traffic": (
-            "the city's, cut to this junction",
+            "the city's, cut to this junction: egvs city traffic makes it",
             {
                 "fcd": f"../../{TRAFFIC}/{its_id}.parquet",
                 "roads": ROADS,
