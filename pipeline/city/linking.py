@@ -50,6 +50,7 @@ def _link(city: City, junction: CityJunction) -> bool:
         periods = tomlkit.aot()
         for period in wanted["periods"]:
             periods.append(tomlkit.item(period))
+        periods[-1].add(tomlkit.nl())
         table["periods"] = periods
     files.write_text(path, tomlkit.dumps(document))
     return True
