@@ -76,5 +76,6 @@ def _named(sources: dict[str, Any]) -> Iterator[Any]:
     """The files that a scenario's traffic comes from."""
     if "fcd" in sources:
         yield sources["fcd"]
-    for period in sources.get("periods", ()):
+    periods = sources.get("periods", [])
+    for period in periods if isinstance(periods, list) else [periods]:
         yield period.get("fcd", "") if isinstance(period, dict) else ""

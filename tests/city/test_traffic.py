@@ -123,6 +123,9 @@ def test_what_is_there_is_not_made_again_and_what_changed_is(city: City) -> None
     assert traffic.make(city).anew and contents(city) == before
     (city.folder / "traffic" / traffic.SEAL).write_text("[]")
     assert traffic.make(city).anew and contents(city) == before
+    moved = load(city.folder.rename(city.folder.parent / "elsewhere"))
+    assert not traffic.make(moved).anew
+    moved.folder.rename(city.folder)
     add(city.folder / "junctions" / "west" / "sites.csv", "pole_c,12,12,3\n")  # where the region reaches anyway
     assert not traffic.make(city).anew
     add(city.folder / "junctions" / "west" / "sites.csv", "pole_d,12,60,3\n")
@@ -169,6 +172,8 @@ def test_the_files_are_what_sumo_writes(city: City) -> None:
     [
         ("junctions/west/scenario.toml", "../../traffic/west.parquet", "mine.parquet",
          'fcd = "../../traffic/west.parquet"'),
+        ("junctions/west/scenario.toml", "frame_period_s = 0.5", "periods = 3",
+         "scenario.toml: traffic.periods: 3; input should be a valid array"),
         ("junctions/west/scenario.toml", "frame_period_s = 0.5", "frame_period_s = 0.75",
          "traffic.frame_period_s: 0.75 s, but"),
         ("junctions/east/scenario.toml", "gamma = 4", "gamma = -4", "score.gamma"),
