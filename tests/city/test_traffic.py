@@ -17,6 +17,7 @@ from pipeline.city import cutting, regions, traffic
 from pipeline.city.model import City, load
 from pipeline.core.errors import InputError, RunError
 from pipeline.traffic import fcd
+from tests.checks.conftest import net_xml
 from tests.city.conftest import FRAMES
 
 pytestmark = pytest.mark.system
@@ -259,6 +260,17 @@ def test_a_scenario_of_other_traffic_is_left_as_it_is(city: City) -> None:
     with pytest.raises(InputError, match=r"comes from mine\.csv, not from the city's"):
         traffic.make(city)
     assert path.read_text() == text
+
+
+def test_junctions_that_do_not_know_the_relief_are_told(city: City) -> None:
+    """A network with heights, which the eastern junction names as its roads."""
+    hill = net_xml().replace("-40,-1.60 80,-1.60", "-40,-1.60,0 580,-1.60,9")
+    (city.folder / "net.net.xml").write_text(hill)
+    add(city.folder / "city.toml", 'roads = "net.net.xml"\nfcd =', "fcd =")
+    add(city.junctions[1].scenario_folder(city) / "scenario.toml", 'roads = "../../net.net.xml"\nfcd =', "fcd =")
+    warnings = traffic.make(load(city.folder)).summary["warnings"]
+    told = [warning["found"] for warning in warnings if warning["rule"] == "relief"]
+    assert told == ["the network goes up and down, but west name no roads: the ground is level there"]
 
 
 def test_two_processes_do_not_make_it_at_once(city: City) -> None:
