@@ -81,10 +81,15 @@ def _walk(page: Page, asked: argparse.Namespace) -> None:
     moves = [moved(dice.choice(sites), dice) for _ in range(asked.moves)]
     _walked(page, moves[:10], len(CATALOGUE), 1 + len(page.session.periods))
     first = memory_mb()
-    taken_ms = _walked(page, moves, asked.sensors, asked.periods)
+    begin = time.process_time()
+    taken_ms = _walked(page, moves, 0, 0)
+    busy_ms = 1000.0 * (time.process_time() - begin) / len(moves)
+    _walked(page, moves[-1:], asked.sensors, asked.periods)
     last = memory_mb()
     median, most = np.percentile(taken_ms, [50, 95])
-    print(f"end of a move to the number: median {median:.0f} ms, 95 % within {most:.0f} ms")
+    print(
+        f"end of a move to the number: median {median:.0f} ms, 95 % within {most:.0f} ms; processors {busy_ms:.0f} ms"
+    )
     print(f"memory: {opened:.0f} MB opened, {first:.0f} MB after a few of each, {last:.0f} MB at the end: "
           f"{last / first - 1.0:+.1%}")  # fmt: skip
     again = page.session.rate(page.view.site.name, page.view.site.pose, page.view.site.sensor)
