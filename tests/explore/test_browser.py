@@ -21,6 +21,7 @@ import pytest
 
 from pipeline.explore.kept import KEPT
 from pipeline.explore.opening import open_session
+from pipeline.explore.view import Camera
 from pipeline.sensing.sites import Pose
 from tests.conftest import write_mini
 
@@ -50,6 +51,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
     """Over the small scenario, served, with its loop in a thread."""
     folder = tmp_path_factory.mktemp("browser")
     served = Page(open_session(write_mini(folder / "mini"), (), folder / "run"), folder / "scratch")
+    served.look_from(Camera((30.0, -34.0, 18.0), (30.0, -10.0, 3.0)))  # at the sensor that is dragged
     loop = threading.Thread(target=served.run)
     loop.start()
     try:
@@ -93,6 +95,20 @@ def tab(browser: Any, page: Page, errors: list[str]) -> Any:
     return look(browser, page.address, errors)
 
 
+def looks_at_it(page: Page) -> None:
+    """Wait until the browser tells that it looks from where it was told to; it begins elsewhere."""
+    (client,) = page._server.get_clients().values()
+    there = threading.Event()
+
+    def told(camera: Any) -> None:
+        if np.allclose(camera.position, page._server.initial_camera.position, atol=1e-3):
+            there.set()
+
+    client.camera.on_update(told)
+    told(client.camera)
+    assert there.wait(READY_S)
+
+
 def on_screen(page: Page, tab: Any, at_m: np.ndarray) -> tuple[float, float]:
     """Where a point of the page's frame is drawn, in pixels, by the camera that the browser tells of."""
     (client,) = page._server.get_clients().values()
@@ -112,6 +128,7 @@ def on_screen(page: Page, tab: Any, at_m: np.ndarray) -> tuple[float, float]:
 
 
 def test_a_drag_ends_with_the_score_of_where_it_ends(tab: Any, page: Page, errors: list[str]) -> None:
+    looks_at_it(page)
     start = page.rating.site
     at_m = np.subtract(start.pose.position_m, page.zero_m)
     x, y = on_screen(page, tab, at_m + np.array([0.0, 0.0, 0.85 * GIZMO_M]))
