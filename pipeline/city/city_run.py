@@ -86,8 +86,9 @@ def run_on(
     heard: Callable[[Done], None],
 ) -> CityRun:
     """Run junctions on a cluster that is there, and bring their scores together; for those who hold the folder."""
+    order = running.give_order()
     made = traffic.make(city, progress, sets)
-    running.run(client, jobs_of(city, folder, chosen, sets), heard=heard, progress=progress)
+    running.run(client, jobs_of(city, folder, chosen, sets), order, heard=heard, progress=progress)
     results = junctions.read_runs(folder, chosen)
     return CityRun(folder, results, junctions.write(folder, city, results), tuple(warnings_of([made.summary])))
 

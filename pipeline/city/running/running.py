@@ -27,8 +27,15 @@ Heard = Callable[[Done], None]
 """Called with each junction as it is done."""
 
 
-def run(client: Client, jobs: Sequence[Job], *, heard: Heard = lambda _: None, progress: Progress = silent) -> None:
-    """Run junctions, each into its own folder.
+def run(
+    client: Client,
+    jobs: Sequence[Job],
+    order: Order | None = None,
+    *,
+    heard: Heard = lambda _: None,
+    progress: Progress = silent,
+) -> None:
+    """Run junctions, each into its own folder; ``order`` is :func:`give_order`'s, asked for here when None.
 
     Raises
     ------
@@ -37,7 +44,7 @@ def run(client: Client, jobs: Sequence[Job], *, heard: Heard = lambda _: None, p
     RunError
         Where the cluster is lost, or a worker is ended again and again.
     """
-    order = give_order()
+    order = order or give_order()
     sizes = dict(each(client, tasks.beams, jobs, order))
     beams = {job.junction: size for job, size in sizes.items() if isinstance(size, int)}
     failed = [its for its in sizes.values() if isinstance(its, Failed)]

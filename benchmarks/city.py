@@ -1,0 +1,222 @@
+"""What a city run costs on one worker and on two, and what is left of it when workers are killed.
+
+``python -m benchmarks.city speed`` runs a synthetic city (junctions of :mod:`benchmarks.scaling`) with a store of its
+own each time, and prints sites a second of one and of two workers, what a task takes beside its work, the seconds a
+site from 10 to 10,000 sites of one junction and from 1 to 50 junctions, and the workers' memory.
+
+``python -m benchmarks.city kills`` ends random workers with SIGKILL at random moments, ten times, and compares every
+artefact with those of a run that was left alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import os
+import random
+import shutil
+import signal
+import statistics
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from benchmarks.scaling import Size, prepare
+from pipeline.city.running import clusters, graph, running
+from pipeline.city.running.jobs import Done, Job
+
+KILLS = 10
+
+_DATA = ("scores.parquet", "tpog.parquet", "trajectories.parquet", "statics.ply")
+
+
+def build(folder: Path, sizes: dict[str, Size]) -> list[Job]:
+    """A synthetic city: the jobs of its junctions."""
+    for name, size in sizes.items():
+        if not (folder / name).exists():
+            prepare(size, folder / name)
+    return [Job(name, folder / name, folder.parent / "out" / name) for name in sizes]
+
+
+@contextmanager
+def fresh(jobs: list[Job]) -> Iterator[None]:
+    """Nothing was made before: a new store, and no runs."""
+    for job in jobs:
+        shutil.rmtree(job.out, ignore_errors=True)
+    with tempfile.TemporaryDirectory() as store:
+        os.environ["EGVS_STORE"] = store
+        yield
+
+
+def timed(client: Any, jobs: list[Job]) -> tuple[float, list[Done]]:
+    """Seconds of a run that finds nothing, and what its tasks say."""
+    done: list[Done] = []
+    with fresh(jobs):
+        start = time.perf_counter()
+        running.run(client, jobs, heard=done.append)
+        return time.perf_counter() - start, done
+
+
+def warm(client: Any, folder: Path) -> None:
+    """Have every worker compile, or load, its kernels."""
+    jobs = build(folder / "warm", {f"w{i}": Size(sites=2, frames=10) for i in range(4)})
+    timed(client, jobs)
+
+
+# ---- speed
+
+
+def speed(folder: Path, repeats: int) -> None:
+    """Print sites a second of one worker and of two, and how flat the cost is."""
+    large = Size(sites=400, frames=100, beams=57_600 // 2)
+    jobs = build(folder / "two", {f"j{i}": replace(large, sites=200) for i in range(6)})
+    sites = sum(200 for _ in jobs)
+    rates: dict[int, list[float]] = {1: [], 2: []}
+    for _ in range(repeats):
+        for count in (1, 2):
+            with clusters.connected(f"processes={count}") as client:
+                warm(client, folder)
+                seconds, _ = timed(client, jobs)
+                rates[count].append(sites / seconds)
+                print(f"{count} workers: {sites} sites in {seconds:.2f} s, {sites / seconds:.1f} sites/s", flush=True)
+    ratio = [two / one for one, two in zip(rates[1], rates[2], strict=True)]
+    print(f"two workers do {statistics.median(ratio):.2f} times as many (of {[round(r, 2) for r in ratio]})")
+
+
+def overhead(folder: Path) -> None:
+    """Print what a task takes beside its work: from the scheduler's own record of when tasks began and ended."""
+    jobs = build(folder / "one", {"big": Size(sites=1200, frames=100, beams=57_600 // 2)})
+    with clusters.connected("processes=2") as client:
+        warm(client, folder)
+        empty = []
+        for _ in range(200):
+            start = time.perf_counter()
+            client.submit(int, 1, pure=False).result()
+            empty.append(time.perf_counter() - start)
+        with fresh(jobs):
+            running.run(client, jobs)
+            parts = [its for its in client.get_task_stream() if its["key"].startswith("score-")]
+    took = [sum(s["stop"] - s["start"] for s in its["startstops"] if s["action"] == "compute") for its in parts]
+    median = statistics.median(took) if took else float("nan")
+    print(
+        f"a task of {len(parts)} takes {median:.2f} s; an empty one {1e3 * statistics.median(empty):.1f} ms there and"
+    )
+    print(f"back, {statistics.median(empty) / median:.2%} of it")
+
+
+def flat(folder: Path) -> None:
+    """Print processor seconds a site, from few sites to many and from one junction to many."""
+    small = Size(frames=100)
+    empty: dict[str, float] = {}
+    with clusters.connected("processes=2") as client:
+        warm(client, folder)
+
+        def cost(name: str, sizes: dict[str, Size]) -> None:
+            jobs = build(folder / name, sizes)
+            before = _worker_seconds(client)
+            timed(client, jobs)
+            seconds, sites = _worker_seconds(client) - before, sum(size.sites for size in sizes.values())
+            memory = max(client.run(_peak_mb).values())
+            empty.setdefault("junction", seconds / len(sizes))
+            own = seconds - len(sizes) * empty["junction"]
+            told = f"{1e3 * own / sites:.2f} ms a site beside the junctions' own" if name != "empty" else ""
+            print(f"{len(sizes)} junctions, {sites} sites: {seconds:.2f} s; {told}; peak of a worker {memory:.0f} MB",
+                  flush=True)  # fmt: skip
+
+        cost("empty", {f"e{i}": replace(small, sites=1) for i in range(6)})
+        for sites in (10, 100, 1000, 10_000):
+            cost(f"sites{sites}", {"j": replace(small, sites=sites)})
+        for junctions in (1, 5, 20, 50):
+            cost(f"junctions{junctions}", {f"j{i}": replace(small, sites=100) for i in range(junctions)})
+
+
+def _worker_seconds(client: Any) -> float:
+    return float(sum(client.run(time.process_time).values()))
+
+
+def _peak_mb() -> float:
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM:"))
+
+
+# ---- loss
+
+
+def kills(folder: Path, seed: int, count: int = KILLS) -> None:
+    """Kill workers, and see that nothing else comes out."""
+    rng, sizes = random.Random(seed), {f"j{i}": Size(sites=30, frames=100) for i in range(4)}
+    sizes["big"] = Size(sites=300, frames=100, beams=57_600)
+    jobs, killed, runs = build(folder / "kills", sizes), 0, 0
+    with clusters.connected("processes=2") as client:
+        warm(client, folder)
+        seconds, _ = timed(client, jobs)
+        wanted = digests(jobs)
+        print(f"left alone: {seconds:.1f} s")
+        while killed < count:
+            stop = threading.Event()
+            moments = sorted(rng.uniform(0.0, seconds) for _ in range(min(3, count - killed)))
+            told: list[str] = []
+            killer = threading.Thread(target=_kill, args=(client, moments, rng.random(), stop, told))
+            with fresh(jobs):
+                killer.start()
+                running.run(client, jobs)
+                stop.set()
+                killer.join()
+            killed, runs = killed + len(told), runs + 1
+            same = digests(jobs) == wanted
+            verdict = "same bytes" if same else "OTHER BYTES"
+            print(f"run {runs}: {'; '.join(told) or 'nobody was there to kill'}: {verdict}", flush=True)
+            if not same:
+                sys.exit(1)
+    print(f"{killed} kills in {runs} runs: the same bytes in all")
+
+
+def _kill(client: Any, moments: list[float], which: float, stop: threading.Event, told: list[str]) -> None:
+    start = time.perf_counter()
+    for moment in moments:
+        if stop.wait(max(0.0, moment - (time.perf_counter() - start))):
+            return
+        pids = sorted(client.run(os.getpid).values())
+        if pids:
+            pid = pids[int(which * len(pids))]
+            os.kill(pid, signal.SIGKILL)
+            told.append(f"worker {pid} killed after {time.perf_counter() - start:.1f} s")
+
+
+def digests(jobs: list[Job]) -> dict[str, str]:
+    """Of every artefact that shows no cost."""
+    paths = [job.out / name for job in jobs for name in _DATA]
+    return {f"{path.parent.name}/{path.name}": hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
+
+
+def main() -> None:
+    """Measure what is asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("speed", "flat", "overhead", "kills"))
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--most-beams", type=int, help="of a task, so that small cities are cut too")
+    asked = parser.parse_args()
+    if asked.most_beams:
+        graph.LEAST_BEAMS = graph.MOST_BEAMS = asked.most_beams
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        match asked.what:
+            case "speed":
+                speed(folder, asked.repeats)
+            case "flat":
+                flat(folder)
+            case "overhead":
+                overhead(folder)
+            case "kills":
+                kills(folder, asked.seed)
+
+
+if __name__ == "__main__":
+    main()
