@@ -70,6 +70,7 @@ def common() -> str:
         "roi": ("", scenario_folder.voxels()),
         "traffic": (f"as in {model.FILE}, or a multiple of it", {"frame_period_s": period_s}),
         "sites": ("", scenario_folder.mounts()),
+        "scan": ("sites are scanned as they are scored; true keeps their scans, 0.7 MB a site", {"keep": False}),
         "score": scenario_folder.score_table(),
     }
     about = "What the scenarios of all junctions have in common; each may say otherwise."
