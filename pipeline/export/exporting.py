@@ -1,4 +1,4 @@
-"""Exports a run: vector layers as GeoPackage, GeoJSON, GeoParquet, KML or CSV, rasters as GeoTIFF.
+"""Exports a run, or a city's: vector layers as GeoPackage, GeoJSON, GeoParquet, KML or CSV, rasters as GeoTIFF.
 
 Steps: refuse what cannot be done before any work; open the run, and choose the reference system; make the layers or
 rasters; write them aside, and bring them under their names when all are whole.
@@ -17,6 +17,7 @@ from pipeline.artefacts import tables as artefacts
 from pipeline.core import files, plugins
 from pipeline.core.errors import InputError
 from pipeline.core.progress import Progress, silent
+from pipeline.export import city
 from pipeline.export.finished_run import FinishedRun
 from pipeline.export.layers import NAMES, Layer, best_site, layers_of
 from pipeline.export.reference import CHOICES, DEGREES, SCENARIO, Reference
@@ -92,14 +93,24 @@ def export(
         Where the libraries are not installed.
     """
     its = _format(to, crs, sites)
-    run = FinishedRun.open(folder)
+    whole = city.is_city(folder)
+    if whole and to == "geotiff":
+        raise InputError("--to geotiff", f"{folder} is a city's run", f"a junction's: {folder / 'junctions' / 'NAME'}")
+    run = city.any_run(folder) if whole else FinishedRun.open(folder)
+    name = city.name_of(folder) if whole else run.scenario.name
     reference = _reference(run, its, crs)
     chosen = _chosen(run, sites)
-    target = out or folder / FOLDER / (f"{file_name(run.scenario.name)}{its.suffix}" if its.is_one_file else to)
+    target = out or folder / FOLDER / (f"{file_name(name)}{its.suffix}" if its.is_one_file else to)
     _check_target(target, its)
     _check_free([target] if its.is_one_file else [], out)
     with files.scratch() as aside:
-        made, notes = _made(run, its, reference, aside, target.name, chosen, progress)
+        if its.name == "geotiff":
+            made, notes = list(_rasters(run, reference, aside, chosen, progress)), list[str]()
+        else:
+            layers, notes = city.layers_of_city(folder) if whole else layers_of(run)
+            progress("layers made", 1, 2)
+            made = list(_vectors(its, layers, reference, aside, target.name, name))
+            progress("files written", 2, 2)
         paths = [target if its.is_one_file else target / path.name for path in made]
         _check_free(paths, out)
         _bring(made, paths)
@@ -174,25 +185,6 @@ def _remove_others(folder: Path, paths: Sequence[Path]) -> None:
         path = folder / f"{layer}{paths[0].suffix}"
         if path not in paths:
             path.unlink(missing_ok=True)
-
-
-def _made(
-    run: FinishedRun,
-    its: Format,
-    reference: Reference,
-    aside: Path,
-    name: str,
-    sites: Collection[str],
-    progress: Progress,
-) -> tuple[list[Path], list[str]]:
-    """The files, written aside, and notes."""
-    if its.name == "geotiff":
-        return list(_rasters(run, reference, aside, sites, progress)), []
-    layers, notes = layers_of(run)
-    progress("layers made", 1, 2)
-    made = list(_vectors(its, layers, reference, aside, name, run.scenario.name))
-    progress("files written", 2, 2)
-    return made, notes
 
 
 def _vectors(

@@ -26,10 +26,10 @@ from pipeline.report.placement import PLACEMENT
 from pipeline.stages.shared.world import STATICS, world_of
 from pipeline.traffic import network
 
-SITES, PLAN, MISSED, MISSED_LANES, FOOTPRINTS, REGION = NAMES = (
-    "sites", "plan", "blindspots", "blindspot_lanes", "footprints", "region",
+JUNCTIONS, SITES, PLAN, MISSED, MISSED_LANES, FOOTPRINTS, REGION = NAMES = (
+    "junctions", "sites", "plan", "blindspots", "blindspot_lanes", "footprints", "region",
 )  # fmt: skip
-"""Layers, those on top first."""
+"""Layers, those on top first; a city's run alone has junctions."""
 
 _GROUND, _CELL, _LANE = "ground", "cell", "lane"
 _RESERVED = ("fid", "ogc_fid", "geom", "geometry", "wkt")
@@ -66,7 +66,7 @@ class Layer:
     @property
     def is_of_points(self) -> bool:
         """Whether its geometries are points."""
-        return self.name in (SITES, PLAN, MISSED)
+        return self.name in (JUNCTIONS, SITES, PLAN, MISSED)
 
     @property
     def span(self) -> tuple[float, float] | None:
@@ -99,7 +99,7 @@ def _sites(run: FinishedRun, notes: list[str]) -> Iterator[Layer]:
     scores, about = tables.read(run.artefact("scores.parquet"), "scores")
     first = ["rank", *(name for name in scores.column_names if name != "rank")]
     rows = _with_periods(run, scores.select(first))
-    yield Layer(SITES, _points(scores), _plain(rows), about.get("rank_by", "egvs"))
+    yield Layer(SITES, points(scores), plain(rows), about.get("rank_by", "egvs"))
 
 
 def _with_periods(run: FinishedRun, scores: pa.Table) -> pa.Table:
@@ -125,7 +125,7 @@ def _plan(run: FinishedRun, notes: list[str]) -> Iterator[Layer]:
         notes.append("the plan is left out: it was made of other traffic, sites or settings; egvs place makes it anew")
         return
     table = pa.Table.from_pylist(rows)
-    yield Layer(PLAN, _points(table), _plain(table))
+    yield Layer(PLAN, points(table), plain(table))
 
 
 def _blindspots(run: FinishedRun, notes: list[str]) -> Iterator[Layer]:
@@ -136,13 +136,13 @@ def _blindspots(run: FinishedRun, notes: list[str]) -> Iterator[Layer]:
     table, _ = tables.read(run.artefact(BLINDSPOTS), "blindspots")
     places = table.filter(pc.not_equal(table.column("by"), _CELL)).drop_columns(["ix", "iy"])
     best = best_site(run)
-    yield Layer(MISSED, _points(places), _plain(places), "share_seen", True, best)
+    yield Layer(MISSED, points(places), plain(places), "share_seen", True, best)
     lines = _lanes_of(run)
     known = [by == _LANE and name in lines for by, name in _pairs(places)]
     lanes = places.filter(pa.array(known, pa.bool_()))
     if len(lanes):
         along = np.array([lines[name] for _, name in _pairs(lanes)], dtype=object)
-        yield Layer(MISSED_LANES, along, _plain(lanes), "share_seen", True, best)
+        yield Layer(MISSED_LANES, along, plain(lanes), "share_seen", True, best)
 
 
 def _pairs(places: pa.Table) -> Iterator[tuple[str, str]]:
@@ -212,14 +212,15 @@ def _region(run: FinishedRun, notes: list[str]) -> Iterator[Layer]:
     yield Layer(REGION, np.array([shapely.box(x, y, x + w, y + h)], dtype=object), pa.Table.from_pylist([row]))
 
 
-def _points(table: pa.Table) -> NDArray[np.object_]:
+def points(table: pa.Table) -> NDArray[np.object_]:
+    """Where the rows of a table stand: its columns x_m and y_m."""
     import shapely
 
-    points: NDArray[np.object_] = shapely.points(table.column("x_m").to_numpy(), table.column("y_m").to_numpy())
-    return points
+    found: NDArray[np.object_] = shapely.points(table.column("x_m").to_numpy(), table.column("y_m").to_numpy())
+    return found
 
 
-def _plain(table: pa.Table) -> pa.Table:
+def plain(table: pa.Table) -> pa.Table:
     """A table that every format can hold: numbers of 64 bits, null for what is not a number, and names that differ in
     more than their case; a user's own column that is called as one here, or as one of a format, gets ``given_``."""
     columns: dict[str, Any] = {}

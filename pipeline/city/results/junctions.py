@@ -118,16 +118,20 @@ def write(out: Path, city: City, results: Sequence[JunctionResult]) -> tuple[Pat
         "vehicles": [its.vehicles for its in results],
         **{key: [getattr(site, key) for site in best] for key in ("score", "egvs", "egvs_limit", "entropy_seen")},
     }
-    digests = {row.id: files.sha256_of(run_folder(out, row.id) / _FILE) for row in rows}
     about = {
         "schema": schemas.VERSION,
         "city": {"name": city.name, "attribution": city.attribution},
-        "inputs": files.hash_of(digests),
+        "inputs": digest_of(out, [row.id for row in rows]),
         "seed": city.seed,
         "rank_by": best[0].rank_by,
     }
     tables.write(out / TABLE, "city", columns, about)
     return out / TABLE, out / SCORES
+
+
+def digest_of(out: Path, names: Sequence[str]) -> str:
+    """A hash of the scores of some junctions."""
+    return files.hash_of({name: files.sha256_of(run_folder(out, name) / _FILE) for name in names})
 
 
 def _write_scores(out: Path, results: Sequence[JunctionResult]) -> None:

@@ -92,7 +92,7 @@ class CityPlan:
 def made_from(out: Path, junctions: Sequence[str]) -> str:
     """A hash of what a plan is made from: the stages of each junction's run."""
     keys = {}
-    for name in junctions:
+    for name in sorted(junctions):
         stages = RunRecord.read(run_folder(out, name)).stages
         keys[name] = [stages[stage].inputs for stage in _MADE_FROM]
     return files.hash_of(keys)

@@ -91,7 +91,10 @@ def tell(failed: Sequence[Failed], junctions: int) -> None:
     """EgvsError where there are any: all that they say, the exit code of wrong input where any is."""
     if not failed:
         return
-    lines = [f"junction {its.junction}: {its.message}" for its in failed]
+    alike: dict[str, list[str]] = {}
+    for its in failed:
+        alike.setdefault(its.message, []).append(its.junction)
+    lines = [f"junction{'s' * (len(names) > 1)} {', '.join(names)}: {what}" for what, names in alike.items()]
     if len(failed) < junctions:
         lines.append(f"{len(failed)} of {junctions} junctions failed; the others are done")
     error = EgvsError("\n".join(lines))

@@ -14,7 +14,7 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 from pipeline.export.colouring import colour
-from pipeline.export.layers import FOOTPRINTS, MISSED, MISSED_LANES, PLAN, REGION, SITES, Layer
+from pipeline.export.layers import FOOTPRINTS, JUNCTIONS, MISSED, MISSED_LANES, PLAN, REGION, SITES, Layer
 from pipeline.export.reference import Reference
 
 _NAMESPACE = "http://www.opengis.net/kml/2.2"
@@ -25,6 +25,7 @@ _NONE = re.compile("[\x00-\x08\x0b-\x1f\ud800-\udfff\ufffe\uffff]")
 """Signs that XML cannot hold."""
 _TITLES = {
     SITES: "site", PLAN: "site", MISSED: "words", MISSED_LANES: "words", FOOTPRINTS: "name", REGION: "name",
+    JUNCTIONS: "junction",
 }  # fmt: skip
 """The column that a thing is called by."""
 _ALPHA = {FOOTPRINTS: "a0", REGION: "00"}

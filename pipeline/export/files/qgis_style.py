@@ -11,11 +11,11 @@ from __future__ import annotations
 from xml.etree import ElementTree as ET
 
 from pipeline.export.colouring import OTHER, PLAIN, Shade, shades
-from pipeline.export.layers import FOOTPRINTS, MISSED, MISSED_LANES, PLAN, REGION, SITES, Layer
+from pipeline.export.layers import FOOTPRINTS, JUNCTIONS, MISSED, MISSED_LANES, PLAN, REGION, SITES, Layer
 
-_LABELS = {SITES: ("site", "TR,TL,R,L,T"), PLAN: ("order", "BR,BL,B")}
+_LABELS = {JUNCTIONS: ("title", "TR,TL,R,L,T"), SITES: ("site", "TR,TL,R,L,T"), PLAN: ("order", "BR,BL,B")}
 """The column that a thing is labelled with, and where, the best place first: a plan's sensor hangs where a site is."""
-_SIZES_MM = {PLAN: "4.4", SITES: "3.4", MISSED: "2"}
+_SIZES_MM = {JUNCTIONS: "5", PLAN: "4.4", SITES: "3.4", MISSED: "2"}
 _INK, _PAPER = "29,36,48,255", "255,255,255,255"
 
 
