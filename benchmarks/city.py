@@ -150,14 +150,14 @@ def _peak_mb() -> float:
 
 def kills(folder: Path, seed: int, count: int = KILLS) -> None:
     """Kill workers, and see that nothing else comes out."""
-    rng, sizes = random.Random(seed), {f"j{i}": Size(sites=30, frames=100) for i in range(4)}
-    sizes["big"] = Size(sites=300, frames=100, beams=57_600)
+    rng, sizes = random.Random(seed), {f"j{i}": Size(sites=10, frames=50) for i in range(3)}
+    sizes["big"] = Size(sites=120, frames=50)
     jobs, killed, runs = build(folder / "kills", sizes), 0, 0
     with clusters.connected("processes=2") as client:
         warm(client, folder)
         seconds, _ = timed(client, jobs)
         wanted = digests(jobs)
-        print(f"left alone: {seconds:.1f} s")
+        print(f"left alone: {seconds:.1f} s", flush=True)
         while killed < count:
             stop = threading.Event()
             moments = sorted(rng.uniform(0.0, seconds) for _ in range(min(3, count - killed)))

@@ -52,11 +52,6 @@ class Shared:
     bound: float
     curve: Floats
 
-    @property
-    def certificate(self) -> float:
-        """The share of the best possible that is proved."""
-        return 1.0 if self.bound <= self.value else self.value / self.bound
-
 
 def by_count(junctions: Sequence[Options], count: int) -> Shared:
     """The best choice of at most ``count`` sensors in all, those that are there already among them."""

@@ -15,10 +15,13 @@ from pipeline.artefacts.run_record import RunRecord
 from pipeline.city.model import City
 from pipeline.city.results.junctions import run_folder
 from pipeline.core import files
+from pipeline.placement.solving.bounds import ROUNDING
 
 PLAN = "plan.parquet"
 
 _ARTEFACT = "city_plan"
+_WHOLE = 1.0 + 2.0 * ROUNDING
+"""Bounds are raised by their rounding."""
 _MADE_FROM = ("statics", "scan", "traffic", "tpog")
 
 
@@ -75,8 +78,8 @@ class CityPlan:
 
     @property
     def certificate(self) -> float:
-        """The share of the best possible that is proved."""
-        return 1.0 if self.bound <= self.joint else self.joint / self.bound
+        """The share of the best possible that is proved; 1 up to the rounding of bounds."""
+        return 1.0 if self.bound <= self.joint * _WHOLE else self.joint / self.bound
 
     @property
     def cost(self) -> float:
