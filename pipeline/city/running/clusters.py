@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,13 +18,15 @@ LOCAL = "local"
 ADDRESSES = ("tcp://", "tls://")
 
 _SETTINGS = {
-    "logging.distributed": "critical",  # what goes wrong is told by the run
     "distributed.scheduler.allowed-failures": 5,
     "distributed.worker.daemon": True,
     "distributed.nanny.pre-spawn-environ.DASK_LOGGING__DISTRIBUTED": "critical",
     "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 65536,
     "distributed.comm.timeouts.connect": "20s",
 }
+
+_TALKERS = ("distributed", "distributed.client", "tornado.application")
+"""Loggers that have levels of their own."""
 
 _MOST = 1000
 """Processes on one machine."""
@@ -55,6 +58,8 @@ def connected(where: str, *, memory_limit: str = "auto") -> Iterator[Client]:
     with dask.config.set(_SETTINGS):
         from distributed import Client, LocalCluster
 
+        for name in _TALKERS:  # what goes wrong is told by the run
+            logging.getLogger(name).setLevel(logging.CRITICAL)
         if count is None:
             try:
                 client = Client(where, timeout="20s", set_as_default=False)

@@ -137,6 +137,6 @@ def _watched(client: Client) -> Iterator[None]:
     address = client.scheduler.address if client.scheduler is not None else "?"
     try:
         yield
-    except (CancelledError, CommClosedError, TimeoutError) as error:
-        found = f"the scheduler at {address} was lost ({error or type(error).__name__})"
+    except (CancelledError, CommClosedError, TimeoutError):
+        found = f"the scheduler at {address} was lost"
         raise RunError(f"{found}; run the same command again to go on from what is done") from None
