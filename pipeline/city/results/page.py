@@ -81,7 +81,8 @@ def headline(results: Sequence[JunctionResult]) -> str:
     first = results[0]
     if not first.gain > 0:
         return "No pole sees anything of the traffic"
-    name = first.junction.title or first.junction.id
+    id_, title = first.junction.id, first.junction.title
+    name = f"{id_}, {title}" if title and title != id_ else id_
     if len(results) == 1:
         return f"{name}, the only junction: {first.best.by.sentence(first.score)}"
     equal = sum(its.rank == 1 for its in results)

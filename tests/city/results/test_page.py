@@ -31,7 +31,7 @@ def city(*results: JunctionResult) -> City:
 def test_it_says_where_the_first_sensor_brings_most() -> None:
     some = (result("a", 1, 90.0, "Main Street"), result("b", 2, 30.0))
     html = page.page(city(*some), some, [Finding("rule", "place", "found", "cure")])
-    assert "Of 2 junctions, a first sensor brings most at Main Street" in html
+    assert "Of 2 junctions, a first sensor brings most at a, Main Street" in html
     assert "33.3%" in html
     assert "<b>place</b>: found <small>cure</small>" in html
     assert "© the mappers" in html
