@@ -156,14 +156,12 @@ class Store:
         try:
             shutil.rmtree(work, ignore_errors=True)
             work.mkdir(parents=True)
-            if self._remote.fetch(final.name, work):
+            if self._of_remote(lambda remote: remote.fetch(final.name, work)):
                 _read(work)
                 with self._shared():
                     work.rename(final)
         except _Damaged as damage:
             self._note(f"{self._remote.url}: the kept {stage} is damaged ({damage}), and made again")
-        except InputError as error:
-            self._do_without_remote(error)
         except OSError as error:
             self._do_without(error)
         finally:
@@ -207,11 +205,8 @@ class Store:
             (work / _ENTRY).write_text(_to_json(stage, key, work, made), encoding="utf-8")
             with self._shared():
                 work.rename(final)
-            if self._remote is not None:
-                self._remote.put(final.name, final, made.files)
+            self._of_remote(lambda remote: remote.put(final.name, final, made.files))
             self.prune(self.bound_bytes)
-        except InputError as error:
-            self._do_without_remote(error)
         except OSError as error:
             self._do_without(error)
         finally:
@@ -284,9 +279,16 @@ class Store:
                 if free:
                     shutil.rmtree(folder / ".work" / name, ignore_errors=True)
 
-    def _do_without_remote(self, error: InputError) -> None:
-        self._remote = None
-        self._note(f"{error}; the run goes on without it")
+    def _of_remote(self, ask: Callable[[Remote], bool | None]) -> bool | None:
+        """What the remote store answers; one that is refused is named once, and done without."""
+        if self._remote is None:
+            return None
+        try:
+            return ask(self._remote)
+        except InputError as error:
+            self._remote = None
+            self._note(f"{error}; the run goes on without it")
+            return None
 
     def _do_without(self, error: OSError) -> None:
         self._can_write = False
