@@ -30,6 +30,7 @@ from typing import Any
 from benchmarks.scaling import Size, prepare
 from pipeline.city.running import clusters, graph, running
 from pipeline.city.running.jobs import Done, Job
+from pipeline.runs import workflow
 
 KILLS = 10
 
@@ -65,8 +66,14 @@ def timed(client: Any, jobs: list[Job]) -> tuple[float, list[Done]]:
 
 def warm(client: Any, folder: Path) -> None:
     """Have every worker compile, or load, its kernels."""
-    jobs = build(folder / "warm", {f"w{i}": Size(sites=2, frames=10) for i in range(4)})
-    timed(client, jobs)
+    (job,) = build(folder / "warm", {"w": Size(sites=2, frames=10)})
+    workers = list(client.scheduler_info()["workers"])
+    client.gather([client.submit(_warm, job, number, workers=[its]) for number, its in enumerate(workers)])
+
+
+def _warm(job: Job, number: int) -> None:
+    os.environ["EGVS_STORE"] = ""
+    workflow.run(job.scenario(), job.out.with_name(f"{job.out.name}{number}"), jobs=1)
 
 
 # ---- speed
@@ -74,9 +81,9 @@ def warm(client: Any, folder: Path) -> None:
 
 def speed(folder: Path, repeats: int) -> None:
     """Print sites a second of one worker and of two, and how flat the cost is."""
-    large = Size(sites=400, frames=100, beams=57_600 // 2)
-    jobs = build(folder / "two", {f"j{i}": replace(large, sites=200) for i in range(6)})
-    sites = sum(200 for _ in jobs)
+    large = Size(sites=200, frames=100, beams=57_600 // 2)
+    jobs = build(folder / "two", {f"j{i}": large for i in range(6)})
+    sites = large.sites * len(jobs)
     rates: dict[int, list[float]] = {1: [], 2: []}
     for _ in range(repeats):
         for count in (1, 2):

@@ -54,10 +54,9 @@ def connected(where: str, *, memory_limit: str = "auto") -> Iterator[Client]:
     check(where)
     count = _processes(where)
     import dask
+    from distributed import Client, LocalCluster  # before the settings: what it adds to them is to stay
 
     with dask.config.set(_SETTINGS):
-        from distributed import Client, LocalCluster
-
         for name in _TALKERS:  # what goes wrong is told by the run
             logging.getLogger(name).setLevel(logging.CRITICAL)
         if count is None:
