@@ -120,7 +120,9 @@ def _declared(group: str) -> dict[str, EntryPoint]:
 
 
 def _package(entry: EntryPoint) -> str:
-    return (entry.dist.metadata["Name"] if entry.dist is not None else None) or "?"
+    if entry.dist is None or "Name" not in entry.dist.metadata:  # a backport that other packages bring raises for it
+        return "?"
+    return entry.dist.metadata["Name"] or "?"
 
 
 def _has(found: object, part: str) -> bool:

@@ -74,7 +74,8 @@ def test_what_is_damaged_there_is_made_again(
             shared.pipe_file(f"{tpog}/entry.json", json.dumps(record).encode())
     other = machine(tmp_path / "other", monkeypatch)
     seen = states(scenario, other / "out")
-    assert (seen.pop("tpog"), seen.pop("report")) == ("done", "done")  # the report shows what each stage cost
+    del seen["report"]  # made again where what it shows of the stages' cost differs
+    assert seen.pop("tpog") == "done"
     assert set(seen.values()) == {"fetched"}
     third = machine(tmp_path / "third", monkeypatch)
     assert states(scenario, third / "out")["tpog"] == "fetched"
