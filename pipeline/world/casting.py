@@ -141,7 +141,7 @@ class Caster:
     ) -> tuple[EmptyScan, NDArray[np.int64]]:
         """Where some beams end, and what they meet."""
         ranges, met, doubtful = self._first(o, d, single, range_m)
-        ends, returned = np.empty_like(d), np.empty(len(d), dtype=np.bool_)
+        ends, returned = np.empty(d.shape), np.empty(len(d), dtype=np.bool_)
         rays.end(ranges, d, range_m, ends, returned)
         return EmptyScan(beam, ends, returned, doubtful), met
 

@@ -413,3 +413,11 @@ def test_shipped_scene_agrees_with_brute_force(name, site):
     assert (scan.returned[chosen] == (true <= reach)).all()
     assert np.abs(scan.ends_m[chosen] - d * np.minimum(true, reach)[:, None]).max() < 1e-9
     assert scan.doubtful < 0.01 * len(scan.beam)
+
+
+@pytest.mark.parametrize("dtype", [np.int64, np.float32])
+def test_ends_are_float64_whatever_the_directions_are(dtype):
+    wall = quad((10.3, 0, 0), (10.3, 9, 0), (10.3, 9, 9), (10.3, 0, 9))
+    swept = caster(wall).sweep((0.0, 5.0, 3.0), np.array([[1, 0, 0], [0, -1, 0]], dtype), 20.7)
+    assert swept.ends_m.dtype == np.float64
+    assert np.array_equal(swept.ends_m, [[10.3, 0.0, 0.0], [0.0, -20.7, 0.0]])

@@ -8,12 +8,13 @@ where it is crossed; rounded down, they and the plane name the voxel. Coordinate
 ``_BITS`` binary digits behind the point, each the last one plus a step, so that a processor does several at once and no
 crossing waits for another: nothing is merged or sorted.
 
-That gives what the march gives wherever every decision is far from turning. With u = 2**-53 and R the largest
-coordinate of sensor or grid:
+That gives what the march gives wherever every decision is far from turning. With u = 2**-53 and S the grid's longest
+side plus the sensor's largest coordinate:
 
-- a coordinate here, from a rounded inverse, two products and a sum, is off by at most 7 u R, and by half a last digit
-  a step; a crossing of the march is off by 2 u R, so the distance of two by 4 u R and a rounding;
-- so where each coordinate is further from the next plane than ``CHORD_M`` and 16 u R and those digits, no two crossings
+- a coordinate here, from a rounded inverse, two products and two sums, is off by at most 8 u S, and by less than a last
+  digit for its start and for each step, which are cut off; a crossing of the march is off by 2 u of its distance from
+  the sensor, which is at most sqrt(3) S, so the distance of two by 7 u S and a rounding;
+- so where each coordinate is further from the next plane than ``CHORD_M`` and 16 u S and those digits, no two crossings
   lie as near as ``CHORD_M``: their order is certain, and so is that each voxel between two of them counts;
 - the same distance is asked of both ends of what lies in the grid. Exempt are the grid's own faces, which nothing
   crosses; a sensor that stands exactly on a plane; and an end so near a plane that the voxel behind it cannot count.

@@ -137,6 +137,19 @@ def test_where_nothing_is_certain_it_says_so(shape, voxel_m, o):
     assert sure_march.crossed(o, np.array([3.3, 0.1, 0.2]), shape, near, np.empty(20, np.uint32)) == -1
 
 
+def test_digits_that_a_million_steps_cut_off_have_room():
+    """Each step is nearly a digit too short, so y is wrong by some 1e-6 where it has just passed a plane: not certain.
+    Without room for a whole digit a step, voxels on the wrong side of the plane would be listed."""
+    shape, voxel_m, step = np.array([2**20, 2, 2], np.int64), 1e4, (2.0**16 + 0.9999) / 2.0**40
+    o, d = np.array([0.5, 1.0 + 5e-7 - step * (2**20 - 40.5), 0.5]), np.array([2.0**20, step * 2.0**20, 0.0])
+    cells, near = sure_march.scratch(shape), sure_march.room(o, shape, march.CHORD_M / voxel_m)
+    assert sure_march.crossed(o, d, shape, near, cells) == -1
+    count = sure_march.crossed(o, d, shape, near._replace(plane=near.plane - (2.0**20 + 4.0) / 2.0**40), cells)
+    truly, t_cells = np.empty(shape.sum() + 3, np.int64), np.empty((shape.sum() + 3, 2))
+    assert count == march.walk(o, d, shape, voxel_m, np.zeros(1, np.uint32), truly, t_cells)[0]
+    assert len(np.setxor1d(cells[:count], truly[:count])) > 8
+
+
 @pytest.mark.parametrize("x", [5e-324, 1e-310, 1e-300, 1e200, 1.7e308])
 def test_extents_that_vanish_or_overflow_are_left_to_the_exact_march(x):
     assert listed(sure_march, (0.5, 0.5, 0.5), (3.0, x, 0.1), SHAPE, VOXEL_M) is None
