@@ -38,6 +38,9 @@ bench: $(VENV)/.installed-dev
 
 scaling: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.scaling
+	$(BIN)/python -m benchmarks.city speed
+	$(BIN)/python -m benchmarks.city overhead
+	$(BIN)/python -m benchmarks.city flat
 
 numerics: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.numerics --markdown docs/numerics-table.md
