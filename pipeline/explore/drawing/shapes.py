@@ -30,6 +30,11 @@ ABOVE_LANES_M = 2.0 * _ABOVE_ROAD_M
 
 _SCALE_STEPS, _LEAST = 255, 0.4
 
+MOST_TRIANGLES = 150_000
+"""A world of more is drawn coarser, so that a browser without a graphics card can turn it; beams meet all of it."""
+
+_FINEST_M = 0.25
+
 
 @dataclass(frozen=True)
 class Mesh:
@@ -45,15 +50,32 @@ def zero_of(roi: Roi) -> Vec3:
     return float(round(x + width / 2.0)), float(round(y + length / 2.0)), float(round(z))
 
 
-def solids(world: World, zero_m: Vec3) -> dict[str, Mesh]:
-    """The static world, a mesh for each kind of solid."""
+def solids(world: World, zero_m: Vec3, most: int = MOST_TRIANGLES) -> dict[str, Mesh]:
+    """The static world, a mesh for each kind of solid; drawn coarser where it has more than ``most`` triangles."""
     kinds = np.array([kind for _, kind in world.solids])[world.solid_of_face] if len(world.faces) else np.empty(0, str)
     around = (world.vertices_m - zero_m).astype(np.float32)
     found = {}
     for kind in np.unique(kinds).tolist():
         used, faces = np.unique(world.faces[kinds == kind], return_inverse=True)
         found[kind] = Mesh(around[used], faces.reshape(-1, 3).astype(np.int32))
+    cell_m = _FINEST_M
+    while sum(len(mesh.faces) for mesh in found.values()) > most:
+        found = {kind: _coarser(mesh, cell_m) for kind, mesh in found.items()}
+        cell_m *= 2.0
     return found
+
+
+def _coarser(mesh: Mesh, cell_m: float) -> Mesh:
+    """Corners in one cell of a grid become one, in their middle; triangles that have no area then are left out, and
+    the second of two alike."""
+    cells = np.floor(mesh.points / np.float32(cell_m)).astype(np.int64)
+    _, of, sizes = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    middle = np.column_stack([np.bincount(of.ravel(), mesh.points[:, axis]) / sizes for axis in range(3)])
+    faces = of.ravel()[mesh.faces]
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]
+    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    return Mesh(middle.astype(np.float32), faces[np.sort(first)].astype(np.int32))
 
 
 def lanes(carriageway: Carriageway, zero_m: Vec3) -> Mesh:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import trimesh
 
 import pipeline
 from pipeline.artefacts.readers import Tpog
@@ -16,6 +17,7 @@ from pipeline.sensing.sites import Pose, Site
 from pipeline.traffic.network import Lane, Permission
 from pipeline.world import static_world
 from pipeline.world.carriageway import Carriageway
+from pipeline.world.mesh import World
 
 FAR = Roi((400_000.25, 3_900_000.0, 0.0), (40.0, 20.0, 5.0))
 
@@ -32,6 +34,29 @@ def test_solids_keep_their_triangles(mini: Path) -> None:
     house = meshes["building"]
     assert house.points.dtype == np.float32
     assert (house.points.min(axis=0).tolist(), house.points.max(axis=0).tolist()) == ([-6, 5, 0], [-2, 8, 6])
+
+
+def test_a_large_world_is_drawn_coarser_and_looks_alike() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=8.0)
+    world = World(ball.vertices, ball.faces.astype(np.int32), np.zeros(len(ball.faces), np.int32), (("b", "tree"),))
+    whole, coarse = shapes.solids(world, (0, 0, 0))["tree"], shapes.solids(world, (0, 0, 0), most=2_000)["tree"]
+    assert len(whole.faces) == 20_480
+    assert 500 < len(coarse.faces) <= 2_000
+    assert np.allclose(np.linalg.norm(coarse.points, axis=1), 8.0, atol=0.2)
+    again = trimesh.Trimesh(coarse.points, coarse.faces, process=False)
+    assert again.is_watertight
+    assert np.isclose(again.volume, ball.volume, rtol=0.06)  # wound as before
+
+
+def test_two_leaves_in_one_cell_are_drawn_once() -> None:
+    leaf = np.array([[0, 0, 0], [9, 0, 0], [0, 9, 0]], dtype=np.float64)
+    far = np.array([[50.0, 0, 0], [50.1, 0, 0], [50, 0.1, 0]])  # smaller than a cell
+    world = World(
+        np.concatenate([leaf, leaf + 0.01, far]),
+        np.arange(9, dtype=np.int32).reshape(3, 3), np.zeros(3, np.int32), (("l", "tree"),),
+    )  # fmt: skip
+    drawn = shapes.solids(world, (0, 0, 0), most=2)["tree"]
+    assert np.allclose(drawn.points[drawn.faces], [leaf + 0.005])
 
 
 def test_a_region_has_twelve_edges() -> None:
