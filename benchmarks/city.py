@@ -1,8 +1,11 @@
 """What a city run costs on one worker and on two, and what is left of it when workers are killed.
 
-``python -m benchmarks.city speed`` runs a synthetic city (junctions of :mod:`benchmarks.scaling`) with a store of its
-own each time, and prints sites a second of one and of two workers, what a task takes beside its work, the seconds a
-site from 10 to 10,000 sites of one junction and from 1 to 50 junctions, and the workers' memory.
+Each runs a synthetic city (junctions of :mod:`benchmarks.scaling`) with a store of its own:
+
+- ``python -m benchmarks.city speed``: sites a second of one worker and of two.
+- ``python -m benchmarks.city overhead``: what a task takes beside its work.
+- ``python -m benchmarks.city flat``: milliseconds a site, from 10 to 10,000 sites of one junction and from 1 to 50
+  junctions, and the workers' memory.
 
 ``python -m benchmarks.city kills`` ends random workers with SIGKILL at random moments, ten times, and compares every
 artefact with those of a run that was left alone.
@@ -11,6 +14,7 @@ artefact with those of a run that was left alone.
 from __future__ import annotations
 
 import argparse
+import collections
 import hashlib
 import os
 import random
@@ -23,14 +27,18 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from benchmarks.scaling import Size, prepare
-from pipeline.city.running import clusters, graph, running
+import numpy as np
+from scipy.stats import qmc
+
+from benchmarks.scaling import Size, prepare, sides
+from pipeline.artefacts.run_record import RunRecord
+from pipeline.city.running import clusters, graph, parts, running
 from pipeline.city.running.jobs import Done, Job
 from pipeline.runs import workflow
+from pipeline.runs.store import Store
 
 KILLS = 10
 
@@ -97,8 +105,11 @@ def speed(folder: Path, repeats: int) -> None:
 
 
 def overhead(folder: Path) -> None:
-    """Print what a task takes beside its work: from the scheduler's own record of when tasks began and ended."""
-    jobs = build(folder / "one", {"big": Size(sites=1200, frames=100, beams=57_600 // 2)})
+    """Print what tasks that score take beside scoring: workers' time from the first to the last, by the scheduler's
+    record, against what the store says of the parts that they made."""
+    from distributed import get_task_stream
+
+    jobs = build(folder / "one", {"big": Size(sites=2400, frames=100, beams=57_600 // 2)})
     with clusters.connected("processes=2") as client:
         warm(client, folder)
         empty = []
@@ -106,50 +117,54 @@ def overhead(folder: Path) -> None:
             start = time.perf_counter()
             client.submit(int, 1, pure=False).result()
             empty.append(time.perf_counter() - start)
-        with fresh(jobs):
+        with fresh(jobs), get_task_stream(client) as stream:
             running.run(client, jobs)
-            parts = [its for its in client.get_task_stream() if its["key"].startswith("score-")]
-    took = [sum(s["stop"] - s["start"] for s in its["startstops"] if s["action"] == "compute") for its in parts]
-    median = statistics.median(took) if took else float("nan")
-    print(
-        f"a task of {len(parts)} takes {median:.2f} s; an empty one {1e3 * statistics.median(empty):.1f} ms there and"
-    )
-    print(f"back, {statistics.median(empty) / median:.2%} of it")
+            work_s = sum(entry.made.cost.seconds for entry in Store.default().entries() if entry.stage == parts.KIND)
+    times: dict[str, list[tuple[float, float]]] = collections.defaultdict(list)
+    for its in stream.data:
+        if its["key"].startswith("score-"):
+            times[its["worker"]] += [(s["start"], s["stop"]) for s in its["startstops"] if s["action"] == "compute"]
+    count = sum(map(len, times.values()))
+    inside_s = sum(stop - start for its in times.values() for start, stop in its)
+    all_s = sum(max(stop for _, stop in its) - min(start for start, _ in its) for its in times.values())
+    print(f"{count} tasks took {inside_s:.2f} s, of which they scored for {work_s:.2f} s; {all_s - inside_s:.2f} s lay")
+    print(f"between them: {all_s / work_s - 1:.2%} beside the work; an empty task, there and back, takes")
+    print(f"{1e3 * statistics.median(empty):.1f} ms, {statistics.median(empty) * count / work_s:.2%} of it")
 
 
 def flat(folder: Path) -> None:
-    """Print processor seconds a site, from few sites to many and from one junction to many."""
-    small = Size(frames=100)
-    empty: dict[str, float] = {}
+    """Print what scoring takes a site, from few sites to many and from one junction to many, beside what it takes a
+    junction: that of junctions of one site, which is taken off."""
     with clusters.connected("processes=2") as client:
         warm(client, folder)
 
-        def cost(name: str, sizes: dict[str, Size]) -> None:
-            jobs = build(folder / name, sizes)
-            before = _worker_seconds(client)
-            timed(client, jobs)
-            seconds, sites = _worker_seconds(client) - before, sum(size.sites for size in sizes.values())
-            memory = max(client.run(_peak_mb).values())
-            empty.setdefault("junction", seconds / len(sizes))
-            own = seconds - len(sizes) * empty["junction"]
-            told = f"{1e3 * own / sites:.2f} ms a site beside the junctions' own" if name != "empty" else ""
-            print(f"{len(sizes)} junctions, {sites} sites: {seconds:.2f} s; {told}; peak of a worker {memory:.0f} MB",
-                  flush=True)  # fmt: skip
+        def costs(junctions: int, sites: int) -> tuple[float, float, float]:
+            jobs = spread(folder / f"{junctions}x{sites}", junctions, Size(sites=sites, frames=100))
+            with fresh(jobs):
+                running.run(client, jobs)
+                made = [entry.made for entry in Store.default().entries() if entry.stage == parts.KIND]
+            stages = [RunRecord.read(job.out).stages for job in jobs]
+            scoring = sum(its["score"].cost.seconds for its in stages) + sum(its.cost.seconds for its in made)
+            report = sum(its["report"].cost.seconds for its in stages)
+            most = max(its.cost.peak_mb for its in [*made, *(stage for its in stages for stage in its.values())])
+            return scoring / junctions, report / junctions, most
 
-        cost("empty", {f"e{i}": replace(small, sites=1) for i in range(6)})
-        for sites in (10, 100, 1000, 10_000):
-            cost(f"sites{sites}", {"j": replace(small, sites=sites)})
-        for junctions in (1, 5, 20, 50):
-            cost(f"junctions{junctions}", {f"j{i}": replace(small, sites=100) for i in range(junctions)})
-
-
-def _worker_seconds(client: Any) -> float:
-    return float(sum(client.run(time.process_time).values()))
+        own, *_ = costs(20, 1)
+        print(f"a junction by itself: {1e3 * own:.0f} ms", flush=True)
+        for junctions, sites in ((20, 10), (5, 100), (2, 1000), (1, 10_000), (1, 100), (20, 100), (50, 100)):
+            scoring, report, most_mb = costs(junctions, sites)
+            print(f"{junctions} junctions of {sites} sites: {1e3 * (scoring - own) / (sites - 1):.2f} ms a site; "
+                  f"report {report:.2f} s a junction; peak of a worker {most_mb:.0f} MB", flush=True)  # fmt: skip
 
 
-def _peak_mb() -> float:
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM:"))
+def spread(folder: Path, junctions: int, size: Size) -> list[Job]:
+    """Junctions whose sites lie at other places each, all of them evenly: so that few are what many are."""
+    jobs = build(folder, {f"j{i}": size for i in range(junctions)})
+    places = qmc.Halton(2, scramble=False).random(junctions * size.sites + 1)[1:] * sides(size.hectares)
+    for job, its in zip(jobs, np.split(places, junctions), strict=True):
+        rows = [f"s{i},{x!r},{y!r},4" for i, (x, y) in enumerate(its.tolist())]
+        (job.folder / "sites.csv").write_text("\n".join(["site,x_m,y_m,z_m", *rows]) + "\n", encoding="utf-8")
+    return jobs
 
 
 # ---- loss

@@ -92,7 +92,7 @@ Points = dict[str, dict[float, tuple[float, float]]]
 def prepare(size: Size, folder: Path) -> Path:
     """Write a scenario of this size; its folder."""
     folder.mkdir(parents=True)
-    long, wide = _sides(size.hectares)
+    long, wide = sides(size.hectares)
     channels = min(128, max(4, round(math.sqrt(size.beams / 22.5))))
     spots = max(1, math.ceil(math.sqrt(size.sites)))
     values: dict[str, dict[str, Any]] = {
@@ -121,7 +121,7 @@ def prepare(size: Size, folder: Path) -> Path:
     return folder
 
 
-def _sides(hectares: float) -> tuple[float, float]:
+def sides(hectares: float) -> tuple[float, float]:
     """Length and width of a region about twice as long as wide, whole voxels."""
     wide = round(math.sqrt(hectares * 1e4 / 2) * 4) / 4
     return round(hectares * 1e4 / wide * 4) / 4, wide

@@ -21,6 +21,9 @@ FEWEST_VEHICLES = 10
 MOST_PLACES = 5
 """The worst places that are listed of a site."""
 
+_MOST_GROUPS = 1000
+"""Row groups of a file; where there are more sites, some share one."""
+
 _LISTED = ("lane", "turn", "crossing")
 
 
@@ -116,12 +119,25 @@ def read(path: Path, only: Collection[str] | None = None) -> Iterator[SiteBlinds
         When the file is corrupt, or a row lies outside the region.
     """
     with tables.reader(path, "blindspots") as (file, about):
-        if file.num_row_groups != len(about["sites"]):
-            raise InputError(path, f"{file.num_row_groups} row groups for {len(about['sites'])} sites", "one a site")
-        for group, site in enumerate(about["sites"]):
-            if only is None or site["site"] in only:
-                columns = tables.read_group(file, group, path).to_pydict()
-                yield _of_site(site["site"], columns, about, path)
+        names = [site["site"] for site in about["sites"]]
+        at_once = sites_a_group(len(names))
+        groups = [names[first : first + at_once] for first in range(0, len(names), at_once)]
+        if file.num_row_groups != len(groups):
+            right = "one a site" if at_once == 1 else f"one for {at_once} of them"
+            raise InputError(path, f"{file.num_row_groups} row groups for {len(names)} sites", right)
+        for number, group in enumerate(groups):
+            if only is not None and not any(name in only for name in group):
+                continue
+            table = tables.read_group(file, number, path)
+            rows = table.num_rows // len(group)
+            for place, name in enumerate(group):
+                if only is None or name in only:
+                    yield _of_site(name, table.slice(place * rows, rows).to_pydict(), about, path)
+
+
+def sites_a_group(sites: int) -> int:
+    """How many sites share a row group: Arrow keeps more of a group than the rows of a site take."""
+    return max(1, -(-sites // _MOST_GROUPS))
 
 
 def _of_site(site: str, columns: Mapping[str, list[Any]], about: Mapping[str, Any], path: Path) -> SiteBlindspots:

@@ -18,6 +18,7 @@ from pipeline.artefacts import blindspots, schemas, tables
 from pipeline.artefacts.blindspots import BLINDSPOTS
 from pipeline.artefacts.foreign_columns import foreign_columns
 from pipeline.artefacts.period_ranking import PERIOD_SCORES
+from pipeline.artefacts.readers import Tpog
 from pipeline.checks import recorded
 from pipeline.core.findings import WARNINGS, Finding
 from pipeline.effects import registry
@@ -25,19 +26,18 @@ from pipeline.effects.base import Effect
 from pipeline.formats.georeference import Georeference
 from pipeline.scenario.models import FILE, Scenario
 from pipeline.scoring import uncertainty
-from pipeline.scoring.blindspots import table
 from pipeline.scoring.leave_out import LeaveOut
 from pipeline.stages.base import StageInputs, Summary, Workspace
-from pipeline.stages.shared import period_scores
+from pipeline.stages.shared import period_scores, site_details
 from pipeline.stages.shared.blindspots import network_digests
 from pipeline.stages.shared.judged import Judged
 from pipeline.stages.shared.scene import SCANS, scan_inputs, scene_of, sensor_digests, sensor_settings
 from pipeline.stages.shared.site_scoring import BeamAudit, ScoredSite, SiteScoring, asks_targets
-from pipeline.stages.shared.target_scores import TPOG, TRAJECTORIES, Targets
+from pipeline.stages.shared.target_scores import TPOG, TRAJECTORIES
 from pipeline.world import world_frame
 
 NAME = "score"
-ARTEFACTS = ("scores.parquet", "visibility.parquet", PERIOD_SCORES, BLINDSPOTS)
+ARTEFACTS = ("scores.parquet", site_details.VISIBILITY, PERIOD_SCORES, BLINDSPOTS)
 
 
 def inputs(work: Workspace) -> StageInputs:
@@ -96,26 +96,16 @@ def run(
     )  # fmt: skip
     scored = scored_elsewhere(scoring) if scored_elsewhere is not None else scoring.all_sites()
     done: list[ScoredSite] = []
-    for its in scored:
-        done.append(its)
-        work.progress("sites", len(done), 0)
-        if observe is not None:
-            observe(its)
+    with site_details.writing(work, targets, len(scoring.names)) as details:
+        for its in scored:
+            if observe is not None:
+                observe(its)
+            done.append(details.take(its))
+            work.progress("sites", len(done), 0)
+        about = _about(work, inputs, tpog, done)
+        details.describe(about)
     judged = {name: _judged(name, done, leave_out) for name in ("egvs", *wanted.asked)}
     ranking, others = judged[wanted.rank_by], [judged[name] for name in wanted.asked]
-    sites = [d.site.to_json() for d in done]
-    about = work.metadata(
-        inputs,
-        gamma=work.scenario.gamma,
-        rank_by=wanted.rank_by,
-        grid=tpog.grid.to_json(),
-        frames=tpog.frames,
-        sites=sites,
-    )
-    if wanted.weights.are_given:
-        about["weights"] = wanted.weights.model_dump(mode="json")
-    _write_visibility(work, done, about)
-    _write_blindspots(work, done, targets, about)
     _write_scores(work, done, judged, scorer.limit, about)
     names, worths = [d.site.name for d in done], [d.score for d in done]
     apart = [other for other in others if other.name != "entropy_seen"]
@@ -148,6 +138,14 @@ def run(
     if doubts := nothing + doubts:
         summary[WARNINGS] = [doubt.to_json() for doubt in doubts]
     return summary
+
+
+def _about(work: Workspace, inputs: StageInputs, tpog: Tpog, done: list[ScoredSite]) -> dict[str, Any]:
+    """The metadata that all files of the stage have."""
+    wanted, sites = work.scenario.score, [d.site.to_json() for d in done]
+    grid, gamma = tpog.grid.to_json(), work.scenario.gamma
+    about = work.metadata(inputs, gamma=gamma, rank_by=wanted.rank_by, grid=grid, frames=tpog.frames, sites=sites)
+    return about | ({"weights": wanted.weights.model_dump(mode="json")} if wanted.weights.are_given else {})
 
 
 def _judged(name: str, done: list[ScoredSite], leave_out: LeaveOut | None) -> Judged:
@@ -203,25 +201,3 @@ def _worst(audits: list[BeamAudit]) -> dict[str, float]:
         "misplaced_chords": sum(audit.misplaced_chords for audit in audits),
         "voxels_visited_twice": sum(audit.voxels_visited_twice for audit in audits),
     }
-
-
-def _write_blindspots(work: Workspace, done: list[ScoredSite], targets: Targets | None, about: dict[str, Any]) -> None:
-    path = work.path(BLINDSPOTS)
-    if targets is None or targets.spots is None:
-        path.unlink(missing_ok=True)
-        return
-    seen = [d.targets.missed for d in done if d.targets is not None and d.targets.missed is not None]
-    names, mixed = [d.site.name for d in done], bool(work.scenario.traffic.periods)
-    table.write(path, targets.spots, names, seen, about, mixed=mixed)
-
-
-def _write_visibility(work: Workspace, done: list[ScoredSite], about: dict[str, Any]) -> None:
-    path = work.path(ARTEFACTS[1])
-    kept = [(scored.site.name, scored.visible) for scored in done if scored.visible is not None]
-    if not kept:
-        path.unlink(missing_ok=True)
-        return
-    with tables.writer(path, "visibility") as file:
-        for site, columns in kept:
-            file.write({"site": [site] * len(columns["hits"]), **columns})
-        file.describe(about)

@@ -11,8 +11,8 @@ from pipeline.city.running.jobs import Job, Order
 if TYPE_CHECKING:
     from dask.delayed import Delayed
 
-LEAST_BEAMS, MOST_BEAMS = 2**23, 2**25
-"""Beams of a task: 2**23 take some seconds, beside which what a task costs by itself does not count."""
+LEAST_BEAMS, MOST_BEAMS = 2**24, 2**25
+"""Beams of a task: 2**24 take some ten seconds, beside which what a task costs by itself does not count."""
 
 ROUNDS = 4
 """So many tasks for each worker, where they are large enough."""

@@ -17,15 +17,18 @@ from pipeline.city.running.keeping import KEPT
 from pipeline.runs import workflow
 from pipeline.sensing import sensors, sites
 
+SITE_BEAMS = 2**14
+"""What a site takes beside its beams, as beams: few take less than adding up what all voxels are worth."""
+
 
 @told
 def beams(job: Job, order: Order) -> int:
-    """How many beams the candidates of a junction have together: what its work is measured by."""
+    """The work of a junction's candidates: their beams, and as many more as a site by itself takes the time of."""
     with order.obeyed():
         scenario = job.scenario()
         candidates = sites.of(scenario)
         its = {name: sensors.of_scenario(name, scenario, "sites").beams for name in {s.sensor for s in candidates}}
-        return sum(its[site.sensor] for site in candidates)
+        return sum(its[site.sensor] + SITE_BEAMS for site in candidates)
 
 
 def run_whole(jobs: Sequence[Job], order: Order) -> list[Done | Failed]:

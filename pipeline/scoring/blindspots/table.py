@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pipeline.artefacts import tables
+from pipeline.artefacts import blindspots, tables
+from pipeline.artefacts.tables import TableWriter
 from pipeline.core.grid import Grid
 from pipeline.scoring.blindspots.spots import CELL, CELL_M, SiteSeen, Spots
 from pipeline.scoring.targets.scores import SEEN_WELL_POINTS
@@ -16,26 +18,46 @@ from pipeline.scoring.targets.scores import SEEN_WELL_POINTS
 ARTEFACT = "blindspots"
 
 
-def write(
-    path: Path, spots: Spots, sites: Sequence[str], seen: Sequence[SiteSeen], about: dict[str, Any], *, mixed: bool
-) -> None:
-    """Write ``blindspots.parquet``, one row group a site.
+class SpotWriter:
+    """Writes ``blindspots.parquet`` site by site. Made by :func:`writer`."""
 
-    Parameters
-    ----------
-    about
-        Its metadata, of which ``grid`` says where squares are counted from.
-    mixed
-        Whether the traffic is a mix of periods.
-    """
-    where, weights = _where(spots), spots.weights
-    with tables.writer(path, ARTEFACT, ("weight",) if mixed else ()) as file:
-        for site, its in zip(sites, seen, strict=True):
-            shares = {"seen": its.seen, "share_seen": its.share, "share_se": its.se, "weight": weights}
-            file.write({"site": [site] * len(spots), **where, **shares})
+    def __init__(self, file: TableWriter, spots: Spots, sites: int) -> None:
+        self._file, self._weights, self._at_once = file, spots.weights, blindspots.sites_a_group(sites)
+        self._where = {name: list(values) for name, values in _where(spots).items()}
+        self._waiting: list[tuple[str, SiteSeen]] = []
+
+    def add(self, site: str, its: SiteSeen) -> None:
+        """Append a site."""
+        self._waiting.append((site, its))
+        if len(self._waiting) == self._at_once:
+            self._write()
+
+    def describe(self, about: dict[str, Any]) -> None:
+        """Set the metadata, of which ``grid`` says where squares are counted from; no site comes after."""
+        if self._waiting:
+            self._write()
         grid = Grid.from_json(about["grid"])
         cells = {"origin_m": list(grid.origin_m[:2]), "cell_m": CELL_M, "shape": list(cells_over(grid))}
-        file.describe({**about, "cells": cells, "points": SEEN_WELL_POINTS})
+        self._file.describe({**about, "cells": cells, "points": SEEN_WELL_POINTS})
+
+    def _write(self) -> None:
+        names, seen = zip(*self._waiting, strict=True)
+        many: dict[str, Any] = {name: values * len(seen) for name, values in self._where.items()}
+        many["site"] = [name for name in names for _ in self._weights]
+        for column, of in (("seen", "seen"), ("share_seen", "share"), ("share_se", "se")):
+            many[column] = np.concatenate([getattr(its, of) for its in seen])
+        self._file.write({**many, "weight": np.tile(self._weights, len(seen))})
+        self._waiting.clear()
+
+
+@contextmanager
+def writer(path: Path, spots: Spots, sites: int, *, mixed: bool) -> Iterator[SpotWriter]:
+    """Open ``blindspots.parquet`` for so many sites; it appears when the block ends well.
+
+    ``mixed``: whether the traffic is a mix of periods.
+    """
+    with tables.writer(path, ARTEFACT, ("weight",) if mixed else ()) as file:
+        yield SpotWriter(file, spots, sites)
 
 
 def cells_over(grid: Grid) -> tuple[int, int]:

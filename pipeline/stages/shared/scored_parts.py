@@ -112,7 +112,7 @@ def _of(arrays: Mapping[str, NDArray[Any]]) -> Find:
         found = arrays[kind][start : start + length]
         if len(found) != length:
             raise ValueError("numbers are missing")
-        return found
+        return found.copy()  # a view would hold the whole file's numbers for as long as one site's score is known
 
     return find
 

@@ -37,18 +37,18 @@ def test_every_junction_is_in_one_end(beams: list[int], workers: int) -> None:
 
 
 def test_a_large_junction_is_cut_and_small_ones_are_joined() -> None:
-    every, m = jobs(5), 2**20
+    every, m = jobs(5), 2**21
     beams = dict(zip((job.junction for job in every), (m, 100 * m, m, m, 9 * m), strict=True))
     assert graph.beams_a_task(beams, 2) == 8 * m  # an eighth of 112 million, as a power of two
     assert graph.parts_of(beams["j1"], 8 * m) == 13
-    small = [every[i] for i in (0, 2, 3)]  # 3 million each, with what a junction takes by itself
-    assert [[job.junction for job in group] for group in graph.joined(small, beams, 8 * m)] == [["j0", "j2"], ["j3"]]
+    small = [every[i] for i in (0, 2, 3)]  # 2 m each, with what a junction takes by itself
+    assert [[job.junction for job in group] for group in graph.joined(small, beams, 5 * m)] == [["j0", "j2"], ["j3"]]
     ends = graph.build(every, beams, ORDER, 2)
     tasks = {end.key.split("-")[0] for end in ends}
     assert tasks == {"finish", "run"}
 
 
-@pytest.mark.parametrize(("workers", "task"), [(1, 2**25), (2, 2**25), (8, 2**25), (100, 2**23)])
+@pytest.mark.parametrize(("workers", "task"), [(1, 2**25), (2, 2**25), (8, 2**25), (100, 2**24)])
 def test_tasks_are_neither_tiny_nor_endless(workers: int, task: int) -> None:
     assert graph.beams_a_task({"a": 2**31}, workers) == task
     assert graph.beams_a_task({"a": 1}, workers) == graph.LEAST_BEAMS

@@ -47,8 +47,8 @@ def test_a_junction_scored_in_parts_is_the_junction_run_alone(
     client: Any, jobs: list[Job], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job = Job("c", jobs[2].folder, jobs[2].out, CUT)
-    monkeypatch.setattr(graph, "LEAST_BEAMS", 1)
-    monkeypatch.setattr(graph, "MOST_BEAMS", 4096)  # 2,880 beams a site: three parts of four sites
+    monkeypatch.setattr(graph, "LEAST_BEAMS", 2**15)
+    monkeypatch.setattr(graph, "MOST_BEAMS", 2**15)  # 2,880 beams and 16,384 a site: three parts of four sites
     heard: list[Done] = []
     running.run(client, [job], heard=heard.append)
     assert [(its.junction, its.sites) for its in heard] == [("c", 4)]

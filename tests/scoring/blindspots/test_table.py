@@ -250,3 +250,25 @@ def test_a_file_that_is_cut_off_is_refused_by_the_report(ran: tuple[Path, Path],
     path.write_bytes(path.read_bytes()[:-100])
     code, _, told = egvs("report", ran[0], "--out", tmp_path)
     assert code == 2 and "blindspots.parquet: was altered or replaced" in " ".join(told.split())
+
+
+def test_many_sites_share_row_groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("EGVS_STORE", "")  # which would hold the other's
+    more = "".join(f"more_{i},{12 + i},9,3\n" for i in range(3))
+    folder = write_mini(tmp_path / "mini")
+    (folder / "sites.csv").write_text(SITES + more)
+    found = {}
+    for most, sites in ((1000, [1] * 5), (3, [2, 2, 1])):
+        monkeypatch.setattr(blindspots, "_MOST_GROUPS", most)
+        path = tmp_path / f"run{most}" / "blindspots.parquet"
+        pipeline.run(loading.load(folder), path.parent, jobs=1)
+        about, rows = pq.read_metadata(path), pq.read_metadata(path).num_rows // 5
+        assert [about.row_group(i).num_rows for i in range(about.num_row_groups)] == [rows * count for count in sites]
+        found[most] = path, list(blindspots.read(path))
+    for alone, shared in zip(found[1000][1], found[3][1], strict=True):
+        assert (alone.site, alone.places) == (shared.site, shared.places)
+        np.testing.assert_array_equal(alone.share_missed, shared.share_missed)
+    (path, whole), only = found[3], {"pole_b", "more_2"}
+    assert [its.site for its in blindspots.read(path, only)] == ["pole_b", "more_2"]
+    assert [its.places for its in blindspots.read(path, only)] == [whole[1].places, whole[4].places]
+    assert pq.read_table(found[1000][0]).to_pandas().equals(pq.read_table(path).to_pandas())
