@@ -146,8 +146,8 @@ def flat(folder: Path) -> None:
             stages = [RunRecord.read(job.out).stages for job in jobs]
             scoring = sum(its["score"].cost.seconds for its in stages) + sum(its.cost.seconds for its in made)
             report = sum(its["report"].cost.seconds for its in stages)
-            most = max(its.cost.peak_mb for its in [*made, *(stage for its in stages for stage in its.values())])
-            return scoring / junctions, report / junctions, most
+            peaks = [stage.cost.peak_mb for its in stages for stage in its.values()] + [its.cost.peak_mb for its in made]
+            return scoring / junctions, report / junctions, max(peaks)
 
         own, *_ = costs(20, 1)
         print(f"a junction by itself: {1e3 * own:.0f} ms", flush=True)
