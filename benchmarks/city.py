@@ -146,7 +146,9 @@ def flat(folder: Path) -> None:
             stages = [RunRecord.read(job.out).stages for job in jobs]
             scoring = sum(its["score"].cost.seconds for its in stages) + sum(its.cost.seconds for its in made)
             report = sum(its["report"].cost.seconds for its in stages)
-            peaks = [stage.cost.peak_mb for its in stages for stage in its.values()] + [its.cost.peak_mb for its in made]
+            peaks = [stage.cost.peak_mb for its in stages for stage in its.values()] + [
+                its.cost.peak_mb for its in made
+            ]
             return scoring / junctions, report / junctions, max(peaks)
 
         own, *_ = costs(20, 1)
