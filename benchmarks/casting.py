@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 import pipeline
+from pipeline.effects.scene_building import build_scene
 from pipeline.kernels import rays
 from pipeline.sensing import sensors, sites
-from pipeline.world import static_world
 from pipeline.world.casting import Caster
 
 _SCENARIOS = Path(__file__).resolve().parent.parent / "scenarios"
@@ -32,72 +32,47 @@ def _work(name: str) -> tuple[dict[str, Callable[[], Any]], int, int]:
     from embreex.rtcore_scene import EmbreeScene
 
     scenario = pipeline.load(_SCENARIOS / name)
-    world = static_world.build(scenario)[0]
-    caster, origin = Caster(world, scenario.roi.box), np.asarray(scenario.roi.box.origin_m)
+    places = sites.of(scenario)
+    start_m = np.array([site.pose.position_m for site in places])
+    caster, origin = (
+        Caster(build_scene(scenario).world, scenario.roi.box, start_m),
+        np.asarray(scenario.roi.box.origin_m),
+    )
     bare = EmbreeScene()
     TriangleMesh(bare, caster._triangles.astype(np.float32))
     jobs = []
-    for site in sites.of(scenario):
+    for site in places:
         sensor = sensors.of_scenario(site.sensor, scenario, site.name)
         directions = sensor.directions(*site.pose.angles_deg)
-        position = np.asarray(site.pose.position_m)
-        d = directions[caster.scan(site.pose.position_m, directions, sensor.range_m).beam]
-        start, single = np.tile((position - origin).astype(np.float32), (len(d), 1)), d.astype(np.float32)
-        nearest = caster._scene.run(start, single)
-        ranges, met, doubtful = np.empty(len(d)), *(np.empty(len(d), dtype=np.int64) for _ in range(2))
-        count = rays.settle(
-            nearest,
-            caster._owner,
-            caster._triangles,
-            caster._planes,
-            position - origin,
-            d,
-            sensor.range_m,
-            ranges,
-            met,
-            doubtful,
-        )
-        jobs.append(
-            (
-                site.pose.position_m,
-                directions,
-                sensor.range_m,
-                position - origin,
-                d,
-                start,
-                single,
-                nearest,
-                ranges,
-                met,
-                doubtful,
-                count,
-            )
-        )
+        beam = caster.scan(site.pose.position_m, directions, sensor.range_m).beam
+        o, single = np.asarray(site.pose.position_m) - origin, directions[beam].astype(np.float32)
+        start, count = np.tile(o.astype(np.float32), (len(beam), 1)), len(beam)
+        shapes, ray = (caster._triangles, caster._planes), (o, beam, directions, sensor.range_m)
+        filled = np.empty(count), np.empty(count, dtype=np.int64)
+        ends, doubtful = (np.empty((count, 3)), np.empty(count, dtype=np.bool_)), np.empty(count, dtype=np.int64)
+        settled = (caster._scene.run(start, single), caster._owner, *shapes, *ray, *filled, doubtful, *ends)
+        some = doubtful[: rays.settle(*settled)]
+        searched = (some, *shapes, caster._boxes, caster._starts, *ray, *filled, *ends)
+        jobs.append(((site.pose.position_m, directions, sensor.range_m), (start, single), settled, searched))
 
-    def settle() -> None:
-        for _, _, range_m, o, d, _start, _single, nearest, ranges, met, doubtful, _count in jobs:
-            rays.settle(nearest, caster._owner, caster._triangles, caster._planes, o, d, range_m, ranges, met, doubtful)
-
-    def search() -> None:
-        for *_, o, d, _start, _single, _nearest, ranges, met, doubtful, count in jobs:
-            rays.search(
-                doubtful[:count], caster._triangles, caster._planes, caster._boxes, caster._starts, o, d, ranges, met
-            )
+    def cast() -> None:
+        for asked, *_ in jobs:  # each is let go before the next is made, as a run does
+            caster.scan(*asked)
 
     work: dict[str, Callable[[], Any]] = {
-        "Embree alone": lambda: [bare.run(job[5], job[6]) for job in jobs],
-        "Embree with rims and fins": lambda: [caster._scene.run(job[5], job[6]) for job in jobs],
-        "settle: hits placed in float64": settle,
-        "search: doubtful beams": search,
-        "whole cast": lambda: [caster.scan(*job[:3]) for job in jobs],
+        "Embree alone": lambda: [bare.run(*ray) for _, ray, *_ in jobs],
+        "Embree with rims and fins": lambda: [caster._scene.run(*ray) for _, ray, *_ in jobs],
+        "settle: hits placed in float64": lambda: [rays.settle(*settled) for *_, settled, _ in jobs],
+        "search: doubtful beams": lambda: [rays.search(*searched) for *_, searched in jobs],
+        "whole cast": cast,
     }
-    return work, sum(len(job[4]) for job in jobs), sum(job[-1] for job in jobs)
+    return work, sum(len(ray[0]) for _, ray, *_ in jobs), sum(len(searched[0]) for *_, searched in jobs)
 
 
 def rows() -> list[tuple[Any, ...]]:
     """A line for each part: what, times Embree alone, share of the whole cast."""
     found: list[tuple[Any, ...]] = []
-    for name in ("nishishinjuku", "ingolstadt"):
+    for name in ("nishishinjuku", "ingolstadt", "hill", "roundabout"):
         work, beams, doubtful = _work(name)
         times: dict[str, list[float]] = {part: [] for part in work}
         for _ in range(_ROUNDS):

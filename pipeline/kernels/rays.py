@@ -126,7 +126,7 @@ def meet(triangle, plane, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-de
 
 
 @_kernel
-def settle(nearest, owner, triangles, planes, o, d, range_m, ranges, met, doubtful):  # type: ignore[no-untyped-def]
+def settle(nearest, owner, triangles, planes, o, beam, d, range_m, ranges, met, doubtful, ends, returned):  # type: ignore[no-untyped-def]
     """Place the hits that were proposed, and tell which proposals float32 cannot be trusted with.
 
     Parameters
@@ -134,11 +134,13 @@ def settle(nearest, owner, triangles, planes, o, d, range_m, ranges, met, doubtf
     nearest
         What each ray meets first in slightly enlarged form, as an index into ``owner``, -1 for none, (n,) int32.
     owner
-        The triangle behind each, ``FIN`` for a fin; the last is none, -1. int64.
+        The triangle behind each, ``FIN`` for a fin; the last is none, -1. int32.
     triangles, planes
         All triangles (m, 3, 3) and their planes (m, 4, 4), float64.
-    o, d
-        The sensor (3,) and the rays' unit directions (n, 3), float64.
+    o
+        The sensor, (3,) float64.
+    beam, d
+        Where the direction of each ray stands, (n,) uint32, in unit vectors (beams, 3) float64.
     range_m
         Of a hit that is further away, it is enough to know that it is.
     ranges
@@ -148,6 +150,9 @@ def settle(nearest, owner, triangles, planes, o, d, range_m, ranges, met, doubtf
     doubtful
         Filled: the rays that met a triangle less than ``SURE_M`` inside, its enlargement only, or at an angle below
         ``SHALLOW``, (n,) int64.
+    ends, returned
+        Filled: where each ray ends, seen from the sensor: at its hit, or at ``range_m`` where that is nearer, (n, 3);
+        and whether it is a hit, (n,) bool.
 
     Returns
     -------
@@ -158,27 +163,39 @@ def settle(nearest, owner, triangles, planes, o, d, range_m, ranges, met, doubtf
     for ray in range(nearest.shape[0]):
         k = owner[nearest[ray]]
         met[ray] = k
-        t, sure = _plainly_met(planes[max(k, 0)], ox, oy, oz, d[ray, 0], d[ray, 1], d[ray, 2], range_m)
-        ranges[ray] = t if sure and k >= 0 else np.inf
+        n = beam[ray]
+        dx, dy, dz = d[n, 0], d[n, 1], d[n, 2]
+        t, sure = _plainly_met(planes, max(k, 0), ox, oy, oz, dx, dy, dz, range_m)
+        t = t if sure and k >= 0 else np.inf
+        ranges[ray] = t
+        _end(ray, t, dx, dy, dz, range_m, ends, returned)
         if (not sure and k != -1) or k < -1:
             if k >= 0:
-                ranges[ray], _, _ = meet(triangles[k], planes[k], ox, oy, oz, d[ray, 0], d[ray, 1], d[ray, 2])
+                ranges[ray], _, _ = meet(triangles[k], planes[k], ox, oy, oz, dx, dy, dz)
             doubtful[count] = ray
             count += 1
     return count
 
 
 @_inlined
-def _plainly_met(plane, ox, oy, oz, dx, dy, dz, range_m):  # type: ignore[no-untyped-def]
+def _end(ray, t, dx, dy, dz, range_m, ends, returned):  # type: ignore[no-untyped-def]
+    """Fill where a ray ends that meets something at range ``t``."""
+    returned[ray] = t <= range_m
+    t = t if t <= range_m else range_m
+    ends[ray, 0], ends[ray, 1], ends[ray, 2] = dx * t, dy * t, dz * t
+
+
+@_inlined
+def _plainly_met(planes, k, ox, oy, oz, dx, dy, dz, range_m):  # type: ignore[no-untyped-def]
     """Range at which a ray meets one triangle, and whether :func:`settle` can trust it: as :func:`meet`, for what is
     well inside and not seen too flat. Without a branch, since whether a beam meets anything cannot be foretold."""
-    facing = plane[0, 0] * dx + plane[0, 1] * dy + plane[0, 2] * dz
-    away = plane[0, 3] - (plane[0, 0] * ox + plane[0, 1] * oy + plane[0, 2] * oz)
+    facing = planes[k, 0, 0] * dx + planes[k, 0, 1] * dy + planes[k, 0, 2] * dz
+    away = planes[k, 0, 3] - (planes[k, 0, 0] * ox + planes[k, 0, 1] * oy + planes[k, 0, 2] * oz)
     t, sine = away / facing, abs(facing)
     x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
-    first = plane[1, 0] * x + plane[1, 1] * y + plane[1, 2] * z - plane[1, 3] >= SURE_M
-    second = plane[2, 0] * x + plane[2, 1] * y + plane[2, 2] * z - plane[2, 3] >= SURE_M
-    third = plane[3, 0] * x + plane[3, 1] * y + plane[3, 2] * z - plane[3, 3] >= SURE_M
+    first = planes[k, 1, 0] * x + planes[k, 1, 1] * y + planes[k, 1, 2] * z - planes[k, 1, 3] >= SURE_M
+    second = planes[k, 2, 0] * x + planes[k, 2, 1] * y + planes[k, 2, 2] * z - planes[k, 2, 3] >= SURE_M
+    third = planes[k, 3, 0] * x + planes[k, 3, 1] * y + planes[k, 3, 2] * z - planes[k, 3, 3] >= SURE_M
     met = (sine >= GRAZE) & (abs(away) > EDGE_M) & (t >= 0.0) & first & second & third
     return t, met & ((sine >= SHALLOW) | (t > range_m + 1.0))
 
@@ -189,7 +206,7 @@ def _inverse(x):  # type: ignore[no-untyped-def]
 
 
 @_kernel
-def search(rays, triangles, planes, boxes, starts, o, d, ranges, met):  # type: ignore[no-untyped-def]
+def search(rays, triangles, planes, boxes, starts, o, beam, d, range_m, ranges, met, ends, returned):  # type: ignore[no-untyped-def]
     """Find the first hit of a few rays among all triangles.
 
     Parameters
@@ -199,15 +216,16 @@ def search(rays, triangles, planes, boxes, starts, o, d, ranges, met):  # type: 
     boxes, starts
         Boxes round the triangles, round each ``GROUP`` consecutive boxes of those, and so on to a single one: (b, 6)
         float64, low and high corner; where each level starts, (levels + 1,) int64.
-    triangles, planes, o, d, ranges, met
-        As in :func:`settle`, which came before; ``ranges`` and ``met`` are filled for these rays. Nothing is looked for
-        behind the hits that it placed.
+    triangles, planes, o, beam, d, range_m, ranges, met, ends, returned
+        As in :func:`settle`, which came before; the last four are filled for these rays. Nothing is looked for behind
+        the hits that it placed.
     """
     ox, oy, oz, top = o[0], o[1], o[2], starts.shape[0] - 2
     for r in range(rays.shape[0]):
         ray, best, level, k = rays[r], np.inf, top, 0
         behind = ranges[ray]
-        dx, dy, dz = d[ray, 0], d[ray, 1], d[ray, 2]
+        n = beam[ray]
+        dx, dy, dz = d[n, 0], d[n, 1], d[n, 2]
         per_x, per_y, per_z = _inverse(dx), _inverse(dy), _inverse(dz)
         while True:
             box = boxes[starts[level] + k]
@@ -230,6 +248,7 @@ def search(rays, triangles, planes, boxes, starts, o, d, ranges, met):  # type: 
             if level == top:
                 break
         ranges[ray] = best
+        _end(ray, best, dx, dy, dz, range_m, ends, returned)
 
 
 @_kernel
@@ -244,13 +263,61 @@ def stands_on(triangles, planes, point, touched):  # type: ignore[no-untyped-def
 
 
 @_inlined
-def _within(o, high, flat, d, first, last):  # type: ignore[no-untyped-def]
-    """Cut [first, last] to one axis of the box, which ends ``high`` ahead of the sensor, and at ``flat`` for a segment
-    that stays where the sensor is. Nothing but selections: several segments are done at once."""
-    t0, t1 = (0.0 - o) / d, high / d
+def _within(t0, t1, flat, d, first, last):  # type: ignore[no-untyped-def]
+    """Cut [first, last] to the piece from t0 to t1, where a segment crosses the two ends of one axis of the box; to
+    ``flat`` for one that stays where the sensor is. Nothing but selections: several segments are done at once."""
     low_t, high_t = t0 if t0 < t1 else t1, t1 if t0 < t1 else t0
     low_t, high_t = 0.0 if d == 0.0 else low_t, flat if d == 0.0 else high_t
     return low_t if low_t > first else first, high_t if high_t < last else last
+
+
+@_inlined
+def _is_tiny(d):  # type: ignore[no-untyped-def]
+    """Whether 1 / d is too large for a product, and d is not 0."""
+    return (abs(d) < 1.0 / _LARGEST) & (d != 0.0)
+
+
+@_inlined
+def _box_seen_from(o, size):  # type: ignore[no-untyped-def]
+    """The sensor in the box's frame, how far the box goes on ahead of it, and, an axis each, 1 where a segment that
+    stays on that axis is within the box, else -1."""
+    ox, oy, oz, high_x, high_y, high_z = o[0], o[1], o[2], size[0] - o[0], size[1] - o[1], size[2] - o[2]
+    flat_x = 1.0 if ox >= 0.0 and high_x >= 0.0 else -1.0
+    flat_y = 1.0 if oy >= 0.0 and high_y >= 0.0 else -1.0
+    flat_z = 1.0 if oz >= 0.0 and high_z >= 0.0 else -1.0
+    return (ox, oy, oz), (high_x, high_y, high_z), (flat_x, flat_y, flat_z)
+
+
+@_kernel
+def _some_meet(o, high, flat, some, range_m, room, found):  # type: ignore[no-untyped-def]
+    """Fill ``found`` for at most ``_AT_ONCE`` segments, see :func:`can_meet`.
+
+    Products with 1 / d and squares decide, unless a piece is so nearly as long as CHORD_M that their rounding could;
+    then quotients and a root do, which take twice the time.
+    """
+    (ox, oy, oz), (high_x, high_y, high_z), (flat_x, flat_y, flat_z) = o, high, flat
+    count, doubts = some.shape[0], 0
+    for n in range(count):
+        room[0, n], room[1, n], room[2, n] = some[n, 0] * range_m, some[n, 1] * range_m, some[n, 2] * range_m
+    for n in range(count):
+        x, y, z = room[0, n], room[1, n], room[2, n]
+        per_x, per_y, per_z = 1.0 / x, 1.0 / y, 1.0 / z
+        first, last = _within((0.0 - ox) * per_x, high_x * per_x, flat_x, x, 0.0, 1.0)
+        first, last = _within((0.0 - oy) * per_y, high_y * per_y, flat_y, y, first, last)
+        first, last = _within((0.0 - oz) * per_z, high_z * per_z, flat_z, z, first, last)
+        square = (last - first) * (last - first) * (x * x + y * y + z * z)
+        found[n] = (last > first) & (square > CHORD_M * CHORD_M)
+        wide = 1e-14 * (abs(x) + abs(y) + abs(z)) + 1e-9  # the rounding of t, at most 1, and what squares lose
+        doubts += abs(square - CHORD_M * CHORD_M) <= wide * (2.0 * CHORD_M + wide)
+        doubts += _is_tiny(x) | _is_tiny(y) | _is_tiny(z)
+    if doubts == 0:
+        return
+    for n in range(count):
+        x, y, z = room[0, n], room[1, n], room[2, n]
+        first, last = _within((0.0 - ox) / x, high_x / x, flat_x, x, 0.0, 1.0)
+        first, last = _within((0.0 - oy) / y, high_y / y, flat_y, y, first, last)
+        first, last = _within((0.0 - oz) / z, high_z / z, flat_z, z, first, last)
+        found[n] = (last - first) * math.sqrt(x * x + y * y + z * z) > CHORD_M
 
 
 @_kernel
@@ -266,43 +333,32 @@ def can_meet(o, ends, size, reaches, range_m=1.0):  # type: ignore[no-untyped-de
     reaches
         Filled, (n,) bool.
     """
-    ox, oy, oz, high_x, high_y, high_z = o[0], o[1], o[2], size[0] - o[0], size[1] - o[1], size[2] - o[2]
-    flat_x = 1.0 if ox >= 0.0 and high_x >= 0.0 else -1.0
-    flat_y = 1.0 if oy >= 0.0 and high_y >= 0.0 else -1.0
-    flat_z = 1.0 if oz >= 0.0 and high_z >= 0.0 else -1.0
-    x, y, z = np.empty(_AT_ONCE), np.empty(_AT_ONCE), np.empty(_AT_ONCE)
+    origin, high, flat = _box_seen_from(o, size)
+    room = np.empty((3, _AT_ONCE))
     for start in range(0, ends.shape[0], _AT_ONCE):
-        some = ends[start : start + _AT_ONCE]
-        for n in range(some.shape[0]):
-            x[n], y[n], z[n] = some[n, 0] * range_m, some[n, 1] * range_m, some[n, 2] * range_m
-        found = reaches[start : start + _AT_ONCE]
-        for n in range(some.shape[0]):
-            first, last = _within(ox, high_x, flat_x, x[n], 0.0, 1.0)
-            first, last = _within(oy, high_y, flat_y, y[n], first, last)
-            first, last = _within(oz, high_z, flat_z, z[n], first, last)
-            found[n] = (last - first) * math.sqrt(x[n] * x[n] + y[n] * y[n] + z[n] * z[n]) > CHORD_M
+        stop = start + _AT_ONCE
+        _some_meet(origin, high, flat, ends[start:stop], range_m, room, reaches[start:stop])
 
 
 @_kernel
-def take(reaches, directions, beam, d, single):  # type: ignore[no-untyped-def]
-    """Take the beams that reach: filled are their indices ``beam`` (k,) uint32, their directions ``d`` (k, 3) float64,
-    and ``single``, these as float32."""
-    k = 0
-    for n in range(directions.shape[0]):
-        if reaches[n]:
-            x, y, z = directions[n, 0], directions[n, 1], directions[n, 2]
-            beam[k] = n
-            d[k, 0], d[k, 1], d[k, 2] = x, y, z
-            single[k, 0], single[k, 1], single[k, 2] = x, y, z
-            k += 1
+def take(o, directions, size, range_m, beam, single):  # type: ignore[no-untyped-def]
+    """Take the beams that can meet the box; how many they are.
 
-
-@_kernel
-def end(ranges, d, range_m, ends, returned):  # type: ignore[no-untyped-def]
-    """Fill where each ray ends, ``ends`` (n, 3), seen from the sensor: at its hit, or at ``range_m`` where that is
-    nearer; and whether it is a hit, ``returned`` (n,) bool."""
-    for ray in range(ranges.shape[0]):
-        t = ranges[ray]
-        returned[ray] = t <= range_m
-        t = t if t <= range_m else range_m
-        ends[ray, 0], ends[ray, 1], ends[ray, 2] = d[ray, 0] * t, d[ray, 1] * t, d[ray, 2] * t
+    Parameters
+    ----------
+    o, directions, size, range_m
+        As in :func:`can_meet`.
+    beam, single
+        The first are filled: their indices, uint32, and their directions, (n, 3) float32. There is room for all.
+    """
+    origin, high, flat = _box_seen_from(o, size)
+    room, found, k = np.empty((3, _AT_ONCE)), np.empty(_AT_ONCE, dtype=np.bool_), 0
+    for start in range(0, directions.shape[0], _AT_ONCE):
+        some = directions[start : start + _AT_ONCE]
+        _some_meet(origin, high, flat, some, range_m, room, found)
+        for n in range(some.shape[0]):
+            if found[n]:
+                beam[k] = start + n
+                single[k, 0], single[k, 1], single[k, 2] = some[n, 0], some[n, 1], some[n, 2]
+                k += 1
+    return k

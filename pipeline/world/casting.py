@@ -35,6 +35,8 @@ _RIM_M = 1e-4
 _RIM_SHARE = 2.0**-21  # of the triangle's largest coordinate: eight times float32's rounding
 _MAX_SHIFT_M = 1.0  # a needle whose tip would move further when it is enlarged is held as a rectangle
 _CLEAR_M = 2.0  # what is left out of the tree is further away than anything held there is enlarged
+_LONG_M, _WASTE = 10.0, 6.0  # a triangle longer than this, in a box with so many times its area, is cut in the tree
+_THIN_M = 1e-3  # but for one that is no wider, whose pieces would have no plane
 _STEEP = 0.25  # sine of the angle between two planes from which the one's rim stands out of the other far enough
 _PAD_M = 1e-5  # more than the rules of kernels.rays and float64's rounding ask for
 
@@ -97,9 +99,9 @@ class Caster:
         met = met[_along_curve(triangles[met].mean(axis=1))]
         self._faces = met
         self._triangles = triangles[met]
-        self._planes = _planes(self._triangles)
+        self._planes = _planes(self._triangles) if len(met) else np.zeros((1, 4, 4))  # one, which is never asked
         self._boxes, self._starts = _boxes(self._triangles)
-        self._owner: NDArray[np.int64] = np.empty(0, dtype=np.int64)
+        self._owner: NDArray[np.int32] = np.array([-1], dtype=np.int32)
         self._scene: Any = None
         if len(met):
             self._owner, self._scene = _tree(self._triangles)
@@ -117,12 +119,9 @@ class Caster:
             Where a beam ends that meets nothing.
         """
         o = np.asarray(position_m, dtype=np.float64) - self._origin_m
-        reaches = np.empty(len(directions), dtype=np.bool_)
-        rays.can_meet(o, directions, self._size_m, reaches, range_m)
-        count = int(np.count_nonzero(reaches))
-        beam, d, single = np.empty(count, np.uint32), np.empty((count, 3)), np.empty((count, 3), np.float32)
-        rays.take(reaches, directions, beam, d, single)
-        return self._ended(beam, o, d, single, range_m)[0]
+        beam, single = np.empty(len(directions), np.uint32), np.empty((len(directions), 3), np.float32)
+        count = rays.take(o, directions, self._size_m, range_m, beam, single)
+        return self._ended(o, beam[:count].copy(), directions, single[:count], range_m)[0]
 
     def sweep(self, position_m: tuple[float, float, float], directions: Floats, range_m: float) -> EmptyScan:
         """Cast every beam, whether or not it can meet the region of interest; as :meth:`scan`, and what is met.
@@ -131,19 +130,10 @@ class Caster:
         """
         o = np.asarray(position_m, dtype=np.float64) - self._origin_m
         beam, single = np.arange(len(directions), dtype=np.uint32), directions.astype(np.float32)
-        scan, met = self._ended(beam, o, directions, single, range_m)
+        scan, met = self._ended(o, beam, directions, single, range_m)
         face = np.full(len(directions), -1, dtype=np.int64)
         face[scan.returned] = self._faces[met[scan.returned]]
         return replace(scan, face=face)
-
-    def _ended(
-        self, beam: NDArray[np.uint32], o: Floats, d: Floats, single: NDArray[np.float32], range_m: float
-    ) -> tuple[EmptyScan, NDArray[np.int64]]:
-        """Where some beams end, and what they meet."""
-        ranges, met, doubtful = self._first(o, d, single, range_m)
-        ends, returned = np.empty(d.shape), np.empty(len(d), dtype=np.bool_)
-        rays.end(ranges, d, range_m, ends, returned)
-        return EmptyScan(beam, ends, returned, doubtful), met
 
     def first_hits(self, o_roi_m: Floats, d: Floats, range_m: float = float("inf")) -> tuple[Floats, int]:
         """Range of each ray's first hit (infinity for none), and how many rays had to be searched in float64.
@@ -151,23 +141,37 @@ class Caster:
         ``o_roi_m`` is the sensor in the ROI's frame, (3,); ``d`` are unit directions (n, 3); hits beyond ``range_m`` do
         not matter.
         """
-        ranges, _, count = self._first(o_roi_m, d, d.astype(np.float32), range_m)
-        return ranges, count
+        ranges = np.empty(len(d))
+        scan, _ = self._ended(o_roi_m, np.arange(len(d), dtype=np.uint32), d, d.astype(np.float32), range_m, ranges)
+        return ranges, scan.doubtful
 
-    def _first(
-        self, o_roi_m: Floats, d: Floats, single: NDArray[np.float32], range_m: float
-    ) -> tuple[Floats, NDArray[np.int64], int]:
-        """As :meth:`first_hits`, and which of the kept triangles each ray meets; ``single`` is ``d`` in float32."""
-        if self._scene is None or len(d) == 0:
-            return np.full(len(d), np.inf), np.full(len(d), -1, dtype=np.int64), 0
-        nearest = self._scene.run(np.broadcast_to(o_roi_m.astype(np.float32), d.shape), single)
-        ranges, (met, doubtful) = np.empty(len(d)), np.empty((2, len(d)), dtype=np.int64)
-        count = rays.settle(
-            nearest, self._owner, self._triangles, self._planes, o_roi_m, d, range_m, ranges, met, doubtful
-        )
-        some = doubtful[:count]
-        rays.search(some, self._triangles, self._planes, self._boxes, self._starts, o_roi_m, d, ranges, met)
-        return ranges, met, int(count)
+    def _ended(
+        self,
+        o: Floats,
+        beam: NDArray[np.uint32],
+        d: Floats,
+        single: NDArray[np.float32],
+        range_m: float,
+        ranges: Floats | None = None,
+    ) -> tuple[EmptyScan, NDArray[np.int64]]:
+        """Where some beams end, and which of the kept triangles each meets.
+
+        ``o`` is the sensor in the ROI's frame, ``d`` the directions of all beams, ``single`` those of the ones that are
+        cast, in float32; ``ranges`` is filled with their first hits.
+        """
+        count = len(beam)
+        ranges = np.empty(count) if ranges is None else ranges
+        met, doubtful = np.empty((2, count), dtype=np.int64)
+        ends, returned = np.empty((count, 3)), np.empty(count, dtype=np.bool_)
+        if self._scene is None or not count:
+            nearest = np.full(count, -1, dtype=np.int32)
+        else:
+            start = np.ndarray((count, 3), np.float32, o.astype(np.float32), strides=(0, 4))  # the same for all
+            nearest = self._scene.run(start, single)
+        shapes, ray, filled = (self._triangles, self._planes), (o, beam, d, range_m), (ranges, met)
+        some = doubtful[: rays.settle(nearest, self._owner, *shapes, *ray, *filled, doubtful, ends, returned)]
+        rays.search(some, *shapes, self._boxes, self._starts, *ray, *filled, ends, returned)
+        return EmptyScan(beam, ends, returned, len(some)), met
 
 
 def reachable(shapes: Floats, roi: Roi, sites_m: Floats, range_m: float = float("inf")) -> NDArray[np.bool_]:
@@ -261,16 +265,17 @@ def _boxes(triangles: Floats) -> tuple[Floats, NDArray[np.int64]]:
     return np.concatenate(levels), np.cumsum([0, *map(len, levels)])
 
 
-def _tree(triangles: Floats) -> tuple[NDArray[np.int64], Any]:
+def _tree(triangles: Floats) -> tuple[NDArray[np.int32], Any]:
     """Embree's tree over the enlarged triangles; and the triangle behind each of its own, FIN for a fin; the last is
     none (-1).
 
-    A triangle is scaled from its incentre so that its sides move out by the rim. That moves a needle's tip far; a
-    needle is held as the two triangles of a rectangle that covers it. Then the fins.
+    Large slivers are cut first. A triangle is scaled from its incentre so that its sides move out by the rim. That
+    moves a needle's tip far; a needle is held as the two triangles of a rectangle that covers it. Then the fins.
     """
     from embreex.mesh_construction import TriangleMesh
     from embreex.rtcore_scene import EmbreeScene
 
+    triangles, cut_from = _cut(triangles)
     rim = _RIM_M + _RIM_SHARE * np.abs(triangles).max(axis=(1, 2))
     sides = np.roll(triangles, -2, axis=1) - np.roll(triangles, -1, axis=1)  # opposite corner i
     lengths = np.sqrt((sides**2).sum(axis=2))
@@ -288,7 +293,33 @@ def _tree(triangles: Floats) -> tuple[NDArray[np.int64], Any]:
     fins = _fins(triangles, cross, rim)
     scene = EmbreeScene()
     TriangleMesh(scene, np.concatenate([enlarged, second, fins]).astype(np.float32))
-    return np.concatenate([np.arange(len(triangles)), needles, np.full(len(fins), rays.FIN), [-1]]), scene
+    owner = np.concatenate([cut_from, cut_from[needles], np.full(len(fins), rays.FIN), [-1]])
+    return owner.astype(np.int32), scene
+
+
+def _cut(triangles: Floats) -> tuple[Floats, NDArray[np.int64]]:
+    """Cut triangles (m, 3, 3) that fill little of a large box, across their longest sides; the pieces, and of which
+    triangle each is.
+
+    A beam that enters a box of Embree's tree is tried against what lies in it, and where slivers fan out, their boxes
+    lie one over another. At most twice as many triangles come out.
+    """
+    triangles, owner, most = triangles.copy(), np.arange(len(triangles)), 2 * len(triangles)
+    while True:
+        size = triangles.max(axis=1) - triangles.min(axis=1)
+        box = size[:, 0] * size[:, 1] + size[:, 1] * size[:, 2] + size[:, 2] * size[:, 0]
+        area = 0.5 * np.sqrt((_cross(triangles) ** 2).sum(axis=1))
+        sides = np.sqrt(((np.roll(triangles, -2, axis=1) - np.roll(triangles, -1, axis=1)) ** 2).sum(axis=2))
+        long = sides.max(axis=1)
+        chosen = np.flatnonzero((long > _LONG_M) & (box > _WASTE * area) & (2.0 * area > _THIN_M * long))
+        if len(chosen) == 0 or len(triangles) + len(chosen) > most:
+            return triangles, owner
+        turn = (sides[chosen].argmax(axis=1)[:, None] + np.arange(3)) % 3  # the corner that faces it comes first
+        apex, a, b = np.moveaxis(np.take_along_axis(triangles[chosen], turn[:, :, None], axis=1), 1, 0)
+        middle = 0.5 * (a + b)
+        triangles[chosen] = np.stack([apex, a, middle], axis=1)
+        triangles = np.concatenate([triangles, np.stack([apex, middle, b], axis=1)])
+        owner = np.concatenate([owner, owner[chosen]])
 
 
 def _fins(triangles: Floats, cross: Floats, rim: Floats) -> Floats:

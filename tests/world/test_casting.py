@@ -13,7 +13,7 @@ from pipeline.kernels import rays
 from pipeline.scenario import loading
 from pipeline.sensing.scanner import Scanner
 from pipeline.sensing.sensors import CATALOGUE
-from pipeline.world.casting import Caster, standing_on, with_planes
+from pipeline.world.casting import Caster, _cut, standing_on, with_planes
 from pipeline.world.mesh import World
 from tests.oracles import cast
 
@@ -77,8 +77,9 @@ def test_float32_is_not_trusted_near_edges_and_at_shallow_angles(end, range_m, d
     o = np.array([0.0, 0.0, 0.5])
     d = towards(o, [[*end, 0.0]])
     ranges, found = np.empty(1), np.empty(1, np.int64)
-    nearest, owner = np.zeros(1, np.int32), np.array([0, -1])
-    count = rays.settle(nearest, owner, triangles, planes, o, d, range_m, ranges, np.empty(1, np.int64), found)
+    nearest, owner = np.zeros(1, np.int32), np.array([0, -1], np.int32)
+    beam, met, ends, returned = np.zeros(1, np.uint32), np.empty(1, np.int64), np.empty((1, 3)), np.empty(1, np.bool_)
+    count = rays.settle(nearest, owner, triangles, planes, o, beam, d, range_m, ranges, met, found, ends, returned)
     assert ranges[0] == pytest.approx(np.linalg.norm([*end, 0.5]), abs=1e-9)
     assert bool(count) == doubtful
 
@@ -421,3 +422,88 @@ def test_ends_are_float64_whatever_the_directions_are(dtype):
     swept = caster(wall).sweep((0.0, 5.0, 3.0), np.array([[1, 0, 0], [0, -1, 0]], dtype), 20.7)
     assert swept.ends_m.dtype == np.float64
     assert np.array_equal(swept.ends_m, [[10.3, 0.0, 0.0], [0.0, -20.7, 0.0]])
+
+
+def meets(o, ends, size):
+    """Whether each segment shares more than CHORD_M with the box, by one quotient for each crossing."""
+    with np.errstate(all="ignore"):
+        t = np.sort([(0.0 - o) / ends, (size - o) / ends], axis=0)
+        stays = ends == 0.0
+        low = np.where(stays, 0.0, t[0]).max(axis=1, initial=0.0)
+        high = np.where(stays, np.where((o >= 0.0) & (size - o >= 0.0), 1.0, -1.0), t[1]).min(axis=1, initial=1.0)
+        x, y, z = ends.T
+        return (high - low) * np.sqrt(x * x + y * y + z * z) > rays.CHORD_M
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([1e-3, 1.0, 200.0, 1e5]))
+def test_beams_that_can_meet_the_region_are_those_of_exact_quotients(seed, reach):
+    """At random, along axes, along the box's faces, and past its edges with a chord of about CHORD_M."""
+    rng, size = np.random.default_rng(seed), np.array([40.0, 20.0, 5.0])
+    o = rng.choice([rng.uniform(-50, 90, 3), size * rng.integers(-1, 3, 3), size * rng.random(3)], axis=0)
+    edge = np.column_stack([size[0] * rng.integers(0, 2, 400), size[1] * rng.integers(0, 2, 400), rng.random(400) * 5])
+    inwards = np.where(edge[:, :2] == 0.0, 1.0, -1.0) * rng.choice([0.5, 0.7, 0.71, 1.0, 3.0], (400, 1)) * 1e-6
+    past = np.concatenate([edge[:, :2] + inwards * rng.random((400, 2)), edge[:, 2:]], axis=1)
+    ends = np.concatenate([(past - o) * rng.choice([0.9, 1.0, 1.5], (400, 1)), random_directions(rng, 400) * reach])
+    ends *= rng.choice([1.0, 0.0], ends.shape, p=[0.9, 0.1])
+    ends[::50, 0], ends[1::50, 2] = 1e-300, -5e-324
+    found = np.empty(len(ends), dtype=np.bool_)
+    rays.can_meet(o, ends, size, found)
+    np.testing.assert_array_equal(found, meets(o, ends, size))
+
+
+def test_a_chord_that_rounding_makes_too_short_is_measured_by_quotients():
+    """Through a box no thicker than CHORD_M: which beams share a longer piece with it, rounding alone says."""
+    rng, size, o = np.random.default_rng(9), np.array([rays.CHORD_M, 20.0, 5.0]), np.array([0.0, 10.0, 2.5])
+    away = np.array([1.0, 0.0, 0.0]) + rng.uniform(-1e-8, 1e-8, (20_000, 3)) * [0.0, 1.0, 1.0]
+    ends = away * rng.uniform(1.0, 300.0, (20_000, 1))
+    true = meets(o, ends, size)
+    per = 1.0 / ends[:, 0]
+    chord = size[0] * per * np.sqrt((ends**2).sum(axis=1))
+    assert (true != (chord > rays.CHORD_M)).mean() > 0.01  # so products alone would not do
+    found = np.empty(len(ends), dtype=np.bool_)
+    for n in range(2000):  # alone: one in doubt has those beside it measured too
+        rays.can_meet(o, ends[n : n + 1], size, found[n : n + 1])
+    np.testing.assert_array_equal(found[:2000], true[:2000])
+
+
+def fan(slivers, reach, turn_deg):
+    """Slivers from one corner to the points of a line, in a plane that climbs."""
+    far = np.column_stack([np.full(slivers + 1, reach), np.linspace(-reach, reach, slivers + 1)])
+    flat = np.stack([np.zeros((slivers, 2)), far[:-1], far[1:]], axis=1) @ turned(turn_deg)[:2, :2].T
+    return np.dstack([flat + 50.0, 1.0 + flat @ [0.03, -0.02]])
+
+
+def test_slivers_are_cut_into_pieces_that_are_them():
+    whole = np.concatenate([fan(12, 180.0, 31.0), quad((0, 0, 0), (9, 0, 0), (9, 9, 0), (0, 9, 0))])
+    pieces, owner = _cut(whole)
+    assert len(whole) < len(pieces) <= 2 * len(whole)
+    assert (owner[-2:] != len(whole) - 1).all() and (owner == len(whole) - 1).sum() == 1  # the quad stays as it is
+    area = np.linalg.norm(np.cross(pieces[:, 1] - pieces[:, 0], pieces[:, 2] - pieces[:, 0]), axis=1)
+    true = np.linalg.norm(np.cross(whole[:, 1] - whole[:, 0], whole[:, 2] - whole[:, 0]), axis=1)
+    assert np.bincount(owner, area) == pytest.approx(true, rel=1e-12)
+    for corner in range(3):
+        np.testing.assert_allclose(along_plane(pieces[:, corner], whole[owner]), 0.0, atol=1e-12)
+
+
+def along_plane(points, triangles):
+    """How far each point lies beside the plane of its triangle."""
+    normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    return ((points - triangles[:, 0]) * normal).sum(axis=1) / np.linalg.norm(normal, axis=1)
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 31.0])
+@pytest.mark.parametrize("height_m", [0.05, 4.0])
+def test_a_fan_of_slivers_leaks_nowhere(turn_deg, height_m):
+    """Beams at the cuts, at the sides, and at anything, steep and nearly along the plane, against brute force."""
+    rng, slivers = np.random.default_rng(5), fan(60, 150.0, turn_deg)
+    pieces, _ = _cut(slivers)
+    assert len(pieces) > 100
+    sides = 0.5 * (pieces + np.roll(pieces, 1, axis=1)).reshape(-1, 3)
+    share = rng.dirichlet([1, 1, 1], len(slivers) * 40)
+    inside = (np.repeat(slivers, 40, axis=0) * share[:, :, None]).sum(axis=1)
+    o = np.array([50.0, 50.0, 1.0 + height_m]) + (turned(turn_deg) @ [20.0, 3.0, 0.0])
+    d = towards(o, np.concatenate([pieces.reshape(-1, 3), sides, inside]))
+    found, true = cast_both(slivers, o, d)
+    assert np.isfinite(true).mean() > 0.9
+    assert not cast.differ(found, true).any()
