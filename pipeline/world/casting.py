@@ -83,8 +83,8 @@ class Caster:
     roi
         Beams that cannot meet it are not cast.
     sites_m, range_m
-        Where beams start, (n, 3), and how far they go at most: what none of them can meet is left out of the tree. All
-        is kept when None.
+        Where beams start, (n, 3), and how far they go at most: what none of them can meet is left out of the tree,
+        where that is most of the world. All is kept when None.
     """
 
     def __init__(self, world: World, roi: Roi, sites_m: Floats | None = None, range_m: float = float("inf")) -> None:
@@ -95,7 +95,9 @@ class Caster:
             raise InputError("statics", "a triangle has a corner that is no number", "finite metres")
         met = np.flatnonzero(_cross(triangles).any(axis=1))  # the others have no plane, and what is beside them is met
         if sites_m is not None:
-            met = met[reachable(world.triangles_m[met], roi, sites_m, range_m)]
+            reached = reachable(world.triangles_m[met], roi, sites_m, range_m)
+            if 2 * np.count_nonzero(reached) < len(met):  # a few less make no quicker tree
+                met = met[reached]
         met = met[_along_curve(triangles[met].mean(axis=1))]
         self._faces = met
         self._triangles = triangles[met]
