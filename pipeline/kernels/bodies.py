@@ -34,7 +34,7 @@ _PAD = 1e-9
 _LARGEST = 1e200  # stands for 1 / 0: times a length it is larger than any range
 
 _kernel = compiled()
-_inlined = compiled(inline="always")
+_inlined = compiled(forceinline=True)
 
 
 @_inlined

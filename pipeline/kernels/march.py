@@ -40,7 +40,7 @@ CHORD_M = 1e-6
 
 
 _kernel = compiled()
-_inlined = compiled(inline="always")
+_inlined = compiled(forceinline=True)
 
 
 @_inlined

@@ -30,7 +30,7 @@ from pipeline.kernels.boxes import SHRINK_M, axes_of
 from pipeline.kernels.compile_cache import compiled
 
 _kernel = compiled()
-_inlined = compiled(inline="always")
+_inlined = compiled(forceinline=True)
 
 TOGETHER_RAD = 1e-3
 """Beams whose azimuths differ by less are taken together."""

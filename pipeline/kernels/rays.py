@@ -48,7 +48,7 @@ GROUP = 8
 _LARGEST = 1e200  # stands for 1 / 0: times a length it is larger than any range, times zero it is zero
 
 _kernel = compiled()
-_inlined = compiled(inline="always")
+_inlined = compiled(forceinline=True)
 
 
 @_kernel

@@ -20,7 +20,7 @@ from pipeline.kernels.compile_cache import compiled
 from pipeline.kernels.occlusion import face
 
 _kernel = compiled()
-_inlined = compiled(inline="always")
+_inlined = compiled(forceinline=True)
 
 _MARGIN_RAD = 1e-9
 """Spans are widened by this: rounding loses no beam."""

@@ -42,7 +42,7 @@ _SMALLEST, _LARGEST = 2.0**-500, 2.0**500
 """Components between these (or 0) and their inverses and products neither vanish nor overflow."""
 
 _kernel = compiled()
-_inlined = compiled(inline="always")
+_inlined = compiled(forceinline=True)
 
 
 class Room(NamedTuple):

@@ -19,7 +19,7 @@ import numpy as np
 CAPPED, LOGARITHM, SATURATING = 0, 1, 2
 
 _kernel = numba.njit(cache=True, nogil=True, error_model="numpy")
-_inlined = numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+_inlined = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 
 
 @_inlined
