@@ -58,6 +58,7 @@ def test_the_contracts_on_imports_hold(capsys: pytest.CaptureFixture[str]) -> No
     assert not broken, capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_no_import_hides_in_a_string() -> None:
     """What is imported by name is seen by no contract; only plug-ins and the package's own names are."""
     hidden = {
@@ -70,6 +71,7 @@ def test_no_import_hides_in_a_string() -> None:
     assert hidden <= {"__init__.py", "core/plugins.py"}
 
 
+@pytest.mark.slow
 def test_one_package_reads_parquet_and_one_module_the_schemas() -> None:
     readers = {name for name in MODULES if "pyarrow.parquet" in imported(name)}
     assert readers <= {"artefacts/tables.py", "traffic/fcd.py"}  # the latter reads what SUMO wrote
@@ -98,6 +100,7 @@ def test_a_module_is_short(name: str) -> None:
     assert len((PACKAGE / name).read_text(encoding="utf-8").splitlines()) <= MOST_LINES
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MODULES)
 def test_a_module_opens_with_a_plain_sentence(name: str) -> None:
     opening = re.match(r".+?[.:?!](?=\s|$)", ast.get_docstring(tree(name)) or "", re.DOTALL)
@@ -205,6 +208,7 @@ def test_each_name_can_be_imported_and_used_first_and_says_what_it_is(run_folder
         assert kind == str(name[0].isupper()), name
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_a_run_knows_nothing_of_validation(run_folder: Path) -> None:
     code = (

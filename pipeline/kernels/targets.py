@@ -176,9 +176,8 @@ def _list(k, b, box, beams, runs, owner, range_m, hits, count):  # type: ignore[
 def _restore(runs, length_m, owner, range_m):  # type: ignore[no-untyped-def]
     """Take the boxes out of the way of beams again."""
     for run in range(runs.shape[0]):
-        first, last = runs[run]
-        owner[first:last] = -1
-        range_m[first:last] = length_m[first:last]
+        for n in range(runs[run, 0], runs[run, 1]):
+            owner[n], range_m[n] = -1, length_m[n]
 
 
 @_kernel

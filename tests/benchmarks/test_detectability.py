@@ -60,6 +60,7 @@ def test_hits_by_hand() -> None:
     assert examples.hits_of(record, found).tolist() == [0.0, 1.0, 1.0, 0.0, 1.0]
 
 
+@pytest.mark.slow
 def test_a_box_too_high_is_found_from_above_alone_and_the_bound_itself_is_not_enough() -> None:
     record = record_of([car(10.0), car(20.0, length=10.0), car(40.0, length=10.0)])
     found = [boxes(car(10.0, z=1.25), car(20.0, length=7.0), car(40.0, length=7.001))]  # 0.5 in space; 0.7 and more

@@ -44,6 +44,8 @@ from pipeline.validation.detectors.pointpillars.detector import SHIPPED, Model
 from pipeline.validation.looking import Look
 from tests.conftest import write_mini
 
+pytestmark = pytest.mark.slow  # a study is made for all of them
+
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 
@@ -51,7 +53,6 @@ DOCS = ROOT / "docs"
 # the places
 
 
-@pytest.mark.slow
 def test_the_grid_is_the_same_each_time_upright_and_at_all_heights(mini: Path) -> None:
     first, again = (poses.grid_poses(pipeline.build_scene(pipeline.load(mini)), None, "small") for _ in range(2))
     assert first == again and len(first) == 40
@@ -110,7 +111,6 @@ def part_of(mini: Path, folder: Path) -> measuring.Part:
     return measuring.Part(**{**vars(part), "scores": ("entropy_seen",)})
 
 
-@pytest.mark.slow
 def test_a_part_that_was_measured_is_kept_and_an_interrupted_one_goes_on(mini, tmp_path, monkeypatch, short) -> None:
     said: list[str] = []
     part = part_of(mini, tmp_path)
@@ -194,7 +194,6 @@ def test_some_of_the_given_sites_are_of_many_poles_and_all_heights() -> None:
     assert [site.name for site in looking_from.some(pair, 2)] == ["k0", "k2"]
 
 
-@pytest.mark.slow
 def test_the_whole_study_is_the_same_bytes_twice_and_says_what_it_went_without(
     tmp_path, monkeypatch, capsys, short
 ) -> None:

@@ -307,6 +307,7 @@ def test_the_command_says_so_when_nothing_is_found_and_writes_nothing(street: Pa
     assert sorted(street.rglob("*")) == before
 
 
+@pytest.mark.slow
 def test_a_run_keeps_the_warnings_and_shows_them(mini: Path, egvs) -> None:
     statics(mini, box((1000, 2000), (1010, 2010)))
     for state in ("nearest solid", "unchanged"):

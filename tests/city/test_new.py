@@ -99,6 +99,7 @@ def test_a_city_has_every_junction_with_signals(made: new.NewCity, extract: Path
     assert counted["junctions"] == {"made": 2, "signalised": 2} and "OpenStreetMap" in city.attribution
 
 
+@pytest.mark.slow
 def test_a_junction_has_the_region_and_the_poles_that_it_has_alone(made: new.NewCity, extract: Path) -> None:
     for its in model.load(made.folder).junctions:
         folder = made.folder.parent / f"alone-{its.id}"
@@ -168,6 +169,7 @@ def test_a_junction_without_a_free_place_is_left_out_and_told(extract: Path, tmp
     assert len(city.left_out[new.NO_PLACE]) == 1
 
 
+@pytest.mark.slow
 def test_a_table_names_the_junctions(extract: Path, tmp_path: Path) -> None:
     table = tmp_path / "wanted.csv"
     (lat, lon), (b_lat, b_lon) = degrees(-195, 5), degrees(0, 0)
@@ -207,6 +209,7 @@ def test_a_wrong_row_of_a_table_is_named(extract: Path, tmp_path: Path, rows: st
     assert not (tmp_path / "town").exists()
 
 
+@pytest.mark.slow
 def test_wrong_input_is_one_message_and_leaves_nothing(extract: Path, tmp_path: Path, egvs) -> None:
     out = tmp_path / "town"
     for options, told in (

@@ -46,6 +46,7 @@ def uncut(city: City, name: str, monkeypatch: pytest.MonkeyPatch) -> bytes:
     return city.junction(name).traffic_file(city).read_bytes()
 
 
+@pytest.mark.slow
 def test_each_junction_gets_every_frame_with_vehicles_or_without(city: City) -> None:
     made = traffic.make(city)
     assert made.anew and made.frames == FRAMES
@@ -60,6 +61,7 @@ def test_each_junction_gets_every_frame_with_vehicles_or_without(city: City) -> 
     assert few["frame"].to_pylist() == list(range(min(few["frame"].to_pylist()), max(few["frame"].to_pylist()) + 1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effects", ["", ARTICULATED + "[effects.moving_occlusion]\n"])
 def test_a_junction_alone_gets_what_it_gets_from_all_vehicles(
     city: City, effects: str, monkeypatch: pytest.MonkeyPatch

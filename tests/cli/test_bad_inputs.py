@@ -350,6 +350,7 @@ COMMANDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("arguments", "message"), COMMANDS.values(), ids=COMMANDS.keys())
 def test_wrong_command_is_answered(mini: Path, tmp_path: Path, egvs, arguments: list[str], message: str) -> None:
     _, error = refused(egvs, *(a.format(mini=mini, out=tmp_path / "out") for a in arguments))
@@ -372,6 +373,7 @@ def spoil_parquet(path: Path) -> None:
     path.write_bytes(bytes(data))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["trajectories.parquet", "tpog.parquet", "scans.parquet", "statics.ply"])
 @pytest.mark.parametrize("how", ["truncated", "one byte", "other columns", "no file"])
 def test_a_damaged_artefact_is_named_by_the_stage_that_reads_it(

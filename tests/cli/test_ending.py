@@ -43,6 +43,7 @@ def test_closed_streams_are_no_error(mini: Path, tmp_path: Path) -> None:
     assert (tmp_path / "out" / "report.html").is_file()
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_names_that_an_encoding_does_not_know_are_printed_as_escapes(mini: Path, tmp_path: Path) -> None:
     sites = mini / "sites.csv"
@@ -104,6 +105,7 @@ CLOSED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.system
 @pytest.mark.parametrize("name", CLOSED)
 def test_a_file_that_may_not_be_read_is_wrong_input(mini: Path, tmp_path: Path, name: str) -> None:

@@ -46,6 +46,7 @@ def by_syntax_tree(text: str, package: str) -> set[str]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_the_pattern_sees_what_the_syntax_tree_sees(path: Path) -> None:
     text, package = path.read_text(encoding="utf-8"), "pipeline.x"
@@ -105,6 +106,7 @@ CHANGED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.system
 @pytest.mark.parametrize("file", CHANGED)
 def test_a_changed_line_changes_the_digest_of_what_imports_it(file: str, tmp_path: Path) -> None:

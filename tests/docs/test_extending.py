@@ -130,6 +130,7 @@ assert dropped == 0 and read.tobytes() == points.tobytes()
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_a_score_of_another_package_is_listed(tmp_path: Path) -> None:
     beside = install(package("A score"), tmp_path / "installed")

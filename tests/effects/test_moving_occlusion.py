@@ -213,6 +213,7 @@ def recorded(out: Path, grid: Grid) -> dict[int, np.ndarray]:
 # By hand
 
 
+@pytest.mark.slow
 def test_a_car_parked_in_half_of_the_frames_halves_what_is_behind_it() -> None:
     half = replay({0: [car(10, 0.25)], 2: [car(10, 0.25)]}, 4)  # from x = 8 to 12
     share = half.share(listed((0, 0.25, 1), [[20, 0, 0]]))
@@ -443,6 +444,7 @@ def test_all_frames_are_the_mean_of_each_and_their_order_does_not_matter() -> No
     assert replay_of(turned).blocked(rays).tolist() == replay_of(frames).blocked(rays).tolist()
 
 
+@pytest.mark.slow
 def test_it_multiplies_with_rain(ran: tuple[Path, Path]) -> None:
     folder, out = ran
     scenario = pipeline.load(folder, [ON, ALL, "effects.rain.rate_mm_h=30"])

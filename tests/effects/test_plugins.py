@@ -155,6 +155,7 @@ BROKEN = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_broken_ones_that_nobody_named_are_listed_as_broken(mini, tmp_path):
     for name, source in BROKEN.items():
@@ -204,6 +205,7 @@ def test_shares_of_no_crossing_and_of_bits_are_shares() -> None:
     assert visibility._shares(effect, np.array([True, False]), 2, "ranges").tolist() == [True, False]
 
 
+@pytest.mark.slow
 @pytest.mark.system
 @pytest.mark.parametrize("value", ["np.nan", "2.0"])
 def test_a_run_with_an_effect_that_gives_no_shares_ends_with_its_name(mini, package, tmp_path, value):

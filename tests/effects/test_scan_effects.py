@@ -457,6 +457,7 @@ def test_the_switch_acts_and_weights_and_metadata_are_as_declared(
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EACH)
 def test_any_number_of_threads_gives_the_same_bytes_and_unkept_scans_the_same_scores(
     mini: Path, tmp_path: Path, plain: Path, name: str

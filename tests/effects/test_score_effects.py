@@ -521,6 +521,7 @@ def test_bad_optics_are_refused(mini: Path, key: str) -> None:
 # The run
 
 
+@pytest.mark.slow
 def test_only_the_score_runs_again(mini: Path, tmp_path: Path) -> None:
     def states(*settings: str) -> dict[str, str]:
         seen: dict[str, str] = {}
@@ -560,6 +561,7 @@ print(sorted(name for name in sys.modules if name.startswith({MODULES})))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.system
 @pytest.mark.parametrize(
     ("settings", "expected"),
@@ -576,6 +578,7 @@ def test_what_is_not_named_is_not_imported(
     assert run.stdout.strip() == repr(expected)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_a_whole_plain_run_imports_no_effect(mini: Path, tmp_path: Path) -> None:
     program = f"""

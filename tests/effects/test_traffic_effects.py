@@ -162,6 +162,7 @@ def test_a_flat_network_keeps_its_flat_ground(flat, tmp_path):
     assert len(read_ply(one / "statics.ply")[0].faces) == 2
 
 
+@pytest.mark.slow
 def test_each_switch_acts(flat, plain, climbed, tmp_path):
     for number, effects in enumerate(({"articulated": {}}, CROWD)):
         assert bytes_of(scenario(flat, effects, **SMALL), tmp_path / str(number))[1] != plain[0]
@@ -577,6 +578,7 @@ def test_people_never_lower_a_voxels_count(climbed):
     assert all(np.all(more >= less) and more.sum() > less.sum() for less, more in itertools.pairwise(counts))
 
 
+@pytest.mark.slow
 def test_more_departures_bring_more_people(flat, tmp_path):
     means = []
     for rate in (0, 200, 1000):
@@ -586,6 +588,7 @@ def test_more_departures_bring_more_people(flat, tmp_path):
     assert means[0] == 0 < means[1] < means[2]
 
 
+@pytest.mark.slow
 def test_same_seed_same_bytes_and_the_same_over_traci(hill, climbed, tmp_path, patient):
     from sumolib.miscutils import getFreeSocketPort
 

@@ -129,6 +129,7 @@ def test_where_none_can_stand_no_score_is_left(page: Page) -> None:
     assert page._label.text == "pole_a: cannot stand"
 
 
+@pytest.mark.slow
 def test_another_sensor_is_that_of_the_catalogue(page: Page, session: Session) -> None:
     pose = session.candidates["pole_a"].site.pose
     settled(page, "pole_a", pose, "VLP-16")
@@ -136,6 +137,7 @@ def test_another_sensor_is_that_of_the_catalogue(page: Page, session: Session) -
     assert page.rating.scores["egvs"] > session.candidates["pole_a"].scores["egvs"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("layer", LAYERS)
 def test_layers_show_what_their_names_say(page: Page, session: Session, layer: str) -> None:
     page.ask(layer=layer, ring=0, frame=7)
@@ -165,6 +167,7 @@ def test_layers_show_what_their_names_say(page: Page, session: Session, layer: s
         assert f"{session.blindspots(site).whole.share:.1%} seen" in page.controls._legend.content
 
 
+@pytest.mark.slow
 def test_recorded_traffic_plays(page: Page) -> None:
     page.controls.plays.value = True
     page.ask(layer="replay", frame=39)
@@ -176,6 +179,7 @@ def test_recorded_traffic_plays(page: Page) -> None:
     assert any(body is not None for body in bodies)
 
 
+@pytest.mark.slow
 def test_settings_are_those_of_a_run_with_them(page: Page, session: Session, tmp_path: Path) -> None:
     pose = Pose(10.5, 12.25, 4.125, 33.0, -7.5, 2.0)
     settled(page, "pole_a", pose)
@@ -201,6 +205,7 @@ def test_settings_are_those_of_a_run_with_them(page: Page, session: Session, tmp
     assert page.rating == session.rate("pole_a", pose)
 
 
+@pytest.mark.slow
 def test_what_is_asked_while_a_setting_is_made_is_not_lost(page: Page, session: Session) -> None:
     pose = Pose(10.5, 12.25, 4.0)
     page.ask(settings=Settings(2.0, "egvs", frozenset()))
@@ -211,6 +216,7 @@ def test_what_is_asked_while_a_setting_is_made_is_not_lost(page: Page, session: 
     assert page.session.scenario.gamma == 2.0
 
 
+@pytest.mark.slow
 def test_nothing_is_held_of_poses_sensors_and_sessions_that_were(page: Page, session: Session) -> None:
     """What a page holds on to is bounded: one mount a scanner, one engine a session, messages of what is shown."""
     buffer = page._server._websock_server._broadcast_buffer
@@ -264,6 +270,7 @@ def test_who_is_gone_holds_nothing_any_more(page: Page) -> None:
     assert (page._gizmo.position + page.zero_m).tolist() == [10.5, 12, 4]
 
 
+@pytest.mark.slow
 def test_a_plan_moves_with_its_sensors(mini: Path, tmp_path: Path) -> None:
     placed = pipeline.place(pipeline.load(mini, ["placement.count=1"]), tmp_path / "run")
     served = Page(open_session(mini, (), tmp_path / "run"), tmp_path / "scratch")

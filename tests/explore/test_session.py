@@ -66,6 +66,7 @@ def test_a_moved_sensor_has_the_score_of_a_run_with_its_site_there(tmp_path: Pat
     assert moved.rank == row["rank"]
 
 
+@pytest.mark.slow
 def test_an_effect_that_is_idle_until_a_sensor_moves_acts_then(tmp_path: Path) -> None:
     folder = write_mini(tmp_path / "mini")
     world = json.loads((folder / "statics.geojson").read_text())
@@ -122,6 +123,7 @@ def in_periods(folder: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effect", [None, "effects.range_limit={rated_range_m=40,rated_reflectivity=0.1}"])
 def test_a_moved_sensor_has_the_scores_of_each_period(mini: Path, tmp_path: Path, effect: str | None) -> None:
     settings = [EVERY, *([effect] if effect else [])]

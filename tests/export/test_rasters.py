@@ -49,6 +49,7 @@ def test_the_tpog_from_above_is_that_of_the_artefact(located: Path, tmp_path: Pa
         assert values[39 - iy, ix] == pytest.approx(expected, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_seen_and_missed_add_up_to_the_entropy_and_to_the_score_s_share(located: Path, tmp_path: Path) -> None:
     name = "pole_a"
     export(located, "geotiff", out=tmp_path, sites=[name])

@@ -171,6 +171,7 @@ def test_lzf_by_hand(tmp_path: Path) -> None:
     assert read(tmp_path, "a.pcd", head + struct.pack("<II", len(body), 24) + body) == [[1, 1, 1], [1, 1, 1]]
 
 
+@pytest.mark.slow
 @quick
 @given(data=st.data())
 def test_compressed_equals_plain(tmp_path: Path, data: st.DataObject) -> None:
@@ -251,6 +252,7 @@ def las(folder: Path, name: str, n: int = 300) -> tuple[Path, Any]:
     return folder / name, whole * header.scales + header.offsets
 
 
+@pytest.mark.slow
 @pytest.mark.system
 @needs_laspy
 @pytest.mark.parametrize("name", ["a.las", "a.laz"])
@@ -261,6 +263,7 @@ def test_las_gives_scaled_coordinates_in_float64(tmp_path: Path, name: str) -> N
     assert dropped == 0
 
 
+@pytest.mark.slow
 @pytest.mark.system
 @needs_laspy
 @pytest.mark.parametrize("name", ["a.las", "a.laz"])
@@ -293,6 +296,7 @@ def test_las_with_a_damaged_header_is_refused(tmp_path: Path, at: int, value: by
         read_points(path, "")
 
 
+@pytest.mark.slow
 @pytest.mark.system
 @needs_laspy
 def test_laz_that_would_end_the_process_is_refused(tmp_path: Path) -> None:

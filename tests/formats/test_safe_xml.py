@@ -78,6 +78,7 @@ def hostile() -> Iterator[tuple[str, bytes, str]]:
     yield "a bomb without an end", gzip.compress(b"<net>" + ONE_MB * 3, mtime=0), told
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("data", "said"), [case[1:] for case in hostile()], ids=[case[0] for case in hostile()])
 def test_what_is_too_large_is_refused(tmp_path: Path, data: bytes, said: str) -> None:
     with pytest.raises(InputError) as refused:

@@ -49,6 +49,7 @@ FAULTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_faults_are_told(tmp_path: Path) -> None:
     """A program that does what it should not gets the verdict that it deserves."""
@@ -72,6 +73,7 @@ for fault, line in {FAULTS!r}.items():
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_killed_runs_come_to_the_same_bytes() -> None:
     """One that is killed with all its processes, and one that is killed alone."""
@@ -79,6 +81,7 @@ def test_killed_runs_come_to_the_same_bytes() -> None:
     assert (done.returncode, done.stdout) == (0, "2 kills: 2 same bytes\n"), done.stderr
 
 
+@pytest.mark.slow
 def test_a_seed_gives_the_same_mutants() -> None:
     """And never the file as it was."""
     for data in (b"", b"a,b\n1,2\n", gzip.compress(b"<a b='1'/>", mtime=0), bytes(range(256))):

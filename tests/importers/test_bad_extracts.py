@@ -24,6 +24,7 @@ BLOCK = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -260,6 +260,7 @@ def test_a_name_of_odd_characters_is_kept_and_comments_say_what_is_what(tmp_path
 # --- the same input, the same bytes --------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_same_bytes_elsewhere_packed_as_pbf_and_in_another_order(made: Made, tmp_path: Path) -> None:
     text = SMALL.read_text(encoding="utf-8")
     nodes = re.findall(r" <node .*?(?:</node>|/>)\n", text)
@@ -304,6 +305,7 @@ def test_an_empty_folder_is_filled_and_a_name_with_spaces_is_mended(tmp_path: Pa
     assert [p.name for p in tmp_path.iterdir()] == ["my junction"]
 
 
+@pytest.mark.slow
 def test_without_signals_the_largest_junction_is_taken_and_said(tmp_path: Path) -> None:
     plain = edited(tmp_path, (' <node id="1" ([^>]*)>.*?</node>', r' <node id="1" \1/>'))
     summary = osm.new(tmp_path / "plain", plain)
@@ -311,6 +313,7 @@ def test_without_signals_the_largest_junction_is_taken_and_said(tmp_path: Path) 
     assert any("no junction in the extract has signals" in note for note in summary.notes)
 
 
+@pytest.mark.slow
 def test_a_ring_that_does_not_close_is_counted(tmp_path: Path) -> None:
     deleted = ('<node id="1" ', '<node id="77" action="delete"/><node id="1" ')
     torn = edited(tmp_path, (' <way id="2102">.*?</way>', ""), deleted)

@@ -105,6 +105,7 @@ def test_what_comes_in_is_met_even_where_it_cannot_leave_as_wished() -> None:
     assert rates.tolist() == [[100, 0], [50, 0], [0, 0]]
 
 
+@pytest.mark.slow
 def test_a_smaller_cut_changes_neither_sites_nor_flows(tmp_path: Path) -> None:
     made = {r: osm.new(tmp_path / str(r), SMALL, surroundings_m=r) for r in (120.0, 150.0, None)}
     lengths = [summary.streets.lane_length_m for summary in made.values()]

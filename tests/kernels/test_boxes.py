@@ -230,6 +230,7 @@ def test_outside_by_one_ulp_and_inside_by_1_mm(axis, pitch):
         assert cells_of(box)
 
 
+@pytest.mark.slow
 def test_pitched_and_flat_agree_as_pitch_goes_to_zero():
     rng = np.random.default_rng(1)
     for _ in range(30):
@@ -475,6 +476,7 @@ def counted_by(kernels, frame, values, shape, voxel_m):
     return np.cumsum(steps, axis=0)[:-1].transpose(1, 2, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_the_touching_rule_fails_where_the_0_1_mm_rule_holds(real):
     frame, values, grid = real
@@ -546,6 +548,7 @@ def test_the_hunt_finds_nothing(make, seed, voxel_m):
     assert (row.cases, row.mismatches) == (400, 0)
 
 
+@pytest.mark.slow
 def test_the_hunts_quick_depth_is_the_oracles():
     rng = np.random.default_rng(7)
     for box in hunt.hostile(rng, 15, SHAPE, VOXEL_M):

@@ -253,6 +253,7 @@ def test_turning_round_changes_nothing(segment):
         assert walked(o, d, SHAPE, voxel_m) ^ walked(end, back, SHAPE, voxel_m) <= oracle.doubtful(o, d, SHAPE, voxel_m)
 
 
+@pytest.mark.slow
 @often
 @given(point, st.tuples(*[st.sampled_from([0.0, -0.0])] * 3), voxel_size)
 def test_a_segment_without_length_crosses_nothing(o, d, voxel_m):
@@ -320,6 +321,7 @@ origins = st.sampled_from(
 )
 
 
+@pytest.mark.slow
 @often
 @given(origins, st.tuples(metres, metres, metres), st.tuples(metres, metres, metres), voxel_size)
 def test_beams_in_the_world_frame(origin, start, beam, voxel_m):
@@ -401,6 +403,7 @@ def good_beams(n=400, seed=5):
     return np.array([2.0, 1.5, 1.0]), np.concatenate([lattice_ends, random_ends])
 
 
+@pytest.mark.slow
 def test_the_audit_is_quiet_on_good_beams():
     worst_sum, longest_gap_m, misplaced, doubled = audited(march, *good_beams())
     assert worst_sum < 1e-12
@@ -475,6 +478,7 @@ FAULTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", list(FAULTS))
 def test_a_fault_in_the_march_shows_in_the_corpus(fault):
     faulty = with_fault(*FAULTS[fault])
@@ -503,6 +507,7 @@ def test_the_hunt_finds_nothing():
     assert all(row.cases > 0 for row in rows)
 
 
+@pytest.mark.slow
 def test_the_hunts_quick_answers_are_the_oracles():
     """The hunt settles most segments in float64 with a margin, and asks the oracle about the rest; both must agree."""
     rng = np.random.default_rng(6)
@@ -515,6 +520,7 @@ def test_the_hunts_quick_answers_are_the_oracles():
     assert settled > 75
 
 
+@pytest.mark.slow
 def test_the_hunts_count_of_fragile_beams_is_the_oracles():
     rng = np.random.default_rng(7)
     shape = np.array(SHAPE, np.int64)

@@ -95,6 +95,7 @@ def test_slivers_and_degenerate_triangles(a, b, share, width, aside):
     check_triangle((a, b, c))
 
 
+@pytest.mark.slow
 @often
 @given(corner, st.sampled_from([1e-2, 1e-3, 1e-4, 1e-6]), st.tuples(corner, corner))
 def test_tiny_triangles(a, size, others):
@@ -119,6 +120,7 @@ def test_tiny_triangles_at_a_corner(size):
         )
 
 
+@pytest.mark.slow
 def test_long_triangles():
     rng = np.random.default_rng(1)
     for _ in range(60):
@@ -126,6 +128,7 @@ def test_long_triangles():
         check_triangle(np.concatenate([inner, rng.uniform(-200, 200, (2, 3))]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("voxel_m", [0.1, 0.3])
 def test_other_voxel_sizes(voxel_m):
     rng = np.random.default_rng(2)

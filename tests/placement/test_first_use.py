@@ -33,6 +33,7 @@ def test_help_names_the_tables_of_the_scenario(egvs) -> None:
     assert "[placement.refine]" in " ".join(text.replace("│", " ").split())
 
 
+@pytest.mark.slow
 def test_a_plan_asked_for_by_options_stays_in_the_report_of_the_next_run(few: Path, tmp_path: Path, egvs) -> None:
     out = tmp_path / "out"
     egvs("run", few, "--out", out)
@@ -106,6 +107,7 @@ def _curve(text: str) -> list[list[str]]:
 HALVES = 'traffic.periods=[{name="a", length_s=12, weight=3}, {name="b", begin_s=12, length_s=8}]'
 
 
+@pytest.mark.slow
 def test_bars_of_the_worst_period_are_shares_already(few: Path, tmp_path: Path, egvs, monkeypatch) -> None:
     steps = []
     draw = placement.drawing.curve

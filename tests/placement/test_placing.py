@@ -61,6 +61,7 @@ def read(out: Path) -> tuple[list[dict], list[dict], dict]:
     return rows.to_pylist(), curve.to_pylist(), about["plan"]
 
 
+@pytest.mark.slow
 def test_the_exact_plan_is_the_best_of_all_subsets_to_the_last_bit(many: Path, out: Path, egvs) -> None:
     for count in (1, 2, 3):
         code, text, error = egvs("place", many, "--out", out, "--count", count, "--exact")
@@ -113,6 +114,7 @@ def test_shares_of_beams_count_up_to_gamma(effect: str, many: Path, out: Path) -
     assert joint.value == pytest.approx(float((entropy * np.minimum(hits, scenario.gamma)).sum()), rel=1e-12)
 
 
+@pytest.mark.slow
 def test_what_is_written_adds_up(many: Path, out: Path, egvs) -> None:
     code, _, error = egvs("place", many, "--out", out, "--count", 3)
     assert code == 0, error
@@ -310,6 +312,7 @@ def test_the_report_shows_the_plan_until_something_changes(many: Path, out: Path
     assert "Which poles together?" not in (out / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_a_plan_that_was_altered_is_told(many: Path, out: Path, egvs) -> None:
     egvs("run", many, "--out", out)
     egvs("place", many, "--out", out, "--count", 2)
@@ -332,6 +335,7 @@ def test_threads_and_kept_scans_change_no_byte(many: Path, out: Path, egvs) -> N
     assert (out / "one" / "placement.parquet").read_bytes() == (out / "two" / "placement.parquet").read_bytes()
 
 
+@pytest.mark.slow
 def test_the_joint_score_from_python(many: Path, out: Path) -> None:
     scenario = pipeline.load(many)
     joint = pipeline.JointScore.of(scenario, out)

@@ -429,6 +429,7 @@ def test_no_cap(tmp_path):
     json.dumps(inputs_of(report, about, out).to_json(), allow_nan=False)
 
 
+@pytest.mark.slow
 def test_no_record_no_costs(tmp_path):
     about, out = finished(tmp_path, record=False)
     read = Reader(page(about, out))
@@ -451,6 +452,7 @@ def choices(text):
     return json.loads(re.search(r'id="site-data">(.*?)</script>', text, re.DOTALL).group(1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "is_coarse"), [(40, False), (41, True)])
 def test_every_site_can_be_chosen_with_larger_pixels_where_there_are_many(tmp_path, monkeypatch, count, is_coarse):
     monkeypatch.setattr(site_views, "_COARSE_PIXELS", 100)
@@ -643,6 +645,7 @@ def test_a_study_that_was_replaced_is_named_by_verify(mini, tmp_path, egvs):
     assert "report.html shows accuracy.png, which was replaced since" in printed
 
 
+@pytest.mark.slow
 def test_a_damaged_study_is_named(mini, tmp_path, egvs):
     out = tmp_path / "out"
     assert egvs("accuracy", mini, "--out", out, "--budget", "0.001s")[0] == 0

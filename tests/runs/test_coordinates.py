@@ -189,6 +189,7 @@ def test_the_report_says_where_the_sites_are(tmp_path: Path) -> None:
     assert f"{lon:.6f}" in page
 
 
+@pytest.mark.slow
 def test_a_new_crs_makes_the_sites_stand_elsewhere(tmp_path: Path) -> None:
     """Stages that read degrees run again when the frame is another; those that do not know it are left."""
     folder = moved_mini(tmp_path / "mini", to_degrees, None)

@@ -168,6 +168,7 @@ def test_artefacts_and_what_becomes_one_replace_links(mini: Path, tmp_path: Path
     assert not [path for path in out.iterdir() if path.is_symlink()]
 
 
+@pytest.mark.slow
 def test_a_gamma_without_bound_is_json_and_comes_back(mini: Path, tmp_path: Path, egvs) -> None:
     def no_constant(name: str) -> float:
         raise AssertionError(f"{name} is no JSON")
@@ -225,6 +226,7 @@ def test_names_are_no_markup(mini: Path, tmp_path: Path, egvs) -> None:
     assert "best [x] :car:; worst [red]S1" in error
 
 
+@pytest.mark.slow
 def test_another_score_that_is_0_everywhere_is_told(mini: Path, tmp_path: Path, egvs) -> None:
     settings = ("--set", "score.rank_by='seen_well'", "--set", "score.gamma=0")
     code, printed, error = egvs("run", mini, "--out", tmp_path / "out", *settings)

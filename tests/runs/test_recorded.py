@@ -104,6 +104,7 @@ def test_the_run_that_the_message_asks_for_mends_it(runs, out: Path) -> None:
     assert {name: contents(out)[name] for name in READ_BY} == {name: contents(runs[1])[name] for name in READ_BY}
 
 
+@pytest.mark.slow
 def test_stages_one_by_one_still_go_on_from_what_lies_there(runs, tmp_path: Path, egvs) -> None:
     scenario, made, _ = runs
     for verb in ("statics", "scan", "traffic", "tpog", "score", "report"):

@@ -53,6 +53,7 @@ def test_what_one_machine_made_another_one_fetches(
     assert set(states(scenario, other / "again").values()) == {"fetched"}  # from this machine's folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", ["bytes", "missing", "record", "climbs"])
 def test_what_is_damaged_there_is_made_again(
     damage: str, mini: Path, tmp_path: Path, shared: Any, monkeypatch: pytest.MonkeyPatch

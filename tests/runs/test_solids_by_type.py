@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import pyarrow.parquet as pq
+import pytest
 
 from tests.conftest import BUILDING, collection, feature
 
@@ -23,6 +24,7 @@ def scores(folder: Path) -> list[tuple[float, int]]:
     return list(zip(table["egvs"].to_pylist(), table["rank"].to_pylist(), strict=True))
 
 
+@pytest.mark.slow
 def test_the_ranking_of_a_poly_xml_is_that_of_footprints(mini: Path, tmp_path: Path, egvs) -> None:
     house = feature({"type": "Polygon", "coordinates": BUILDING}, height_m=6)
     (mini / "statics.geojson").write_text(collection(house), encoding="utf-8")

@@ -146,6 +146,7 @@ def test_a_changed_and_a_former_setting(done: tuple[pipeline.Scenario, Path]) ->
     assert digests(out) == before
 
 
+@pytest.mark.slow
 def test_a_file_that_the_kept_stage_does_not_have_goes(mini: Path, tmp_path: Path) -> None:
     """Hits of sites are kept by one setting, and not by the other."""
     plain, seen = pipeline.load(mini), pipeline.load(mini, ['score.keep_visibility="all"'])
@@ -273,6 +274,7 @@ def test_several_at_once_make_every_stage_once(mini: Path, tmp_path: Path, store
     assert len(assert_whole(store)) == len(STAGES)
 
 
+@pytest.mark.slow
 def test_who_comes_second_waits_and_takes_it(done: tuple[pipeline.Scenario, Path], tmp_path: Path, store: Path) -> None:
     scenario, out = done
     kept = Store(store)
@@ -463,6 +465,7 @@ CHANGED_LINES = {
 }
 
 
+@pytest.mark.slow
 def test_one_changed_line_makes_what_depends_on_it_again(
     mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -112,6 +112,7 @@ def test_a_changed_setting_runs_what_depends_on_it(
     assert digests(out) == digests(fresh)  # nothing of the earlier run shows
 
 
+@pytest.mark.slow
 def test_scoring_again_casts_nothing(done: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     mini, out = done
     casts = []
@@ -137,6 +138,7 @@ def test_threads_change_no_byte(done: tuple[Path, Path], tmp_path: Path) -> None
         assert digests(other) == digests(out)
 
 
+@pytest.mark.slow
 def test_verify_passes_elsewhere_and_names_an_altered_artefact(done: tuple[Path, Path], tmp_path: Path, egvs) -> None:
     mini, out = done
     moved, source = tmp_path / "elsewhere" / "run", tmp_path / "elsewhere" / "scenario"
@@ -205,6 +207,7 @@ def test_a_record_that_was_damaged_at_any_depth_is_refused(done: tuple[Path, Pat
             assert "remove it and run again" in said
 
 
+@pytest.mark.slow
 def test_a_single_stage_with_other_settings_leaves_no_mixed_record(done: tuple[Path, Path], egvs) -> None:
     mini, out = done
     assert egvs("score", mini, "--out", out, "--set", "score.gamma=7", "--set", "sites.yaw_deg=5")[0] == 0
@@ -240,6 +243,7 @@ def test_editor_schema_is_not_stale() -> None:
     )
 
 
+@pytest.mark.slow
 def test_another_seed_in_the_same_folder_changes_no_byte_of_what_is_not_random(
     mini: Path, tmp_path: Path, egvs
 ) -> None:
@@ -307,6 +311,7 @@ def test_a_record_of_an_earlier_version_is_one_of_nothing(done: tuple[Path, Path
     assert not {"effects", "said"} & json.loads((out / "run.json").read_text()).keys()
 
 
+@pytest.mark.slow
 def test_the_best_sites_alone_are_printed_and_the_others_counted(mini: Path, tmp_path: Path, egvs) -> None:
     rows = [f"p{i:02d},{2 + i},12,{3 + i / 8}" for i in range(9)]
     (mini / "sites.csv").write_text("\n".join(["site,x_m,y_m,z_m", *rows]) + "\n")

@@ -36,6 +36,7 @@ def test_it_goes_through_the_gammas_of_the_study() -> None:
     assert hidden == {0.125: 0.45, 0.25: 1.0, 0.5: 2.2, 1.0: 5.0, 2.0: 11.0}
 
 
+@pytest.mark.slow
 @given(st.floats(0.01, 100), st.booleans())
 def test_two_digits_and_rising(voxel_m: float, occlusion: bool) -> None:
     found = gamma_for(voxel_m, moving_occlusion=occlusion)

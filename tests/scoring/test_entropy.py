@@ -37,6 +37,7 @@ def test_entropy_is_correctly_rounded(frames):
         assert abs(found - true) <= 4e-16 * true
 
 
+@pytest.mark.slow
 @settings(derandomize=True, max_examples=300, deadline=None)
 @given(st.data())
 def test_entropy_of_any_count(data):

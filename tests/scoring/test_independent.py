@@ -26,7 +26,7 @@ from pipeline.world.mesh import World, read_ply, write_ply
 from tests.oracles import cast
 from tests.stages import run_stage
 
-pytestmark = pytest.mark.system  # SUMO makes the traffic
+pytestmark = [pytest.mark.system, pytest.mark.slow]  # SUMO makes the traffic
 
 SHORT = ("traffic.frames=60", "tpog.blocks=3", "traffic.frame_period_s=1")
 SITES = {"nishishinjuku": "c05", "ingolstadt": "k02"}

@@ -78,6 +78,7 @@ def test_the_mix_is_exact(split: Path, tmp_path: Path) -> None:
     assert found == wanted
 
 
+@pytest.mark.slow
 def test_each_period_is_scored_as_if_it_were_alone(split: Path, tmp_path: Path) -> None:
     pipeline.run(pipeline.load(split), tmp_path / "both")
     by_period = of(read_scores_by_period(tmp_path / "both" / "scores_by_period.parquet"))
@@ -94,6 +95,7 @@ def test_each_period_is_scored_as_if_it_were_alone(split: Path, tmp_path: Path) 
         assert (theirs.counts == own.counts).all()
 
 
+@pytest.mark.slow
 def test_frames_stand_one_after_another_and_weights_need_no_new_traffic(split: Path, tmp_path: Path) -> None:
     pipeline.run(pipeline.load(split), tmp_path)
     table, about = tables.read(tmp_path / "trajectories.parquet", "trajectories")
@@ -108,6 +110,7 @@ def test_frames_stand_one_after_another_and_weights_need_no_new_traffic(split: P
     assert read_tpog(tmp_path / "tpog.parquet").frames == 2 * 24 + 3 * 16
 
 
+@pytest.mark.slow
 def test_a_run_with_periods_is_the_same_again_and_shows_them(split: Path, tmp_path: Path, egvs) -> None:  # type: ignore[no-untyped-def]
     code, printed, told = egvs("run", split, "--out", tmp_path / "out")
     assert code == 0
@@ -222,6 +225,7 @@ def test_a_period_whose_best_site_is_another_is_told() -> None:
     assert period_scores.disagreements(["a"], judged((9.0, 0.0, math.nan)), named) == []
 
 
+@pytest.mark.slow
 def test_periods_disagree_without_standard_errors_too(
     split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -271,6 +275,7 @@ def test_the_world_frame_counts_where_a_period_alone_is_a_finished_file(
     assert traffic.inputs(Workspace(scenario, split)).settings["world_frame"] == "here"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [

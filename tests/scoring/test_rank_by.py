@@ -81,6 +81,7 @@ def test_sites_rank_by_the_score_that_is_named(mini: Path, tmp_path: Path, name:
     assert all(0.5 <= row["beats_next"] <= 1.0 for row in ranked)
 
 
+@pytest.mark.slow
 def test_what_ranks_changes_no_score(mini: Path, tmp_path: Path) -> None:
     (mini / "sites.csv").write_text(SITES)
     plain, other = run(mini, tmp_path / "a"), run(mini, tmp_path / "b", "score.rank_by=points_on_target", ALL)
@@ -124,6 +125,7 @@ def test_without_standard_errors_there_are_none(mini: Path, tmp_path: Path) -> N
         assert not [name for name in rows["pole_a"] if name.endswith(("_se", "beats_next"))]
 
 
+@pytest.mark.slow
 def test_a_mix_of_periods_weighs_vehicles_with_and_without_errors(mini: Path, tmp_path: Path) -> None:
     periods = 'traffic.periods=[{name="a", length_s=12, weight=3}, {name="b", begin_s=12, length_s=8}]'
     rank = ("score.rank_by=seen_well", periods)
@@ -224,6 +226,7 @@ def test_traffic_without_a_vehicles_centre_is_told(mini: Path, tmp_path: Path) -
     assert math.isnan(values[0])
 
 
+@pytest.mark.slow
 def test_terminal_and_report_show_the_score_that_ranks(mini: Path, tmp_path: Path, egvs) -> None:  # type: ignore[no-untyped-def]
     code, printed, _ = egvs("run", mini, "--out", tmp_path, "--set", "score.rank_by=seen_well")
     assert code == 0

@@ -201,6 +201,7 @@ def test_altered_artefacts_are_refused(mini, tmp_path, artefact, change, message
         run_stage(score, load(mini), tmp_path)
 
 
+@pytest.mark.slow
 def test_counts_may_reach_the_number_of_frames(mini, tmp_path):
     run(mini, tmp_path)
     rewrite(

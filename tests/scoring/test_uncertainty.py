@@ -176,6 +176,7 @@ def occupied(runs: int, chains: int, frames: int, rng: np.random.Generator) -> t
     return states, p * share
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("blocks", "frames"), [(10, 2400), (50, 2400), (5, 1600)])
 def test_intervals_cover_the_truth_as_often_as_they_say(
     blocks: int, frames: int, monkeypatch: pytest.MonkeyPatch
@@ -244,6 +245,7 @@ def test_a_block_that_does_not_exist_is_refused(mini: Path, tmp_path: Path) -> N
         LeaveOut.of(path, pipeline.read_tpog(path))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", ["score.standard_error=false", "tpog.blocks=1"])
 def test_without_errors_the_scores_are_the_same(mini: Path, tmp_path: Path, change: str) -> None:
     pipeline.run(pipeline.load(mini), tmp_path / "with")

@@ -22,6 +22,7 @@ OWN = {"fid": [1, 2], "owner": ["City, east", "Grid Ltd."], "note": [None, 'by t
 KNOWN = ("site", "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg", "sensor", "points")
 
 
+@pytest.mark.slow
 def test_columns_of_a_csv_arrive_in_the_scores_with_their_types(mini: Path, tmp_path: Path, egvs) -> None:
     plain = tmp_path / "plain"
     assert egvs("run", mini, "--out", plain)[0] == 0
@@ -37,6 +38,7 @@ def test_columns_of_a_csv_arrive_in_the_scores_with_their_types(mini: Path, tmp_
     assert egvs("verify", tmp_path / "own")[0] == 0
 
 
+@pytest.mark.slow
 def test_a_note_that_changes_is_in_the_next_scores(mini: Path, tmp_path: Path, egvs) -> None:
     for note in ("first", "second"):
         rows = f"site,x_m,y_m,z_m,note\npole_a,10,12,3,{note}\npole_b,30.5,-12,3,{note}\n"

@@ -75,6 +75,7 @@ def test_a_crs_in_metres_is_taken(mini: Path, crs: object) -> None:
     assert places(of_geojson(mini, text)) == [("a", 0, 1, 2)]
 
 
+@pytest.mark.slow
 def test_a_run_from_geojson_scores_what_a_run_from_csv_does(mini: Path, tmp_path: Path) -> None:
     settings = ["score.standard_error=false"]
     pipeline.run(pipeline.load(mini, settings), tmp_path / "csv")

@@ -212,6 +212,7 @@ def test_an_interrupted_study_goes_on(mini: Path, tmp_path: Path, few: None, mon
     assert not list((tmp_path / "out" / "accuracy").glob(".work-*"))
 
 
+@pytest.mark.slow
 def test_a_budget_leaves_settings_out_and_names_them(mini: Path, tmp_path: Path, egvs) -> None:
     code, printed, said = egvs("accuracy", mini, "--out", tmp_path / "out", "--budget", "0.001s")
     assert code == 0, said
@@ -231,6 +232,7 @@ def test_without_a_longer_reference_simulated_traffic_is_judged_by_its_standard_
     assert study.rows[0].judged == study.rows[0].error_se > study.tolerance
 
 
+@pytest.mark.slow
 def test_a_setting_that_fails_is_named_and_the_rest_goes_on(
     mini: Path, tmp_path: Path, few: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -248,6 +250,7 @@ def test_a_setting_that_fails_is_named_and_the_rest_goes_on(
     assert (again.rows, again.skipped) == (study.rows, study.skipped)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("standard_error", ["true", "false"])
 def test_the_score_that_ranks_is_studied(mini: Path, tmp_path: Path, few: None, standard_error: str) -> None:
     sets = ["score.rank_by=seen_well", f"score.standard_error={standard_error}"]
@@ -271,6 +274,7 @@ def test_seeds_are_for_the_egvs_alone(junction: Path, tmp_path: Path) -> None:
         study_of(junction, ["score.rank_by=seen_well"], tmp_path / "out", seeds=2)
 
 
+@pytest.mark.slow
 def test_a_setting_that_is_no_scenario_is_named_and_the_rest_goes_on(
     mini: Path, tmp_path: Path, few: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -305,6 +309,7 @@ def test_knobs_of_another_method_are_not_turned(mini: Path) -> None:
     assert "without moving_occlusion" in names
 
 
+@pytest.mark.slow
 def test_a_study_goes_on_without_warming_up_for_what_it_cannot_afford(
     mini: Path, tmp_path: Path, few: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -82,6 +82,7 @@ def test_the_change_that_is_expected_is_the_one_that_a_run_finds(mini: Path, tmp
     assert found["foliage"].change == ""
 
 
+@pytest.mark.slow
 def test_trees_and_long_trucks_in_the_scene_are_seen(mini: Path, tmp_path: Path) -> None:
     crown = feature({"type": "Point", "coordinates": [12, 9]}, kind="tree_crown", height_m=5, base_m=1, radius_m=1.5)
     far = feature({"type": "Point", "coordinates": [900, 9]}, kind="tree_crown", height_m=5, base_m=1, radius_m=1.5)
@@ -101,6 +102,7 @@ def test_trees_and_long_trucks_in_the_scene_are_seen(mini: Path, tmp_path: Path)
     assert found["articulated"].change.startswith("100.0% of the boxes in the last run get parts")
 
 
+@pytest.mark.slow
 def test_traffic_of_another_scenario_is_not_tried_on(mini: Path, tmp_path: Path, egvs) -> None:
     out = tmp_path / "out"
     code, printed, _ = egvs("effects", mini, "--out", out)
@@ -120,6 +122,7 @@ def test_a_named_effect_is_on_with_its_parameters(mini: Path) -> None:
     assert "rate_mm_h = 20" in why
 
 
+@pytest.mark.slow
 def test_an_effect_that_cannot_change_anything_is_skipped_and_the_run_says_so(mini: Path, tmp_path: Path, egvs) -> None:
     named = ("effects.rain.rate_mm_h=0", "effects.foliage.leaf_area_density=1")
     found = states(mini, *named)
@@ -160,6 +163,7 @@ def test_an_ablation_of_nothing_is_refused(mini: Path, egvs, arguments: list[str
     assert message in said
 
 
+@pytest.mark.slow
 def test_a_scenario_may_extend_another(mini: Path, tmp_path: Path, egvs) -> None:
     wet = tmp_path / "wet"
     wet.mkdir()

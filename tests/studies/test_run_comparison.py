@@ -60,6 +60,7 @@ def test_a_run_beside_itself_agrees_and_differs_in_nothing(two: tuple[Path, Path
     assert (found.differences, found.notes) == ((), ())
 
 
+@pytest.mark.slow
 def test_runs_agree_by_the_scores_that_rank_them(mini: Path, tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]
     rows = "".join(f"p{n},{4 + 7 * n},{12 - 24 * (n % 2)},{2 + n}\n" for n in range(5))
     (mini / "sites.csv").write_text(f"site,x_m,y_m,z_m\n{rows}")
@@ -139,6 +140,7 @@ def test_tables_fit_the_terminal(width: int, runs: int, monkeypatch: pytest.Monk
     assert any("longitude" in line for line in header) == (width == 190)
 
 
+@pytest.mark.slow
 def test_a_row_that_a_run_lacks_is_told_once_and_by_its_name(
     mini: Path,
     tmp_path: Path,
@@ -157,6 +159,7 @@ def test_a_row_that_a_run_lacks_is_told_once_and_by_its_name(
     assert "traffic.kinds[car].length_m" in printed
 
 
+@pytest.mark.slow
 def test_an_effect_that_a_run_lacks_is_told_by_its_parameters_alone(mini: Path, tmp_path: Path) -> None:
     folders = tmp_path / "plain", tmp_path / "rain"
     for folder, named in zip(folders, ([], ["effects.rain.rate_mm_h=30"]), strict=True):

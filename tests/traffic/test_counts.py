@@ -39,6 +39,7 @@ def turn(start, end, per_hour, kind=""):
     return {"from_edge": f"{start}0A0", "to_edge": f"A0{end}0", "per_hour": per_hour, "kind": kind}
 
 
+@pytest.mark.slow
 def test_turning_movements_an_edge_and_a_kind_are_met(cross, tmp_path):
     rows = [
         turn("left", "right", 300), turn("left", "top", 80), turn("bottom", "left", 120),
@@ -74,6 +75,7 @@ def test_the_same_seed_gives_the_same_traffic(cross, tmp_path):
     assert routes(1, "a") == routes(1, "b") != routes(2, "c")
 
 
+@pytest.mark.slow
 def test_counts_that_the_lanes_cannot_carry_are_told(cross, tmp_path):
     result = run_stage(traffic, counted(cross, [turn("left", "top", 9000)], frames=300), tmp_path)
     warning, waiting = result["warnings"]
@@ -82,6 +84,7 @@ def test_counts_that_the_lanes_cannot_carry_are_told(cross, tmp_path):
     assert re.search(r"1 of 1 counts are missed .*left0A0 to A0top0: \d+(\.\d)? for 9000", warning["found"])
 
 
+@pytest.mark.slow
 def test_frames_far_apart_change_no_rate(cross, tmp_path):
     """SUMO ends with the last frame: 19 minutes of 20 are simulated, and the rate is that of these."""
     lasting = {"frames": 20, "frame_period_s": 60.0, "warmup_s": 60.0}

@@ -67,6 +67,7 @@ def recorded(scene, out, *acting):
         return tally.to_json(rows.window.period_ms / 1000.0), reports, rows.summary()
 
 
+@pytest.mark.slow
 def test_an_extension_adds_traffic_that_does_not_count_and_changes_boxes(town, tmp_path):
     scene = scenario(town, network="net.xml", **SMALL)
     counts, reports, summary = recorded(scene, tmp_path, Guests(EffectParameters()))

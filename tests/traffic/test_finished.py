@@ -50,6 +50,7 @@ def vtypes(mini: Path, *files: str) -> list[str]:
 # ---- how long
 
 
+@pytest.mark.slow
 def test_without_frames_all_of_a_file_is_taken(mini: Path, tmp_path: Path, egvs) -> None:
     assert egvs("run", mini, "--out", tmp_path / "said")[0] == 0
     code, printed, said = egvs("run", unsaid(mini), "--out", tmp_path / "unsaid")
@@ -61,6 +62,7 @@ def test_without_frames_all_of_a_file_is_taken(mini: Path, tmp_path: Path, egvs)
     assert egvs("verify", tmp_path / "unsaid")[0] == 0
 
 
+@pytest.mark.slow
 def test_what_fills_no_block_is_left_over_and_told(mini: Path, tmp_path: Path, egvs) -> None:
     code, printed, said = egvs("run", unsaid(mini, ("blocks = 4", "blocks = 3")), "--out", tmp_path / "three")
     assert code == 0, said
@@ -228,6 +230,7 @@ def test_sizes_are_missed_by_the_check(mini: Path, egvs) -> None:
 # ---- on which roads
 
 
+@pytest.mark.slow
 def test_roads_beside_a_file_are_the_networks(mini: Path, tmp_path: Path, egvs) -> None:
     (mini / "net.net.xml").write_text(net_xml())
     roads = ["--set", "traffic.roads='net.net.xml'"]

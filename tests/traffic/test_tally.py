@@ -47,6 +47,7 @@ def footprint(found, i):
     return shapely.Polygon([(found.x_m[i] + cos * u - sin * v, found.y_m[i] + sin * u + cos * v) for u, v in corners])
 
 
+@pytest.mark.slow
 @given(st.integers(0, 2**32 - 1))
 def test_overlaps_are_those_that_polygons_find(seed):
     rng = np.random.default_rng(seed)

@@ -119,6 +119,7 @@ def over_traci(scene, out, folder, *flags):
             process.kill()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("patient")
 def test_traci_records_the_same_bytes(town, recorded, tmp_path):
     result, _, _, out = recorded
@@ -285,6 +286,7 @@ def test_patience_is_two_cycles_and_three_minutes_at_least():
     assert recording.patience_s(120) == 240
 
 
+@pytest.mark.slow
 def test_more_vehicles_than_the_town_holds_fail_with_the_numbers(town, tmp_path):
     keys = SMALL | {"vehicles": 200, "frames": 40}
     with pytest.raises(
@@ -309,6 +311,7 @@ NODES = """<nodes><node id="a" x="0" y="0" z="0"/><node id="b" x="400" y="0" z="
 EDGES = """<edges><edge id="ab" from="a" to="b" numLanes="2"/><edge id="bc" from="b" to="c" numLanes="2"/></edges>"""
 
 
+@pytest.mark.slow
 def test_uphill_boxes_are_pitched_and_stand_on_the_road(tmp_path):
     (tmp_path / "n.nod.xml").write_text(NODES)
     (tmp_path / "e.edg.xml").write_text(EDGES)
@@ -386,6 +389,7 @@ def test_inputs_depend_on_what_the_stage_reads_and_on_nothing_else(town, tmp_pat
     assert about(town, frames=10) != about(tmp_path / "elsewhere", frames=10)
 
 
+@pytest.mark.slow
 def test_importing_the_stage_loads_no_tool_of_sumo():
     code = "import sys, pipeline.stages.traffic; print([m for m in ('sumolib', 'traci') if m in sys.modules])"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

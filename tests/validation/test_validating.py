@@ -83,6 +83,7 @@ def test_traffic_that_was_seen_is_told(whole):
     assert any(its["place"] == "scenario.toml: traffic.fcd" for its in about["warnings"])  # wherever that is
 
 
+@pytest.mark.slow
 def test_twice_the_same_bytes(whole, middle, tmp_path):
     mini, out, _ = whole
     elsewhere = shutil.copytree(mini, tmp_path / "moved" / mini.name)  # the store of this test is empty

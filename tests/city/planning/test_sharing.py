@@ -43,6 +43,7 @@ def every_choice(of: list[Options]) -> list[tuple[float, int, float]]:
     return [(sum(p.value for p in c), sum(p.count for p in c), sum(p.cost for p in c)) for c in chosen]
 
 
+@pytest.mark.slow
 @given(junctions(), st.integers(1, 12))
 def test_a_count_is_shared_as_well_as_can_be(of: list[Options], count: int) -> None:
     shared = sharing.by_count(of, count)

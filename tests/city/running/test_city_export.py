@@ -16,6 +16,7 @@ from pipeline.export.exporting import export
 pytestmark = pytest.mark.usefixtures("here")
 
 
+@pytest.mark.slow
 def test_a_citys_run_is_exported(city: City, tmp_path: Path) -> None:
     placed = city_place.place(city, tmp_path / "out", count=2)
     (path,) = export(tmp_path / "out", "gpkg").paths
@@ -31,6 +32,7 @@ def test_a_citys_run_is_exported(city: City, tmp_path: Path) -> None:
         assert [row["rank"] for row in csv.DictReader(file)] == ["1", "2"]
 
 
+@pytest.mark.slow
 def test_what_cannot_be_exported_of_a_city(city: City, tmp_path: Path) -> None:
     out = city_run.run(city, tmp_path / "out").out
     with pytest.raises(InputError, match=r"--to geotiff: .* is a city's run; a junction's"):

@@ -56,6 +56,7 @@ def test_no_choice_of_sites_is_better(city: City, tmp_path: Path, count: int) ->
     assert f"The plan: {len(rows)} sensors" in html
 
 
+@pytest.mark.slow
 def test_a_plan_stands_on_the_page_until_its_junctions_change(city: City, tmp_path: Path) -> None:
     city_place.place(city, tmp_path / "out", count=2)
     page = tmp_path / "out" / "city.html"
@@ -66,6 +67,7 @@ def test_a_plan_stands_on_the_page_until_its_junctions_change(city: City, tmp_pa
     assert "The plan:" not in page.read_text()
 
 
+@pytest.mark.slow
 def test_a_budget_needs_costs_and_is_kept(city: City, tmp_path: Path) -> None:
     with pytest.raises(Exception, match="nothing says what pole_a costs"):
         city_place.place(city, tmp_path / "out", budget=20.0)
@@ -76,6 +78,7 @@ def test_a_budget_needs_costs_and_is_kept(city: City, tmp_path: Path) -> None:
     assert not city_place.place(city, tmp_path / "out", budget=11.0, sets=costs).plan.sensors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("score", ["expected_detections", "coverage"])
 def test_shares_count_by_the_vehicles_that_are_there(city: City, tmp_path: Path, score: str) -> None:
     placed = city_place.place(city, tmp_path / "out", count=1, sets=[f'score.rank_by="{score}"'])
@@ -85,6 +88,7 @@ def test_shares_count_by_the_vehicles_that_are_there(city: City, tmp_path: Path,
     assert sensor.gain == pytest.approx(first.gain, rel=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("asked", "message"),
     [

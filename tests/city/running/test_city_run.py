@@ -40,6 +40,7 @@ def test_a_city_run_is_its_junctions_alone(city: City, tmp_path: Path, monkeypat
     assert files_of(again.out) == first
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("here")
 def test_scores_are_one_table_and_junctions_are_ranked(city: City, tmp_path: Path) -> None:
     sites = city.folder / "junctions" / "east" / "sites.csv"
@@ -64,6 +65,7 @@ def test_scores_are_one_table_and_junctions_are_ranked(city: City, tmp_path: Pat
     assert "http" not in re.sub(r"arXiv|http://www.w3.org/2000/svg", "", html)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("here")
 def test_one_junction_alone_is_chosen(city: City, tmp_path: Path) -> None:
     city_run.run(city, tmp_path / "out")
@@ -76,6 +78,7 @@ def test_one_junction_alone_is_chosen(city: City, tmp_path: Path) -> None:
         city_run.run(city, tmp_path / "out", only=["north"])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("here")
 def test_junctions_that_rank_by_different_scores_are_refused(city: City, tmp_path: Path) -> None:
     path = city.folder / "junctions" / "east" / "scenario.toml"

@@ -70,6 +70,7 @@ def test_small_junctions_are_the_junctions_run_alone(
     assert {its.made for its in again} == {()}
 
 
+@pytest.mark.slow
 def test_parts_that_were_lost_are_scored_again(
     jobs: list[Job], tmp_path: Path, store: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -83,6 +84,7 @@ def test_parts_that_were_lost_are_scored_again(
     assert_same(job, tmp_path / "alone")
 
 
+@pytest.mark.slow
 def test_one_bad_junction_stops_no_other(client: Any, jobs: list[Job]) -> None:
     (jobs[1].folder / "sites.csv").write_text("site,x_m,y_m,z_m\npole,ten,12,3\n")
     with pytest.raises(EgvsError) as refused:

@@ -75,6 +75,7 @@ def exactly(o, d, shape, voxel_m, weights):
     return hits
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("entry", SOUND, ids=[entry["name"] for entry in SOUND])
 def test_hostile_segment(entry):
     o, d, shape, voxel_m = in_voxels(entry)
@@ -137,6 +138,7 @@ def test_where_nothing_is_certain_it_says_so(shape, voxel_m, o):
     assert sure_march.crossed(o, np.array([3.3, 0.1, 0.2]), shape, near, np.empty(20, np.uint32)) == -1
 
 
+@pytest.mark.slow
 def test_digits_that_a_million_steps_cut_off_have_room():
     """Each step is nearly a digit too short, so y is wrong by some 1e-6 where it has just passed a plane: not certain.
     Without room for a whole digit a step, voxels on the wrong side of the plane would be listed."""
@@ -216,6 +218,7 @@ def crooked():
 CASES = [*(in_voxels(entry) for entry in SOUND if is_near(entry, False)), *crooked()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", list(FAULTS))
 def test_a_fault_shows(fault):
     faulty = with_fault(*FAULTS[fault])

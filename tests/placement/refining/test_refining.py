@@ -68,6 +68,7 @@ def test_a_plan_is_never_worth_less_than_it_was(mini: Path, settings: tuple[str,
     assert {pick.site.name for pick in placed.picks} == set(placed.curve_sites[-1])
 
 
+@pytest.mark.slow
 def test_the_score_is_that_of_candidates_that_hang_so(mini: Path) -> None:
     """Bit for bit: a scenario whose sites are the moved poses has the same plan of the same score without moving, and
     so has one with a sensor put back."""
@@ -113,6 +114,7 @@ def test_from_the_worst_corner_it_finds_what_a_fine_grid_finds(mini: Path) -> No
     assert placed.joint >= max(scores.values())
 
 
+@pytest.mark.slow
 def test_poses_that_cannot_be_are_counted_and_never_taken(mini: Path) -> None:
     """A polygon round the building: what is inside of it is no place."""
     polygon = "[[10, 3], [22, 3], [22, 13], [9, 13]]"
@@ -157,6 +159,7 @@ def test_a_candidate_that_sees_nothing_is_refused_before_it_moves(mini: Path) ->
         plan(mini, "placement.count=1")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("setting", "least_m"), [("placement.least_distance_m=2.5", 2.5), ("seed=7", 1.0)])
 def test_sensors_do_not_meet(mini: Path, setting: str, least_m: float) -> None:
     """Two poles drawn to one corner of a polygon; without a distance in the scenario poles stay 1 m apart."""
@@ -183,6 +186,7 @@ def test_the_same_bytes_twice_and_on_two_threads(mini: Path) -> None:
     assert written[0] == written[1] == written[2]
 
 
+@pytest.mark.slow
 def test_the_command_tells_what_moving_gained(mini: Path, egvs) -> None:
     out = mini / "run"
     assert egvs("run", mini, "--out", out)[0] == 0

@@ -136,6 +136,7 @@ def rules_for(count: int, cost: list[float], budget: float = np.inf) -> Rules:
     return Rules(count, budget, price, 0 * price, np.arange(n), (), np.zeros(n, dtype=bool), n, blank, 0.0)
 
 
+@pytest.mark.slow
 def test_many_cheap_ones_are_found_beside_a_dear_one_that_sees_more() -> None:
     """Greedy by gain alone takes the dear one and has nothing left; by gain per cost all the cheap ones."""
     hits = np.zeros((21, 23), dtype=int)

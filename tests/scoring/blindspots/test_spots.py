@@ -124,6 +124,7 @@ def slow_cells(box, roi):
     }
 
 
+@pytest.mark.slow
 @given(st.integers(0, 10_000))
 def test_counts_against_plain_python(seed):
     rng, small = np.random.default_rng(seed), Grid((100.0, 200.0, 0.0), 0.5, (25, 16, 8))

@@ -137,6 +137,7 @@ def test_recorded_traffic_has_a_map_alone(ran: tuple[Path, Path]) -> None:
     assert np.isfinite(site.share_missed).sum() == sum(row["by"] == "cell" for row in rows_of(out, "pole_a"))
 
 
+@pytest.mark.slow
 def test_the_switch_acts(ran: tuple[Path, Path], tmp_path: Path) -> None:
     off = loading.load(ran[0], ["score.blindspots=false"])
     pipeline.run(loading.load(ran[0]), tmp_path, jobs=1)
@@ -252,6 +253,7 @@ def test_a_file_that_is_cut_off_is_refused_by_the_report(ran: tuple[Path, Path],
     assert code == 2 and "blindspots.parquet: was altered or replaced" in " ".join(told.split())
 
 
+@pytest.mark.slow
 def test_many_sites_share_row_groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EGVS_STORE", "")  # which would hold the other's
     more = "".join(f"more_{i},{12 + i},9,3\n" for i in range(3))

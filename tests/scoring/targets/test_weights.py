@@ -73,6 +73,7 @@ def run(folder: Path, out: Path, *overrides: str) -> dict[str, dict[str, float]]
 WEST = "score.weights.zones.west={weight=4, polygon_m=[[0, -10], [16, -10], [16, 10], [0, 10]]}"
 
 
+@pytest.mark.slow
 def test_scores_of_a_run_are_weighted_means_and_so_are_their_errors(mini: Path, tmp_path: Path) -> None:
     plain, rows = run(mini, tmp_path / "plain"), run(mini, tmp_path / "run", WEST)
     scenario = loading.load(mini)
@@ -91,6 +92,7 @@ def test_scores_of_a_run_are_weighted_means_and_so_are_their_errors(mini: Path, 
     assert ratios == pytest.approx([ratios[0]] * 6) and ratios[0] >= 1.0  # widened alike, for the traffic's memory
 
 
+@pytest.mark.slow
 def test_a_weight_of_one_for_all_changes_nothing(mini: Path, tmp_path: Path) -> None:
     plain, one = run(mini, tmp_path / "a"), run(mini, tmp_path / "b", "score.weights.kinds.passenger=1")
     assert {site: set(row.items()) for site, row in one.items()} == {s: set(row.items()) for s, row in plain.items()}

@@ -64,6 +64,7 @@ def test_a_car_in_the_open_is_found(place, yaw, noise_m):
     assert overlaps(boxes, detector.detect(sweep)).min() > 0.7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "pose",
     [
@@ -146,6 +147,7 @@ def test_the_order_of_points_has_no_say():
     assert found.scores.tobytes() == again.scores.tobytes()
 
 
+@pytest.mark.slow
 def test_clusters_are_those_of_single_linkage():
     """A slow twin: squares within reach of each other, directly or over others, are one cluster."""
     random = np.random.default_rng(4)

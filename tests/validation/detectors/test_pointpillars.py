@@ -120,6 +120,7 @@ def test_the_shipped_model_says_how_it_was_made():
     assert about["curve"][-1]["ap_bev_r40_iou50"] > 0.5  # of held-out frames and poses
 
 
+@pytest.mark.slow
 def test_the_shipped_model_finds_the_cars_of_a_road(mini, tmp_path):
     """From both sites, with a sensor of the catalogue: every car with 100 points, to half a metre."""
     record = prepare(load(mini, ["sites.sensor=VLP-32C"]), tmp_path / "r", 10)

@@ -43,6 +43,7 @@ def test_one_finds_what_is_hidden_from_the_other():
     assert [overlaps(boxes[k : k + 1], alone[k]).min() > 0.7 for k in (0, 1)] == [True, True]
 
 
+@pytest.mark.slow
 def test_each_takes_off_its_own_background():
     still = [(3.0, 8.0, 1.3, 0.5, 2.0, 0.4), (-5.0, 18.0, 2.0, 2.0, 2.0, 0.0)]
     found, _ = fused([], [NEAR, FAR], still=still, noise_m=0.02)

@@ -147,6 +147,7 @@ def test_a_plan_that_was_altered(egvs, planned, change, message):
     assert message in _refused(egvs, mini, out, "--plan")
 
 
+@pytest.mark.slow
 def test_a_plan_of_another_scenario_or_of_another_world(egvs, planned, mini, tmp_path):
     _, out = planned
     other = mini.rename(mini.with_name("other"))
