@@ -12,7 +12,7 @@ run: $(VENV)/.installed
 test: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -m "not slow" --ignore=tests/validation/training
 
-# Sweeps, whole studies, kills: what takes more than a second or two each.
+# Sweeps, whole studies, browsers, kills: what takes more than some tenths of a second each.
 test-slow: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -m slow --ignore=tests/validation/training
 
