@@ -120,5 +120,5 @@ def test_tables_of_one_round_are_filled(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(casting, "_ROUNDS", 1)
     monkeypatch.setattr(savings, "REPEATS", 1)
     shares = [row[1] for row in casting.rows() if row[0].endswith("Embree alone")]
-    assert shares == ["1.00 x Embree alone"] * 2
+    assert shares == ["1.00 x Embree alone"] * 4
     assert savings._beams()[0][3]
