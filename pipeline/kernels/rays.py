@@ -166,10 +166,10 @@ def settle(nearest, owner, triangles, planes, o, beam, d, range_m, ranges, met, 
         n = beam[ray]
         dx, dy, dz = d[n, 0], d[n, 1], d[n, 2]
         t, sure = _plainly_met(planes, max(k, 0), ox, oy, oz, dx, dy, dz, range_m)
-        t = t if sure and k >= 0 else np.inf
+        t = t if sure & (k >= 0) else np.inf
         ranges[ray] = t
         _end(ray, t, dx, dy, dz, range_m, ends, returned)
-        if (not sure and k != -1) or k < -1:
+        if (k != -1) & ((k < -1) | (not sure)):
             if k >= 0:
                 ranges[ray], _, _ = meet(triangles[k], planes[k], ox, oy, oz, dx, dy, dz)
             doubtful[count] = ray
@@ -288,9 +288,17 @@ def _box_seen_from(o, size):  # type: ignore[no-untyped-def]
     return (ox, oy, oz), (high_x, high_y, high_z), (flat_x, flat_y, flat_z)
 
 
+@_inlined
+def _rounding(length_m):  # type: ignore[no-untyped-def]
+    """By how much the rounding of t, at most 1, and of squares can change the square of a piece of about CHORD_M, of
+    segments no longer than this."""
+    wide = 1e-14 * length_m + 1e-9
+    return wide * (2.0 * CHORD_M + wide)
+
+
 @_kernel
-def _some_meet(o, high, flat, some, range_m, room, found):  # type: ignore[no-untyped-def]
-    """Fill ``found`` for at most ``_AT_ONCE`` segments, see :func:`can_meet`.
+def _some_meet(o, high, flat, some, range_m, wide, room, found):  # type: ignore[no-untyped-def]
+    """Fill ``found`` for at most ``_AT_ONCE`` segments, see :func:`can_meet`; ``wide`` is :func:`_rounding`'s.
 
     Products with 1 / d and squares decide, unless a piece is so nearly as long as CHORD_M that their rounding could;
     then quotients and a root do, which take twice the time.
@@ -307,8 +315,7 @@ def _some_meet(o, high, flat, some, range_m, room, found):  # type: ignore[no-un
         first, last = _within((0.0 - oz) * per_z, high_z * per_z, flat_z, z, first, last)
         square = (last - first) * (last - first) * (x * x + y * y + z * z)
         found[n] = (last > first) & (square > CHORD_M * CHORD_M)
-        wide = 1e-14 * (abs(x) + abs(y) + abs(z)) + 1e-9  # the rounding of t, at most 1, and what squares lose
-        doubts += abs(square - CHORD_M * CHORD_M) <= wide * (2.0 * CHORD_M + wide)
+        doubts += abs(square - CHORD_M * CHORD_M) <= wide
         doubts += _is_tiny(x) | _is_tiny(y) | _is_tiny(z)
     if doubts == 0:
         return
@@ -334,10 +341,13 @@ def can_meet(o, ends, size, reaches, range_m=1.0):  # type: ignore[no-untyped-de
         Filled, (n,) bool.
     """
     origin, high, flat = _box_seen_from(o, size)
-    room = np.empty((3, _AT_ONCE))
+    room, longest = np.empty((3, _AT_ONCE)), 0.0
+    for n in range(ends.shape[0]):
+        longest = max(longest, abs(ends[n, 0]) + abs(ends[n, 1]) + abs(ends[n, 2]))
+    wide = _rounding(longest * range_m)
     for start in range(0, ends.shape[0], _AT_ONCE):
         stop = start + _AT_ONCE
-        _some_meet(origin, high, flat, ends[start:stop], range_m, room, reaches[start:stop])
+        _some_meet(origin, high, flat, ends[start:stop], range_m, wide, room, reaches[start:stop])
 
 
 @_kernel
@@ -346,16 +356,19 @@ def take(o, directions, size, range_m, beam, single):  # type: ignore[no-untyped
 
     Parameters
     ----------
-    o, directions, size, range_m
+    o, size
         As in :func:`can_meet`.
+    directions, range_m
+        Unit vectors, (n, 3) float64, and how long the beams are.
     beam, single
         The first are filled: their indices, uint32, and their directions, (n, 3) float32. There is room for all.
     """
     origin, high, flat = _box_seen_from(o, size)
     room, found, k = np.empty((3, _AT_ONCE)), np.empty(_AT_ONCE, dtype=np.bool_), 0
+    wide = _rounding(2.0 * range_m)
     for start in range(0, directions.shape[0], _AT_ONCE):
         some = directions[start : start + _AT_ONCE]
-        _some_meet(origin, high, flat, some, range_m, room, found)
+        _some_meet(origin, high, flat, some, range_m, wide, room, found)
         for n in range(some.shape[0]):
             if found[n]:
                 beam[k] = start + n
