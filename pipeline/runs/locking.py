@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,11 +14,15 @@ from pipeline.core.errors import InputError, RunError
 from pipeline.runs import store_settings
 
 _NO_LINK = os.O_CLOEXEC | os.O_NOFOLLOW
+_PAUSE_S = 0.05
 
 
 @contextmanager
-def alone(folder: Path) -> Iterator[None]:
-    """Keep two runs out of one folder, and every run out of the store; the store's settings are right then."""
+def alone(folder: Path, wait_s: float = 0.0) -> Iterator[None]:
+    """Keep two runs out of one folder, and every run out of the store; the store's settings are right then.
+
+    Another run's end is waited for so long; RunError where it is at work there then.
+    """
     store_settings.keep_out(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -25,8 +30,11 @@ def alone(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise InputError(folder, f"cannot be written ({error.strerror})", "a folder of yours") from None
     try:
-        if not _take(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB):
-            raise RunError(f"{folder}: another run is at work there")
+        until = time.monotonic() + wait_s
+        while not _take(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB):
+            if time.monotonic() >= until:
+                raise RunError(f"{folder}: another run is at work there")
+            time.sleep(_PAUSE_S)
         yield
     finally:
         os.close(descriptor)

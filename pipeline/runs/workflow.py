@@ -56,6 +56,7 @@ def run(
     options: dict[str, dict[str, Any]] | None = None,
     help_from: dict[str, dict[str, Any]] | None = None,
     only: Collection[str] = STAGES,
+    wait_s: float = 0.0,
 ) -> RunRecord:
     """Bring every stage up to date, in order.
 
@@ -75,6 +76,8 @@ def run(
         is skipped, fetched and kept as any.
     only
         These stages alone, which must read nothing of others.
+    wait_s
+        How long to wait for the end of another run in the folder.
 
     Returns
     -------
@@ -83,7 +86,7 @@ def run(
     """
     folder = Path(out) if out is not None else default_folder(scenario)
     keep_inputs(scenario, folder)
-    with alone(folder):
+    with alone(folder, wait_s):
         run = _Run(Workspace(scenario, folder, jobs=jobs, progress=progress), listener, help_from or {})
         record = _record_so_far(scenario, folder)
         for name in (stage for stage in STAGES if stage in only):

@@ -17,6 +17,9 @@ from pipeline.city.running.keeping import KEPT
 from pipeline.runs import workflow
 from pipeline.sensing import sensors, sites
 
+_WAIT_S = 60.0
+"""A worker that was killed, or was only taken for lost, may be at a junction for a moment more."""
+
 SITE_BEAMS = 2**14
 """What a site takes beside its beams, as beams: few take less than adding up what all voxels are worth."""
 
@@ -67,7 +70,7 @@ def _run(job: Job, order: Order, help_from: dict[str, dict[str, Any]]) -> Done:
     begin = perf_counter()
     with order.obeyed():
         record = workflow.run(
-            job.scenario(), job.out, jobs=1, help_from=help_from,
+            job.scenario(), job.out, jobs=1, help_from=help_from, wait_s=_WAIT_S,
             listener=lambda stage, state, _: made.append(stage) if state == "done" else None,
         )  # fmt: skip
         return Done(job.junction, record.stages["score"].summary["sites"], perf_counter() - begin, tuple(made))

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from pipeline.artefacts.run_record import STAGES, RunRecord
 from pipeline.city.running import graph, keeping, running, tasks
 from pipeline.city.running.jobs import Done, Failed, Job
 from pipeline.core.errors import EgvsError, InputError, RunError
-from pipeline.runs import workflow
+from pipeline.runs import locking, workflow
 
 DATA = ("statics.ply", "trajectories.parquet", "tpog.parquet", "scores.parquet", "visibility.parquet")
 CUT = ("scan.keep=false", 'score.keep_visibility="all"', 'score.others=["seen_well", "coverage"]')
@@ -153,3 +154,21 @@ def test_jobs_are_small_messages(jobs: list[Job]) -> None:
 
     assert len(pickle.dumps((jobs[0], running.give_order()))) < 2000
     assert json.dumps(running.give_order().token)
+
+
+def test_a_junction_that_a_lost_worker_still_holds_is_waited_for(jobs: list[Job]) -> None:
+    order, free = running.give_order(), threading.Event()
+
+    def hold() -> None:
+        with locking.alone(jobs[0].out):
+            held.set()
+            free.wait(30)
+
+    held, holder = threading.Event(), threading.Thread(target=hold)
+    holder.start()
+    held.wait(30)
+    threading.Timer(0.3, free.set).start()
+    (done,) = tasks.run_whole([jobs[0]], order)
+    holder.join()
+    assert isinstance(done, Done)
+    assert done.sites == 2
