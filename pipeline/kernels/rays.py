@@ -351,7 +351,7 @@ def can_meet(o, ends, size, reaches, range_m=1.0):  # type: ignore[no-untyped-de
 
 
 @_kernel
-def take(o, directions, size, range_m, beam, single):  # type: ignore[no-untyped-def]
+def take(o, directions, size, range_m, beam):  # type: ignore[no-untyped-def]
     """Take the beams that can meet the box; how many they are.
 
     Parameters
@@ -360,8 +360,8 @@ def take(o, directions, size, range_m, beam, single):  # type: ignore[no-untyped
         As in :func:`can_meet`.
     directions, range_m
         Unit vectors, (n, 3) float64, and how long the beams are.
-    beam, single
-        The first are filled: their indices, uint32, and their directions, (n, 3) float32. There is room for all.
+    beam
+        The first are filled: their indices, uint32. There is room for all.
     """
     origin, high, flat = _box_seen_from(o, size)
     room, found, k = np.empty((3, _AT_ONCE)), np.empty(_AT_ONCE, dtype=np.bool_), 0
@@ -372,6 +372,5 @@ def take(o, directions, size, range_m, beam, single):  # type: ignore[no-untyped
         for n in range(some.shape[0]):
             if found[n]:
                 beam[k] = start + n
-                single[k, 0], single[k, 1], single[k, 2] = some[n, 0], some[n, 1], some[n, 2]
                 k += 1
     return k

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +26,7 @@ from scipy.special import cosdg, sindg
 from pipeline.core.errors import InputError
 from pipeline.core.grid import Roi
 from pipeline.kernels import rays
+from pipeline.kernels.embree import Tree
 from pipeline.world.mesh import World
 
 Floats = NDArray[np.float64]
@@ -104,9 +104,10 @@ class Caster:
         self._planes = _planes(self._triangles) if len(met) else np.zeros((1, 4, 4))  # one, which is never asked
         self._boxes, self._starts = _boxes(self._triangles)
         self._owner: NDArray[np.int32] = np.array([-1], dtype=np.int32)
-        self._scene: Any = None
+        self._tree: Tree | None = None
         if len(met):
-            self._owner, self._scene = _tree(self._triangles)
+            enlarged, self._owner = _enlarged(self._triangles)
+            self._tree = Tree(enlarged)
 
     def scan(self, position_m: tuple[float, float, float], directions: Floats, range_m: float) -> EmptyScan:
         """Cast the beams of one sensor.
@@ -121,9 +122,9 @@ class Caster:
             Where a beam ends that meets nothing.
         """
         o = np.asarray(position_m, dtype=np.float64) - self._origin_m
-        beam, single = np.empty(len(directions), np.uint32), np.empty((len(directions), 3), np.float32)
-        count = rays.take(o, directions, self._size_m, range_m, beam, single)
-        return self._ended(o, beam[:count].copy(), directions, single[:count], range_m)[0]
+        beam = np.empty(len(directions), np.uint32)
+        count = rays.take(o, directions, self._size_m, range_m, beam)
+        return self._ended(o, beam[:count].copy(), directions, range_m)[0]
 
     def sweep(self, position_m: tuple[float, float, float], directions: Floats, range_m: float) -> EmptyScan:
         """Cast every beam, whether or not it can meet the region of interest; as :meth:`scan`, and what is met.
@@ -131,8 +132,7 @@ class Caster:
         Beams may leave the region anywhere: for a caster without ``sites_m``.
         """
         o = np.asarray(position_m, dtype=np.float64) - self._origin_m
-        beam, single = np.arange(len(directions), dtype=np.uint32), directions.astype(np.float32)
-        scan, met = self._ended(o, beam, directions, single, range_m)
+        scan, met = self._ended(o, np.arange(len(directions), dtype=np.uint32), directions, range_m)
         face = np.full(len(directions), -1, dtype=np.int64)
         face[scan.returned] = self._faces[met[scan.returned]]
         return replace(scan, face=face)
@@ -144,7 +144,7 @@ class Caster:
         not matter.
         """
         ranges = np.empty(len(d))
-        scan, _ = self._ended(o_roi_m, np.arange(len(d), dtype=np.uint32), d, d.astype(np.float32), range_m, ranges)
+        scan, _ = self._ended(o_roi_m, np.arange(len(d), dtype=np.uint32), d, range_m, ranges)
         return ranges, scan.doubtful
 
     def _ended(
@@ -152,24 +152,19 @@ class Caster:
         o: Floats,
         beam: NDArray[np.uint32],
         d: Floats,
-        single: NDArray[np.float32],
         range_m: float,
         ranges: Floats | None = None,
     ) -> tuple[EmptyScan, NDArray[np.int64]]:
         """Where some beams end, and which of the kept triangles each meets.
 
-        ``o`` is the sensor in the ROI's frame, ``d`` the directions of all beams, ``single`` those of the ones that are
-        cast, in float32; ``ranges`` is filled with their first hits.
+        ``o`` is the sensor in the ROI's frame, ``d`` the directions of all beams; ``ranges`` is filled with the first
+        hits of those that are cast.
         """
         count = len(beam)
         ranges = np.empty(count) if ranges is None else ranges
         met, doubtful = np.empty((2, count), dtype=np.int64)
         ends, returned = np.empty((count, 3)), np.empty(count, dtype=np.bool_)
-        if self._scene is None or not count:
-            nearest = np.full(count, -1, dtype=np.int32)
-        else:
-            start = np.ndarray((count, 3), np.float32, o.astype(np.float32), strides=(0, 4))  # the same for all
-            nearest = self._scene.run(start, single)
+        nearest = np.full(count, -1, dtype=np.int32) if self._tree is None else self._tree.nearest(o, beam, d)
         shapes, ray, filled = (self._triangles, self._planes), (o, beam, d, range_m), (ranges, met)
         some = doubtful[: rays.settle(nearest, self._owner, *shapes, *ray, *filled, doubtful, ends, returned)]
         rays.search(some, *shapes, self._boxes, self._starts, *ray, *filled, ends, returned)
@@ -267,16 +262,13 @@ def _boxes(triangles: Floats) -> tuple[Floats, NDArray[np.int64]]:
     return np.concatenate(levels), np.cumsum([0, *map(len, levels)])
 
 
-def _tree(triangles: Floats) -> tuple[NDArray[np.int32], Any]:
-    """Embree's tree over the enlarged triangles; and the triangle behind each of its own, FIN for a fin; the last is
-    none (-1).
+def _enlarged(triangles: Floats) -> tuple[Floats, NDArray[np.int32]]:
+    """What Embree holds for some triangles, (k, 3, 3); and the triangle behind each, FIN for a fin, with one more for
+    none, -1.
 
     Large slivers are cut first. A triangle is scaled from its incentre so that its sides move out by the rim. That
     moves a needle's tip far; a needle is held as the two triangles of a rectangle that covers it. Then the fins.
     """
-    from embreex.mesh_construction import TriangleMesh
-    from embreex.rtcore_scene import EmbreeScene
-
     triangles, cut_from = _cut(triangles)
     rim = _RIM_M + _RIM_SHARE * np.abs(triangles).max(axis=(1, 2))
     sides = np.roll(triangles, -2, axis=1) - np.roll(triangles, -1, axis=1)  # opposite corner i
@@ -293,10 +285,8 @@ def _tree(triangles: Floats) -> tuple[NDArray[np.int32], Any]:
     first, second = _rectangles(triangles[needles], sides[needles], cross[needles], rim[needles])
     enlarged[needles] = first
     fins = _fins(triangles, cross, rim)
-    scene = EmbreeScene()
-    TriangleMesh(scene, np.concatenate([enlarged, second, fins]).astype(np.float32))
     owner = np.concatenate([cut_from, cut_from[needles], np.full(len(fins), rays.FIN), [-1]])
-    return owner.astype(np.int32), scene
+    return np.concatenate([enlarged, second, fins]), owner.astype(np.int32)
 
 
 def _cut(triangles: Floats) -> tuple[Floats, NDArray[np.int64]]:

@@ -13,8 +13,8 @@ from pipeline.scoring.occupancy import count
 from pipeline.sensing.scanner import Scanner
 
 
-def take_all(o, directions, size, range_m, beam, single) -> int:
-    beam[:], single[:] = np.arange(len(directions)), directions
+def take_all(o, directions, size, range_m, beam) -> int:
+    beam[:] = np.arange(len(directions))
     return len(directions)
 
 

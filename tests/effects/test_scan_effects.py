@@ -655,7 +655,7 @@ def test_reachable_and_between_never_leave_out_what_a_beam_meets() -> None:
 def test_without_static_geometry_in_reach_no_tree_is_built(
     mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(raycast, "_tree", lambda triangles: pytest.fail("a tree was built"))
+    monkeypatch.setattr(raycast, "Tree", lambda triangles: pytest.fail("a tree was built"))
     for number, standing in enumerate(((), (prism(5, 60, 9, 70, 0, 9, "building"),))):
         _, out = scanned(
             place(mini, *standing, sites="pole_a,10,12,3\n"), tmp_path / str(number), "statics.ground=false"

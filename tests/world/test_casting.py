@@ -472,6 +472,17 @@ def test_a_chord_that_rounding_makes_too_short_is_measured_by_quotients():
     np.testing.assert_array_equal(found[:2000], true[:2000])
 
 
+def test_what_is_taken_is_what_can_meet():
+    """The beams that are cast, of a whole turn, from within the region, above it, beside it and far away."""
+    size, d = np.array([40.0, 20.0, 5.0]), random_directions(np.random.default_rng(3), 20_011)
+    for o in ([20.0, 10.0, 2.0], [20.0, 10.0, 9.0], [-3.0, 5.0, 4.0], [300.0, 5.0, 40.0]):
+        beam, found = np.empty(len(d), dtype=np.uint32), np.empty(len(d), dtype=np.bool_)
+        count = rays.take(np.array(o), d, size, 60.0, beam)
+        rays.can_meet(np.array(o), d, size, found, 60.0)
+        np.testing.assert_array_equal(beam[:count], np.flatnonzero(found))
+        np.testing.assert_array_equal(found, meets(np.array(o), d * 60.0, size))
+
+
 def fan(slivers, reach, turn_deg):
     """Slivers from one corner to the points of a line, in a plane that climbs."""
     far = np.column_stack([np.full(slivers + 1, reach), np.linspace(-reach, reach, slivers + 1)])

@@ -1,0 +1,208 @@
+"""Embree's tree of triangles, asked for eight rays at a time.
+
+embreex brings Embree 4 (https://github.com/RenderKit/embree), and asks it for one ray after the other. Beams that leave
+a sensor side by side enter much the same boxes of the tree, and Embree takes eight of them together in a third of the
+time. So the library that embreex has loaded is called here by its own interface; names, numbers and layouts are those
+of its headers, ``rtcore*.h``.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import weakref
+from typing import Any
+
+import embreex.rtcore_scene
+import llvmlite.binding
+import numpy as np
+from numba import types
+from numpy.typing import NDArray
+
+from pipeline.kernels.compile_cache import compiled
+
+_PACKET = 8  # on a processor that cannot, Embree takes them one after the other
+_ALIGNMENT = 32  # bytes
+_ORIGIN, _NEAR, _DIRECTION, _TIME, _FAR, _MASK, _ID, _FLAGS = 0, 3, 4, 7, 8, 9, 10, 11  # rows of a packet: its rays,
+_TRIANGLE, _SHAPE, _ROWS = 17, 18, 24  # and its hits, some rows to spare; eight of 4 bytes in each
+_NONE = 0xFFFFFFFF  # RTC_INVALID_GEOMETRY_ID
+_TRIANGLES, _INDICES, _CORNERS, _UINT3, _FLOAT3 = 0, 0, 1, 0x5003, 0x9003
+_MAJOR_VERSION, _OUT_OF_MEMORY, _COHERENT, _ALL = 1, 4, 1 << 16, 0xFFFFFFFF
+_ROBUST = 1 << 2  # else packets leak between triangles seen from afar, or along their surface
+
+_BLOCK, _BINS = 512, 512  # rays that are sorted together, and into how many bins
+_STRIDE = 13  # shares no divisor with the number of a sensor's channels
+
+_pointer, _number, _size = ctypes.c_void_p, ctypes.c_uint, ctypes.c_size_t
+_SIGNATURES: dict[str, tuple[Any, ...]] = {  # what each returns, then what it takes
+    "rtcNewDevice": (_pointer, ctypes.c_char_p),
+    "rtcGetDeviceError": (_number, _pointer),
+    "rtcGetDeviceProperty": (ctypes.c_ssize_t, _pointer, _number),
+    "rtcNewScene": (_pointer, _pointer),
+    "rtcSetSceneFlags": (None, _pointer, _number),
+    "rtcNewGeometry": (_pointer, _pointer, _number),
+    "rtcSetNewGeometryBuffer": (_pointer, _pointer, _number, _number, _number, _size, _size),
+    "rtcCommitGeometry": (None, _pointer),
+    "rtcAttachGeometry": (_number, _pointer, _pointer),
+    "rtcReleaseGeometry": (None, _pointer),
+    "rtcCommitScene": (None, _pointer),
+    "rtcReleaseScene": (None, _pointer),
+}
+
+_library = ctypes.CDLL(embreex.rtcore_scene.__file__)  # a name is looked for in what this depends on, too
+for _name, (_returned, *_taken) in _SIGNATURES.items():
+    getattr(_library, _name).restype, getattr(_library, _name).argtypes = _returned, _taken
+
+llvmlite.binding.add_symbol("rtcIntersect8", ctypes.cast(_library.rtcIntersect8, _pointer).value)
+_intersect = types.ExternalFunction("rtcIntersect8", types.void(types.intp, types.intp, types.intp, types.intp))
+_kernel = compiled()
+_inlined = compiled(forceinline=True)
+
+
+class Tree:
+    """Triangles in float32. Threads may share one.
+
+    Parameters
+    ----------
+    triangles
+        Corners (m, 3, 3), m > 0.
+
+    Raises
+    ------
+    MemoryError
+        There is not enough for the tree.
+    """
+
+    def __init__(self, triangles: NDArray[np.float64]) -> None:
+        device, count = _device(), len(triangles)
+        self._scene = _library.rtcNewScene(device)
+        weakref.finalize(self, _library.rtcReleaseScene, self._scene)
+        _library.rtcSetSceneFlags(self._scene, _ROBUST)
+        shape = _library.rtcNewGeometry(device, _TRIANGLES)
+        _fill(shape, _CORNERS, _FLOAT3, triangles.astype(np.float32))
+        _fill(shape, _INDICES, _UINT3, np.arange(3 * count, dtype=np.uint32))
+        _library.rtcCommitGeometry(shape)
+        _library.rtcAttachGeometry(self._scene, shape)
+        _library.rtcReleaseGeometry(shape)  # the scene keeps it
+        _library.rtcCommitScene(self._scene)
+        error = _library.rtcGetDeviceError(device)
+        if error:
+            kind = MemoryError if error == _OUT_OF_MEMORY else RuntimeError
+            raise kind(f"Embree built no tree of {count:,} triangles: its error {error}")
+
+    def nearest(self, o: NDArray[np.float64], beam: NDArray[np.uint32], d: NDArray[np.float64]) -> NDArray[np.int32]:
+        """Which triangle each ray meets first, -1 for none, (n,).
+
+        Parameters
+        ----------
+        o
+            Where all rays start, (3,).
+        beam, d
+            Where the direction of each ray stands, (n,), in unit vectors (beams, 3).
+        """
+        found = np.empty(len(beam), dtype=np.int32)
+        valid, packet, asked = _aligned(1).view(np.int32), _aligned(_ROWS), _Arguments(_COHERENT, _ALL)
+        order, words = side_by_side(beam, d), packet.view(np.uint32)
+        _ask(self._scene, ctypes.addressof(asked), o, beam, d, order, valid, packet, words, found)
+        return found
+
+
+class _Arguments(ctypes.Structure):
+    """``RTCIntersectArguments``; what is not given is zero."""
+
+    _fields_ = (
+        ("flags", ctypes.c_uint),
+        ("feature_mask", ctypes.c_uint),
+        ("context", _pointer),
+        ("filter", _pointer),
+        ("intersect", _pointer),
+        ("spare", _size * 2),
+    )
+
+
+def side_by_side(beam: NDArray[np.uint32], d: NDArray[np.float64]) -> NDArray[np.int32]:
+    """An order of rays, (n,), in which those that point nearly the same way follow each other, where the rays of a few
+    turns of a sensor's channels stand together already; arguments as in :meth:`Tree.nearest`."""
+    order = np.empty(len(beam), dtype=np.int32)
+    _sort(beam, d, order)
+    return order
+
+
+@functools.cache
+def _device() -> int:
+    """Embree itself, once in a process."""
+    device: int | None = _library.rtcNewDevice(None)
+    if device is None:
+        raise RuntimeError(f"Embree does not start: its error {_library.rtcGetDeviceError(None)}")
+    if (version := _library.rtcGetDeviceProperty(device, _MAJOR_VERSION)) != 4:
+        raise RuntimeError(f"embreex brings Embree {version}, whose layouts may be others than those of Embree 4")
+    return device
+
+
+def _fill(shape: int, kind: int, form: int, values: NDArray[Any]) -> None:
+    """Give a shape its corners, or which three of them make each triangle."""
+    room = _library.rtcSetNewGeometryBuffer(shape, kind, 0, form, 12, values.size // 3)
+    if room is None:
+        raise MemoryError(f"Embree has no room for {values.nbytes:,} bytes")
+    ctypes.memmove(room, values.ctypes.data, values.nbytes)
+
+
+def _aligned(rows: int) -> NDArray[np.float32]:
+    """Room that Embree can take, (rows, _PACKET)."""
+    room = np.zeros(4 * rows * _PACKET + _ALIGNMENT, dtype=np.uint8)
+    first = -room.ctypes.data % _ALIGNMENT
+    return room[first : first + 4 * rows * _PACKET].view(np.float32).reshape(rows, _PACKET)
+
+
+@_kernel
+def _sort(beam, d, order):  # type: ignore[no-untyped-def]
+    """Fill ``order``: the rays of each block by their directions along the axis on which these differ most, and where
+    they fall into the same of _BINS, as they came."""
+    along, bins, first = np.empty(_BLOCK), np.empty(_BLOCK, dtype=np.int32), np.empty(_BINS + 1, dtype=np.int32)
+    for start in range(0, beam.shape[0], _BLOCK):
+        block = beam[start : start + _BLOCK]
+        axis, low, high = _widest(block, d), np.inf, -np.inf
+        for k in range(block.shape[0]):
+            along[k] = d[block[k], axis]
+            low, high = min(low, along[k]), max(high, along[k])
+        per_bin = (_BINS - 1) / max(high - low, 1e-9)
+        first[:] = 0
+        for k in range(block.shape[0]):
+            bins[k] = int((along[k] - low) * per_bin)
+            first[bins[k] + 1] += 1
+        for b in range(_BINS):
+            first[b + 1] += first[b]
+        for k in range(block.shape[0]):
+            order[start + first[bins[k]]] = start + k
+            first[bins[k]] += 1
+
+
+@_inlined
+def _widest(beam, d):  # type: ignore[no-untyped-def]
+    """The axis along which some of the directions differ most."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for k in range(0, beam.shape[0], _STRIDE):
+        for axis in range(3):
+            low[axis], high[axis] = min(low[axis], d[beam[k], axis]), max(high[axis], d[beam[k], axis])
+    return np.argmax(high - low)
+
+
+@_kernel
+def _ask(scene, asked, o, beam, d, order, valid, packet, words, found):  # type: ignore[no-untyped-def]
+    """Fill ``found``, see :meth:`Tree.nearest`; ``words`` is ``packet`` as uint32. The last packet is filled up by its
+    last ray."""
+    for k in range(_PACKET):
+        valid[0, k] = -1
+        packet[_ORIGIN, k], packet[_ORIGIN + 1, k], packet[_ORIGIN + 2, k] = o[0], o[1], o[2]
+        packet[_NEAR, k], packet[_TIME, k] = 0.0, 0.0
+        words[_MASK, k], words[_ID, k], words[_FLAGS, k] = _NONE, 0, 0
+    count = order.shape[0]
+    for start in range(0, count, _PACKET):
+        for k in range(_PACKET):
+            n = beam[order[min(start + k, count - 1)]]
+            packet[_DIRECTION, k], packet[_DIRECTION + 1, k], packet[_DIRECTION + 2, k] = d[n, 0], d[n, 1], d[n, 2]
+            packet[_FAR, k] = np.inf
+            words[_TRIANGLE, k], words[_SHAPE, k] = _NONE, _NONE
+        _intersect(valid.ctypes.data, scene, packet.ctypes.data, asked)
+        for k in range(min(_PACKET, count - start)):
+            found[order[start + k]] = np.int32(words[_TRIANGLE, k])

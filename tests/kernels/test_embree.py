@@ -1,0 +1,135 @@
+"""Does Embree, asked for packets of beams that are sorted, say what it says of each ray alone?"""
+
+from __future__ import annotations
+
+import gc
+import resource
+import threading
+
+import numpy as np
+import pytest
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+
+from pipeline.kernels import embree
+from pipeline.kernels.embree import Tree, side_by_side
+
+
+def scattered(count: int, seed: int = 4) -> np.ndarray:
+    """Triangles of a metre or two round the origin, none of which comes near another's edge by intent."""
+    rng = np.random.default_rng(seed)
+    return rng.uniform(-20, 20, (count, 1, 3)) + rng.uniform(-1, 1, (count, 3, 3))
+
+
+def fired(azimuths: int, channels: int = 32) -> np.ndarray:
+    """Unit vectors of a sensor in its firing order: all channels, shuffled, then the next azimuth."""
+    elevation = np.random.default_rng(1).permutation(np.radians(np.linspace(-40, 40, channels)))
+    azimuth, elevation = (grid.ravel() for grid in np.meshgrid(
+        np.linspace(0, 2 * np.pi, azimuths, endpoint=False), elevation, indexing="ij"))  # fmt: skip
+    flat = np.cos(elevation)
+    return np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
+
+
+def alone(triangles: np.ndarray, o: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """What embreex says, one ray after the other."""
+    scene = EmbreeScene()
+    TriangleMesh(scene, triangles.astype(np.float32))
+    return scene.run(np.tile(o, (len(d), 1)).astype(np.float32), d.astype(np.float32))
+
+
+def asked(triangles: np.ndarray, o: np.ndarray, d: np.ndarray, beam: np.ndarray | None = None) -> np.ndarray:
+    beam = np.arange(len(d), dtype=np.uint32) if beam is None else beam
+    return Tree(triangles).nearest(o, beam, d)
+
+
+def test_beams_of_a_sensor_meet_what_each_meets_alone() -> None:
+    triangles, o, d = scattered(3000), np.array([0.5, -0.25, 1.0]), fired(900)
+    found, true = asked(triangles, o, d), alone(triangles, o, d)
+    assert 0.1 < (true >= 0).mean() < 0.99
+    # float32 takes one for another along an edge only
+    assert (found != true).mean() < 1e-3
+
+
+@pytest.mark.parametrize("count", [0, 1, 7, 8, 9, 511, 512, 513, 1029])
+def test_any_number_of_beams_is_asked(count: int) -> None:
+    """A square on each side of the origin: which of the 12 triangles is met can be told by hand."""
+    corners = np.array([(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)]) * 5.0
+    squares = [(0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5)]  # -x +x -y +y -z +z
+    box = np.array([corners[list(three)] for a, b, c, d in squares for three in ((a, b, c), (a, c, d))])
+    d = np.random.default_rng(count).normal(size=(2 * count, 3))
+    d /= np.linalg.norm(d, axis=1)[:, None]
+    beam = np.arange(1, 2 * count, 2, dtype=np.uint32)  # every second one is cast
+    axis = np.abs(d[beam]).argmax(axis=1)
+    side = 2 * axis + (d[beam, axis] > 0)
+    np.testing.assert_array_equal(asked(box, np.zeros(3), d, beam) // 2, side)
+
+
+def test_what_meets_nothing_is_minus_one() -> None:
+    d = fired(64)
+    one = np.array([[[9.0, -1.0, -1.0], [9.0, 1.0, -1.0], [9.0, 0.0, 1.0]]])
+    found = asked(one, np.zeros(3), d)
+    assert set(found) == {0, -1}
+    assert (d[found == 0, 0] > 0.9).all()
+    assert (asked(one, np.array([20.0, 0.0, 0.0]), np.abs(d)) == -1).all()  # it is behind all of them
+
+
+def test_whatever_stands_beside_a_beam_it_meets_the_same() -> None:
+    triangles, o, d = scattered(500), np.zeros(3), fired(120)
+    tree, beam = Tree(triangles), np.arange(len(d), dtype=np.uint32)
+    found = tree.nearest(o, beam, d)
+    for other in (beam[::-1].copy(), np.random.default_rng(2).permutation(beam), beam[::7].copy()):
+        assert (tree.nearest(o, other, d) != found[other]).mean() < 1e-3
+
+
+@pytest.mark.parametrize("tilt", [[0, 1, 2], [2, 0, 1], [1, 2, 0]])
+def test_beams_of_a_channel_stand_side_by_side(tilt: list[int]) -> None:
+    """32 channels that fire in a shuffled order, upright or lying on a side, 16 azimuths in a block."""
+    d, beam = fired(900)[:, tilt], np.arange(900 * 32, dtype=np.uint32)
+    order = side_by_side(beam, d)
+    np.testing.assert_array_equal(np.sort(order), beam)
+    for block in np.split(order[: 512 * 56], 56):
+        assert block.max() - block.min() == 511
+        channels = (block % 32).reshape(-1, 8)
+        assert (channels == channels[:, :1]).all(axis=1).mean() > 0.8 or np.ptp(
+            d[block], axis=0
+        ).argmax() != tilt.index(2)
+
+
+def test_threads_share_a_tree() -> None:
+    triangles, o, d = scattered(2000), np.zeros(3), fired(600)
+    tree, beam = Tree(triangles), np.arange(len(d), dtype=np.uint32)
+    true, found = tree.nearest(o, beam, d), [np.empty(0)] * 4
+    threads = [threading.Thread(target=lambda n=n: found.__setitem__(n, tree.nearest(o, beam, d))) for n in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert all(np.array_equal(each, true) for each in found)
+
+
+@pytest.mark.slow
+def test_a_tree_that_is_let_go_leaves_no_memory() -> None:
+    triangles = scattered(50_000)
+    peak = []
+    for _ in range(20):
+        Tree(triangles)
+        gc.collect()
+        peak.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+    assert peak[-1] - peak[4] < 20_000  # kilobytes; 15 trees are 200,000
+
+
+def test_too_little_memory_is_no_smaller_world(monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(embree._library, "rtcSetNewGeometryBuffer", lambda *_: None)
+        with pytest.raises(MemoryError, match="no room for 360 bytes"):
+            Tree(scattered(10))
+    with monkeypatch.context() as patch:
+        patch.setattr(embree._library, "rtcGetDeviceError", lambda _: 4)
+        with pytest.raises(MemoryError, match="no tree of 10 triangles: its error 4"):
+            Tree(scattered(10))
+
+
+def test_another_embree_is_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(embree._library, "rtcGetDeviceProperty", lambda *_: 5)
+    with pytest.raises(RuntimeError, match="brings Embree 5"):
+        embree._device.__wrapped__()
