@@ -79,11 +79,11 @@ class Tree:
         weakref.finalize(self, _library.rtcReleaseScene, self._scene)
         _library.rtcSetSceneFlags(self._scene, _ROBUST)
         shape = _library.rtcNewGeometry(device, _TRIANGLES)
+        _library.rtcAttachGeometry(self._scene, shape)
+        _library.rtcReleaseGeometry(shape)  # the scene keeps it
         _fill(shape, _CORNERS, _FLOAT3, triangles.astype(np.float32))
         _fill(shape, _INDICES, _UINT3, np.arange(3 * count, dtype=np.uint32))
         _library.rtcCommitGeometry(shape)
-        _library.rtcAttachGeometry(self._scene, shape)
-        _library.rtcReleaseGeometry(shape)  # the scene keeps it
         _library.rtcCommitScene(self._scene)
         error = _library.rtcGetDeviceError(device)
         if error:
@@ -168,7 +168,8 @@ def _sort(beam, d, order):  # type: ignore[no-untyped-def]
         per_bin = (_BINS - 1) / max(high - low, 1e-9)
         first[:] = 0
         for k in range(block.shape[0]):
-            bins[k] = int((along[k] - low) * per_bin)
+            place = (along[k] - low) * per_bin
+            bins[k] = int(place) if 0.0 <= place < _BINS else 0  # the latter where a direction is no number
             first[bins[k] + 1] += 1
         for b in range(_BINS):
             first[b + 1] += first[b]

@@ -3,9 +3,10 @@
 Embree (float32) answers *which triangle*, float64 *where*:
 
 1. The world is moved to the region of interest's own frame in float64.
-2. Embree holds every triangle enlarged by a rim that is wider than float32's error, and a low fin upright on each side
-   that is not shared with a steep neighbour. What a beam truly meets, it meets there too: none leaks through a shared
-   edge or vertex, and none slips in along a surface that it sees at a fraction of a degree.
+2. Embree (:class:`pipeline.kernels.embree.Tree`) holds every triangle enlarged by a rim that is wider than float32's
+   error, and a low fin upright on each side that is not shared with a steep neighbour. What a beam truly meets, it
+   meets there too: none leaks through a shared edge or vertex, and none slips in along a surface that it sees at a
+   fraction of a degree.
 3. Each proposed hit is placed in float64 on the true triangle. A beam that met only a rim or fin, came within 0.02 mm
    of an edge, or met a surface at less than 0.6 degrees, is doubtful (one in a thousand); its first hit is searched
    among all true triangles in float64.

@@ -95,6 +95,13 @@ def test_beams_of_a_channel_stand_side_by_side(tilt: list[int]) -> None:
         ).argmax() != tilt.index(2)
 
 
+def test_a_direction_that_is_no_number_spoils_no_other() -> None:
+    d = fired(90)
+    d[3], d[700] = np.nan, np.inf
+    order = side_by_side(np.arange(len(d), dtype=np.uint32), d)
+    np.testing.assert_array_equal(np.sort(order), np.arange(len(d)))
+
+
 def test_threads_share_a_tree() -> None:
     triangles, o, d = scattered(2000), np.zeros(3), fired(600)
     tree, beam = Tree(triangles), np.arange(len(d), dtype=np.uint32)
