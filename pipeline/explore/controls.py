@@ -59,6 +59,8 @@ class Controls:
         That were recorded.
     buttons
         What is done by whom presses them, by what stands on them.
+    note
+        What is to be known of the picture, markdown; nothing where it is empty.
     """
 
     def __init__(
@@ -70,6 +72,7 @@ class Controls:
         effects: dict[str, str],
         frames: int,
         buttons: Mapping[str, Callable[[viser.ClientHandle], None]],
+        note: str,
     ) -> None:
         self._gui, self._session, self._view, self._page = gui, session, view, page
         self._theme(False)
@@ -80,6 +83,8 @@ class Controls:
         self.told = gui.add_markdown("")
         with gui.add_folder("layer"):
             self._draw_layer(session, frames)
+            if note:
+                gui.add_markdown(note)
         with gui.add_folder("pose"):
             self._draw_pose(session)
         with gui.add_folder("scored by", expand_by_default=False):

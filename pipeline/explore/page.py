@@ -187,7 +187,7 @@ class Page:
 
     def _draw(self) -> None:
         scene, session = self._server.scene, self.session
-        self._world = surroundings.World.drawn(scene, session, self.zero_m)
+        self._world = surroundings.World.draw(scene, session, self.zero_m)
         surroundings.draw_sites(scene, session, self.zero_m, self._choose)
         surroundings.draw_plan(scene, self.plan, self.view.site.name, self.zero_m, self._choose)
         self._gizmo = scene.add_transform_controls("/sensor", scale=GIZMO_M, depth_test=False)
@@ -199,7 +199,8 @@ class Page:
         self.look_from(Camera((x, y - 0.4 * reach_m, z + 0.6 * reach_m), self.zero_m))
         buttons = {"Keep this pose": self._keep, "Link to this view": self._link, "Picture (PNG)": self._picture}
         effects, frames = settings.offered(session), self._playback.frames
-        self.controls = Controls(self._server.gui, session, self.view, self, effects, frames, buttons)
+        note = wording.drawn(self._world.drawn, self._world.triangles)
+        self.controls = Controls(self._server.gui, session, self.view, self, effects, frames, buttons, note)
 
     # ---- what somebody does
 

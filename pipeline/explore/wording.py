@@ -37,6 +37,11 @@ def notice(text: str) -> str:
     return f"**{plain(text)}**\n\n"
 
 
+def drawn(triangles: int, of: int) -> str:
+    """Whether the static world is drawn coarser than it is; nothing where it is not."""
+    return f"{triangles:,} of {of:,} triangles are drawn; beams meet all of them." if triangles < of else ""
+
+
 def plan(its: MovingPlan) -> str:
     """What the sensors of a plan are worth together as they are now, and where one more would be best."""
     names, value = ", ".join(map(plain, its.sites)), value_in_words(its.poses.asked.score, its.joint)

@@ -28,6 +28,7 @@ from tests.conftest import write_mini
 viser = pytest.importorskip("viser", reason="the page needs viser: pip install 'egvs[explore]'")
 
 from pipeline.explore.page import GIZMO_M, Page  # noqa: E402 - needs viser
+from tests.explore.serving import serving  # noqa: E402
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 GRAPHICS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
@@ -48,18 +49,12 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    """Over the small scenario, served, with its loop in a thread."""
+    """Over the small scenario, served."""
     folder = tmp_path_factory.mktemp("browser")
-    served = Page(open_session(write_mini(folder / "mini"), (), folder / "run"), folder / "scratch")
-    served.look_from(Camera((30.0, -34.0, 18.0), (30.0, -10.0, 3.0)))  # at the sensor that is dragged
-    loop = threading.Thread(target=served.run)
-    loop.start()
-    try:
+    made = Page(open_session(write_mini(folder / "mini"), (), folder / "run"), folder / "scratch")
+    made.look_from(Camera((30.0, -34.0, 18.0), (30.0, -10.0, 3.0)))  # at the sensor that is dragged
+    with serving(made) as served:
         yield served
-    finally:
-        served.end()
-        loop.join()
-        served.stop()
 
 
 @pytest.fixture(scope="module")

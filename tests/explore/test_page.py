@@ -20,6 +20,7 @@ import pytest
 import pipeline
 from pipeline.core.errors import InputError
 from pipeline.explore import wording
+from pipeline.explore.drawing import shapes
 from pipeline.explore.opening import open_session
 from pipeline.explore.playback import Playback
 from pipeline.explore.session import Session
@@ -34,6 +35,7 @@ import websockets  # noqa: E402 - comes with viser
 from websockets.sync.client import connect  # noqa: E402
 
 from pipeline.explore.page import HOST, Page  # noqa: E402
+from tests.explore.serving import serving  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -52,16 +54,9 @@ def with_key(served: Page) -> Any:
 
 @pytest.fixture
 def page(session: Session, tmp_path: Path) -> Iterator[Page]:
-    """Served, with its loop in a thread."""
-    served = Page(session, tmp_path / "scratch")
-    loop = threading.Thread(target=served.run)
-    loop.start()
-    try:
+    """Served."""
+    with serving(Page(session, tmp_path / "scratch")) as served:
         yield served
-    finally:
-        served.end()
-        loop.join()
-        served.stop()
 
 
 def settled(page: Page, name: str, pose: Pose, sensor: str = "small") -> None:
@@ -90,6 +85,19 @@ def test_who_has_no_key_gets_neither_page_nor_connection(page: Page) -> None:
         f"ws://{HOST}:{port}", additional_headers=cookie, origin=page._origin, subprotocols=protocol
     ) as connection:
         assert connection.recv(10)
+
+
+def test_a_world_that_is_drawn_coarser_says_so(
+    session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said, add = [], viser.GuiApi.add_markdown
+    monkeypatch.setattr(viser.GuiApi, "add_markdown", lambda gui, text: (said.append(text), add(gui, text))[1])
+    for most in (shapes.MOST_TRIANGLES, 6):
+        monkeypatch.setattr(shapes.solids, "__defaults__", (most,))
+        with serving(Page(session, tmp_path / str(most))):
+            pass
+    (told,) = [text for text in said if "triangles" in text]
+    assert told.endswith(f" of {len(session.scene.world.faces)} triangles are drawn; beams meet all of them.")
 
 
 def test_what_rests_is_what_was_wanted_last(page: Page, session: Session) -> None:

@@ -20,6 +20,7 @@ import numpy as np
 import pyarrow.csv
 import pyarrow.parquet as pq
 
+from tests.city.conftest import write_city
 from tests.conftest import SCENARIO, SITES, collection, fcd, feature, write_mini
 
 _KINDS = SCENARIO[SCENARIO.index("[[traffic.kinds]]") : SCENARIO.index("[statics]")]
@@ -325,6 +326,17 @@ def extract(name: str):
             shutil.copyfile(SMALL_OSM, folder / name)
 
     return make
+
+
+def wanted(folder: Path) -> None:
+    """A map and a table of the junctions that are wanted of it, beside no scenario."""
+    extract("map.osm")(folder)
+    (folder / "wanted.csv").write_text("junction,lat_deg,lon_deg\ncross,52.0,10.0\n")
+
+
+def city(folder: Path) -> None:
+    """A city of two junctions, whose traffic is a finished file."""
+    write_city(folder / "town")
 
 
 # ---- what scenarios name beside

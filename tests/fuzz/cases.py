@@ -10,6 +10,7 @@ the scenario promises; with one message). Any other verdict is a fault.
 from __future__ import annotations
 
 import gc
+import itertools
 import math
 import os
 import re
@@ -217,11 +218,11 @@ class Bench:
         """What of the results is compared: scores of the sites, or the bytes of other results."""
         import pyarrow.parquet as pq
 
-        found: list[object] = []
-        for name in self.kind.results:
-            path = folder / name
-            found.append(pq.read_table(path).to_pydict() if path.suffix == ".parquet" else path.read_bytes())
-        return found
+        paths = [sorted(folder.glob(name)) if "*" in name else [folder / name] for name in self.kind.results]
+        return [
+            pq.read_table(path).to_pydict() if path.suffix == ".parquet" else path.read_bytes()
+            for path in itertools.chain.from_iterable(paths)
+        ]
 
 
 def _fault_of(ended: Ended) -> Verdict | None:

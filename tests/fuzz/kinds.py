@@ -31,7 +31,7 @@ class Kind:
     verb
         What reads it.
     results
-        What the verb writes that must stay the same, or change with the meaning.
+        What the verb writes that must stay the same, or change with the meaning; with a star, all that match.
     store
         Whether there is a store, in the case's folder.
     names_others
@@ -79,6 +79,14 @@ def _new(name: str, reads: Meaning) -> Kind:
     return Kind(f"new {name}", name, bases.extract(name), reads, verb=("new", "made", "--osm", name), results=made)
 
 
+def _city(name: str, file: str, reads: Meaning) -> Kind:
+    """What the cut of a city's traffic reads."""
+    verb = ("city", "traffic", "town")
+    return Kind(
+        name, f"town/{file}", bases.city, reads, verb=verb, results=("town/traffic/*.parquet",), names_others=True
+    )
+
+
 _ALL = (
     _input("scenario.toml", "scenario.toml", bases.plain, meaning.toml, True),
     Kind("extended scenario.toml", "scenario/scenario.toml", bases.heir, meaning.toml,
@@ -112,6 +120,11 @@ _ALL = (
     _input("scan.pcd binary", "binary.pcd", bases.measured("binary.pcd"), meaning.pcd),
     _new("map.osm", meaning.gzipped(meaning.xml)), _new("map.osm.gz", meaning.gzipped(meaning.xml)),
     _new("map.osm.pbf", meaning.bytes_themselves),
+    Kind("wanted junctions.csv", "wanted.csv", bases.wanted, meaning.rows, results=("made/junctions/*/*.csv",),
+         verb=("city", "new", "made", "--osm", "map.osm", "--junctions", "wanted.csv")),
+    _city("city.toml", "city.toml", meaning.toml), _city("junctions.csv", "junctions.csv", meaning.rows),
+    _city("junction scenario.toml", "junctions/west/scenario.toml", meaning.toml),
+    _city("city fcd.csv", "fcd.csv", meaning.semicolons),
     *(_artefact(name, verb) for name, verb in (
         ("trajectories.parquet", "tpog"), ("statics.ply", "scan"), ("tpog.parquet", "score"),
         ("scans.parquet", "score"), ("scores.parquet", "report"), ("blindspots.parquet", "report"),

@@ -32,15 +32,26 @@ _OF_PLAN, _NEXT = (214, 40, 120), (120, 60, 200)
 
 @dataclass(frozen=True)
 class World:
-    """Solids, lanes and the region of interest, as they were drawn: each mesh by its kind."""
+    """Solids, lanes and the region of interest, as they were drawn.
+
+    Attributes
+    ----------
+    meshes
+        By kind.
+    drawn, triangles
+        How many triangles are drawn of the static world, and how many it has.
+    """
 
     meshes: dict[str, viser.MeshHandle]
+    drawn: int
+    triangles: int
 
     @classmethod
-    def drawn(cls, scene: viser.SceneApi, session: Session, zero_m: Vec3) -> World:
+    def draw(cls, scene: viser.SceneApi, session: Session, zero_m: Vec3) -> World:
         """Draw it, by day."""
         scene.configure_default_lights(cast_shadow=False)  # a graphics card in software has no time for it
         shown = shapes.solids(session.scene.world, zero_m)
+        count = sum(len(mesh.faces) for mesh in shown.values())
         if session.carriageway is not None:
             shown["lanes"] = shapes.lanes(session.carriageway, zero_m)
         scene.add_line_segments("/roi", shapes.edges(session.scene.roi, zero_m), _ROI, thickness=0.15)
@@ -49,7 +60,7 @@ class World:
                                         flat_shading=kind != "lanes", side="double", cast_shadow=False)
             for kind, mesh in shown.items()
         }  # fmt: skip
-        return cls(meshes)
+        return cls(meshes, count, len(session.scene.world.faces))
 
     def colour(self, is_dark: bool) -> None:
         """By day, or in the dark."""

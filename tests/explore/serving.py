@@ -1,0 +1,22 @@
+"""Serves a page while a test looks at it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from pipeline.explore.page import Page
+
+
+@contextmanager
+def serving(page: Page) -> Iterator[Page]:
+    """With its loop in a thread."""
+    loop = threading.Thread(target=page.run)
+    loop.start()
+    try:
+        yield page
+    finally:
+        page.end()
+        loop.join()
+        page.stop()
