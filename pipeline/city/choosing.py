@@ -84,6 +84,8 @@ def _of_table(streets: Streets, path: Path) -> Iterator[tuple[str, Junction]]:
             raise InputError(place, f"is the same junction as {seen[junction.id]}", "one row for each junction")
         seen[junction.id] = name
         yield name, junction
+    if not names:
+        raise InputError(path, "names no junction", "a row for each, or --junctions signalised or all")
 
 
 def _nearest(streets: Streets, at: Point, place: str) -> Junction:

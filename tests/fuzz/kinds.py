@@ -124,7 +124,7 @@ _ALL = (
          verb=("city", "new", "made", "--osm", "map.osm", "--junctions", "wanted.csv")),
     _city("city.toml", "city.toml", meaning.toml), _city("junctions.csv", "junctions.csv", meaning.rows),
     _city("junction scenario.toml", "junctions/west/scenario.toml", meaning.toml),
-    _city("city fcd.csv", "fcd.csv", meaning.semicolons),
+    _city("city fcd.csv", "fcd.csv", meaning.gzipped(meaning.semicolons)),
     *(_artefact(name, verb) for name, verb in (
         ("trajectories.parquet", "tpog"), ("statics.ply", "scan"), ("tpog.parquet", "score"),
         ("scans.parquet", "score"), ("scores.parquet", "report"), ("blindspots.parquet", "report"),
