@@ -2,8 +2,9 @@
 
 :func:`run` is the whole program. A stage whose inputs (settings by value, files by hash, the program's source) are
 those of the last run, and whose artefacts are still what it wrote, is skipped; one that the store knows is fetched from
-there; any other one is made, and kept in the store. After each stage ``run.json`` is written anew, so that an
-interrupted run goes on from the last whole stage.
+there; any other one is made, and kept in the store. After each stage that was made ``run.json`` is written anew, with
+that stage and those before it, so that an interrupted run goes on from the last whole stage, and no record names
+artefacts of another scenario than its own. A run that is refused before anything was made leaves the folder as it was.
 
 :func:`verify` runs again what ``run.json`` says and compares every artefact byte for byte.
 """
@@ -91,11 +92,7 @@ def run(
         record = _record_so_far(scenario, folder)
         for name in (stage for stage in STAGES if stage in only):
             record = run.bring(name, record, **(options or {}).get(name, {}))
-        others = [stage for stage in record.stages if stage not in (*only, "report")]
-        for name in [stage for stage in others if not _is_of(stage, run.work, record)]:
-            record = record.having(name, None)  # of other settings: the record would contradict itself
-            record.write(folder)
-        return record
+        return run.end(record, [stage for stage in record.stages if stage not in (*only, "report")])
 
 
 def run_one(
@@ -113,11 +110,9 @@ def run_one(
     with alone(out):
         record = _record_so_far(scenario, out)
         work = Workspace(scenario, out, jobs=jobs, progress=progress, recorded=stages.recorded(record))
-        record = _Run(work, listener).bring(name, record, again=True, **options)
-        for other in [stage for stage in record.stages if stage != name and not _is_of(stage, work, record)]:
-            record = record.having(other, None)  # of other settings: the record would contradict itself
-        record.write(out)
-        return record
+        run = _Run(work, listener)
+        record = run.bring(name, record, again=True, **options)
+        return run.end(record, [stage for stage in record.stages if stage != name])
 
 
 def refresh_report(out: Path) -> Path | None:
@@ -137,7 +132,8 @@ def refresh_report(out: Path) -> Path | None:
     before = {name: stage for name, stage in record.stages.items() if name != "report"}
     if not all(_is_of(name, work, record) and _intact(work, stage) for name, stage in before.items()):
         return None
-    _Run(work, unheard).bring("report", record)
+    run = _Run(work, unheard, whole=set(before))
+    run.end(run.bring("report", record), ())
     return out / "report.html"
 
 
@@ -179,33 +175,60 @@ def bring(work: Workspace, *names: str) -> dict[str, str]:
     return keys
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Run:
-    """One scenario in one folder."""
+    """One scenario in one folder.
+
+    Attributes
+    ----------
+    whole
+        The stages that are known to be this scenario's. Of the others a record may know from earlier runs.
+    is_other
+        Whether artefacts in the folder are others than they were.
+    """
 
     work: Workspace
     listener: StageListener
     help_from: dict[str, dict[str, Any]] = field(default_factory=dict)
     store: Store = field(default_factory=Store.default)
+    whole: set[str] = field(default_factory=set)
+    is_other: bool = False
 
     def bring(self, name: str, record: RunRecord, *, again: bool = False, **options: Any) -> RunRecord:
-        """Bring one stage up to date; the record of the run with it, written.
+        """Bring one stage up to date; the record of the run with it. What is whole of it is written once artefacts were
+        made.
 
         A stage with ``options`` is always run, and its artefacts are not kept in the store; ``again``: always run.
         """
-        work, out = self.work, self.work.folder
+        work = self.work
         inputs = stage_keys.inputs(name, work)
         last = record.stages.get(name)
         if last and not (again or options) and last.inputs == inputs.key and _intact(work, last):
             self.listener(name, "skipped", last)
-            return record
-        record = replace(record.having(name, None), scenario=work.scenario.model_dump(mode="json"))
-        record.write(out)
+            return self._with(name, last, record)
         made, fetched = self._made(name, inputs, again, options)
         done = inputs.record(made)
-        record = record.having(name, done)
-        record.write(out)
+        self.is_other |= bool(done.artefacts)
+        record = self._with(name, done, record)
         self.listener(name, "fetched" if fetched else "done", done)
+        return record
+
+    def end(self, record: RunRecord, others: Collection[str]) -> RunRecord:
+        """The record without those of the other stages that are of other settings, which it would contradict; written
+        where it is another one than before."""
+        for name in [stage for stage in others if not _is_of(stage, self.work, record)]:
+            record = record.having(name, None)
+        folder = self.work.folder
+        if not (folder / RECORD).is_file() or RunRecord.read(folder) != record:
+            record.write(folder)
+        return record
+
+    def _with(self, name: str, stage: StageRecord, record: RunRecord) -> RunRecord:
+        self.whole.add(name)
+        record = record.having(name, stage)
+        if self.is_other:
+            whole = {name: stage for name, stage in record.stages.items() if name in self.whole}
+            replace(record, stages=whole).write(self.work.folder)
         return record
 
     def _made(self, name: str, inputs: Inputs, again: bool, options: dict[str, Any]) -> tuple[Made, bool]:

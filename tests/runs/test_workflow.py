@@ -113,6 +113,47 @@ def test_a_changed_setting_runs_what_depends_on_it(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ("roi.center_m=[900, 0, 2.5]",),  # the check refuses it
+        ("traffic.frames=4000",),  # the finished file has fewer; the stages before are as they were
+    ],
+)
+def test_a_refused_run_leaves_the_folder_as_it_was(done: tuple[Path, Path], settings: tuple[str, ...], egvs) -> None:
+    scenario, out = done
+    before = {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()}
+    code, _, said = egvs("run", scenario, "--out", out, *(word for its in settings for word in ("--set", its)))
+    assert code == 2, said
+    assert {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()} == before
+    assert workflow.verify(out) == []
+
+
+def test_a_run_that_ends_on_its_way_leaves_a_record_of_one_scenario(
+    done: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of what was made by then, and of no score of the scenario before; what did not change is not made again."""
+    mini, out = done
+    other, make = pipeline.load(mini, ["statics.ground=false", "traffic.frames=20"]), workflow.stages.make
+
+    def fails(name: str, *rest: object, **options: object) -> object:
+        if name == "traffic":
+            raise RunError("traffic: it does not keep what is promised")
+        return make(name, *rest, **options)  # type: ignore[arg-type]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(workflow.stages, "make", fails)
+        with pytest.raises(RunError):
+            workflow.run(other, out)
+    record = json.loads((out / "run.json").read_text())
+    assert (record["scenario"]["statics"]["ground"], list(record["stages"])) == (False, ["check", "statics", "scan"])
+    with pytest.raises(InputError, match="the stage traffic is not done"):
+        workflow.verify(out)
+    again = states(pipeline.load(mini, ["statics.ground=false"]), out)
+    assert (again["statics"], again["scan"], again["traffic"]) == ("skipped", "skipped", "fetched")
+    assert workflow.verify(out) == []
+
+
 def test_scoring_again_casts_nothing(done: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     mini, out = done
     casts = []
