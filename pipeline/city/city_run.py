@@ -17,6 +17,7 @@ from pipeline.city.results import junctions, page, plan
 from pipeline.city.results.junctions import JunctionResult
 from pipeline.city.running import clusters, running
 from pipeline.city.running.jobs import Done, Job
+from pipeline.core.errors import InputError
 from pipeline.core.findings import Finding, warnings_of
 from pipeline.core.progress import Progress, silent
 from pipeline.runs.locking import alone
@@ -56,7 +57,7 @@ def run(
     only
         Names of junctions; all when there is none.
     sets
-        Laid over every junction's scenario, as ``egvs run --set`` does.
+        Laid over every junction's scenario, as ``egvs run --set`` does; no key of the traffic, which is the city's.
     heard
         Called with each junction as it is done.
 
@@ -68,6 +69,7 @@ def run(
         Where the traffic or a run cannot keep its promise, or the cluster is lost; what is done is kept then.
     """
     chosen, folder = choose(city, only), folder_of(city, out)
+    _refuse_traffic(city, sets)
     with alone(folder):
         clusters.check(where)
         with clusters.connected(where) as client:
@@ -101,10 +103,19 @@ def choose(city: City, only: Collection[str]) -> tuple[CityJunction, ...]:
 
 def jobs_of(city: City, out: Path, chosen: Sequence[CityJunction], sets: Sequence[str]) -> list[Job]:
     """What workers get of junctions."""
+    _refuse_traffic(city, sets)
     return [
         Job(its.id, its.scenario_folder(city).absolute(), junctions.run_folder(out, its.id).absolute(), tuple(sets))
         for its in chosen
     ]
+
+
+def _refuse_traffic(city: City, sets: Sequence[str]) -> None:
+    for override in sets:
+        key = override.partition("=")[0].strip()
+        if key.split(".")[0] == "traffic":
+            found = "the traffic of a city is simulated once, for all of its junctions"
+            raise InputError(f"--set {override}", found, f"{key} in {city.file}, then this command without it")
 
 
 def folder_of(city: City, out: str | Path | None) -> Path:

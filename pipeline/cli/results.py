@@ -26,16 +26,17 @@ if TYPE_CHECKING:
 _FILE_WIDTH = 150
 
 _ROOMY = 130
-"""Terminals with so many columns get another score beside the one that ranks."""
+"""Terminals with so many columns get the entropy seen as well as the score beside the one that ranks."""
 
 
 def ranking_table(sites: Sequence[ScoredSite], width: int = WIDE, top: int | None = None) -> Table:
     """The ``top`` sites (all by default) by rank; without poses and sensors where the terminal is narrow."""
     is_wide, has_errors = width >= NARROW, any(site.egvs_se is not None for site in sites)
-    by, other = SCORES[sites[0].rank_by if sites else "egvs"], beside(sites) if width >= _ROOMY else None
+    by, other = SCORES[sites[0].rank_by if sites else "egvs"], beside(sites)
     names = ["rank", "site", *(["x m", "y m", "z m", "sensor"] if is_wide else []), by.head]
     names += ["std error", "beats next"] if has_errors else []
-    names += ["of best", *([other.head] if other is not None else []), "entropy seen"]
+    names += ["of best", *([other.head] if other is not None else [])]
+    names += ["entropy seen"] if other is None or width >= _ROOMY else []
     names = [*dict.fromkeys(names), *(["beams in ROI"] if is_wide else [])]
     ranking = table(names, left=("site", "sensor"), whole=[name for name in names if name != "site"])
     by_rank = sorted(sites, key=lambda site: site.rank)

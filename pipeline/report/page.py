@@ -51,7 +51,7 @@ CHOOSABLE = 200
 TEMPLATES = Path(__file__).parent / "templates"
 
 _LEFT_OUT = (
-    ("vehicles that hide one another", "moving_occlusion"),
+    ("what vehicles hide from the EGVS", "moving_occlusion"),
     ("rain", "rain"),
     ("fog", "fog"),
     ("the weakening of a beam with distance", "range_limit"),

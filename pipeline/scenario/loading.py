@@ -37,7 +37,7 @@ def load(path: str | Path, overrides: Iterable[str] = ()) -> Scenario:
     InputError
         Naming file, key, value, and what would be right.
     """
-    path = Path(path)
+    path, overrides = Path(path), tuple(overrides)
     file = path / FILE if path.is_dir() else path
     values = _read(file, ())
     for override in overrides:
@@ -45,9 +45,28 @@ def load(path: str | Path, overrides: Iterable[str] = ()) -> Scenario:
             found = "a scenario is extended by its file alone"
             raise InputError(f"--set {override}", found, "extends = ... in a scenario.toml")
         values = _lay_over(values, override)
+    try:
+        return _acting(values, file)
+    except InputError as error:
+        if not overrides or not _is_sound(file):
+            raise
+        place, right = (text.replace(str(file), "--set") for text in (error.place, error.right))
+        raise InputError(place, error.found, right) from None
+
+
+def _acting(values: dict[str, Any], file: Path) -> Scenario:
     scenario = from_values(values, file.parent, str(file))
     check_acting(scenario.traffic, file)
     return scenario
+
+
+def _is_sound(file: Path) -> bool:
+    """Whether a file alone makes a scenario, without what is laid over it."""
+    try:
+        _acting(_read(file, ()), file)
+    except InputError:
+        return False
+    return True
 
 
 def check_acting(traffic: TrafficModel, file: Path) -> None:
@@ -61,7 +80,7 @@ def _read(file: Path, heirs: tuple[Path, ...]) -> dict[str, Any]:
     """The values of a scenario file, laid over those of the scenario that it extends."""
     if not file.is_file():
         place = file.parent if file.name == FILE else file
-        raise InputError(place, f"no {FILE} there", f"a folder with a {FILE}, or the file itself")
+        raise InputError(place, f"no {FILE} there", _instead(place))
     if file.resolve() in heirs:
         raise InputError(f"{file}: extends", "leads back to itself", "a scenario that does not extend this one")
     values = documents.read_toml(file)
@@ -132,6 +151,15 @@ def default_name(folder: Path) -> str:
 def json_schema() -> str:
     """The JSON Schema that editors use to complete and check a scenario.toml."""
     return json.dumps(Scenario.model_json_schema(), indent=2, ensure_ascii=False) + "\n"
+
+
+def _instead(folder: Path) -> str:
+    """What may be meant by a folder that is no scenario's."""
+    if (folder / "city.toml").is_file():
+        return f"it is a city: egvs city run {folder}, or one of its junctions, {folder / 'junctions'}/ID"
+    if (folder / "run.json").is_file():
+        return "it is the folder of a run; the scenario that it is of"
+    return f"a folder with a {FILE}, or the file itself"
 
 
 def _left_behind(source: str) -> frozenset[str]:

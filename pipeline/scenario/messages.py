@@ -63,12 +63,20 @@ def _lines(error: ValidationError, model: type[BaseModel], above: tuple[str, ...
 def nearest_key(loc: Sequence[str | int], top: type[BaseModel]) -> str:
     """What the user may have meant by an unknown key of ``top``."""
     model: type[BaseModel] | None = top
+    if len(loc) == 1 and (inner := _tables_with(str(loc[0]), top)):
+        return f"did you mean {' or '.join(f'{table}.{loc[0]}' for table in inner)}?"
     for part in loc[:-1]:
         if model is not None and part in model.model_fields:
             model = _model_of(model.model_fields[str(part)].annotation)
     known = sorted(model.model_fields) if model is not None else []
     near = difflib.get_close_matches(str(loc[-1]), known, 1, 0.5)
     return f"did you mean {near[0]}?" if near else f"known here are {', '.join(known)}"
+
+
+def _tables_with(key: str, top: type[BaseModel]) -> list[str]:
+    """The tables of ``top`` that know a key."""
+    models = {name: _model_of(field.annotation) for name, field in top.model_fields.items()}
+    return [name for name, model in models.items() if model is not None and key in model.model_fields]
 
 
 def _model_of(annotation: Any) -> type[BaseModel] | None:

@@ -14,6 +14,13 @@ from pipeline.sensing.sites import Pose
 from pipeline.world.casting import standing_on
 from pipeline.world.mesh import World
 
+_DEGREES = "; longitude and latitude stand in columns lon_deg and lat_deg"
+
+
+def _like_degrees(pose: Pose) -> bool:
+    """Whether x and y may be a longitude and a latitude, not metres."""
+    return abs(pose.x_m) <= 180.0 and abs(pose.y_m) <= 90.0
+
 
 def check(scene: Scene, pose: Pose, sensor: Sensor, place: str) -> None:
     """InputError naming ``place`` where the sensor cannot stand or would see nothing of the region of interest."""
@@ -34,7 +41,8 @@ def check(scene: Scene, pose: Pose, sensor: Sensor, place: str) -> None:
         raise InputError(
             place,
             f"stands {far_m:.1f} m from the region of interest",
-            f"within the {sensor.range_m:g} m of {sensor.name}",
+            f"a place within the range of {sensor.name}, {sensor.range_m:g} m"
+            + (_DEGREES if _like_degrees(pose) else ""),
         )
     inside = _solid_among(scene.world, pose, over)
     if inside is not None:

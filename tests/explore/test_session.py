@@ -179,7 +179,7 @@ def test_the_rank_is_among_the_others(opened: Session) -> None:
     [
         ({"x_m": 16.0, "y_m": 6.0}, "(16, 6, 3) stands inside house (building); a free place"),
         ({"z_m": -1.0}, "z_m = -1 is not above the ground (z = 0); a height above 0 m"),
-        ({"x_m": 500.0}, "stands 460.0 m from the region of interest; within the 100 m of small"),
+        ({"x_m": 500.0}, "stands 460.0 m from the region of interest; a place within the range of small, 100 m"),
     ],
 )
 def test_where_none_can_stand_the_reason_is_told(opened: Session, change: dict[str, float], message: str) -> None:

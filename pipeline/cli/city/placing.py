@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipeline.cli.arguments import Set
-from pipeline.cli.city.running import CityOut, CityPath, Cluster, Junctions, told_done
+from pipeline.cli.city.running import CityOut, CityPath, CitySet, Cluster, Junctions, told_done
 
 if TYPE_CHECKING:
     from pipeline.city.city_place import CityPlacement
@@ -23,7 +22,7 @@ def place(
     ] = None,
     cluster: Cluster = "local",
     junction: Junctions = None,
-    set_: Set = None,
+    set_: CitySet = None,
 ) -> None:
     """Which poles over all junctions together: the best plan of the whole city."""
     from pipeline.city import city_place, model

@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipeline.cli.arguments import Set
-
 if TYPE_CHECKING:
     from pipeline.city.city_run import CityRun
     from pipeline.city.running.jobs import Done
@@ -28,13 +26,22 @@ Junctions = Annotated[
     list[str] | None, typer.Option("--junction", metavar="ID", help="This junction only; all by default. Repeatable.")
 ]
 
+CitySet = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Override one value of every junction, e.g. score.gamma=2; not of the traffic.",
+    ),
+]
+
 
 def run(
     city: CityPath,
     out: CityOut = None,
     cluster: Cluster = "local",
     junction: Junctions = None,
-    set_: Set = None,
+    set_: CitySet = None,
 ) -> None:
     """Run every junction: the traffic once, then all of them on the processes of a cluster."""
     from pipeline.city import city_run, model

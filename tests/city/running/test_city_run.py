@@ -65,6 +65,14 @@ def test_scores_are_one_table_and_junctions_are_ranked(city: City, tmp_path: Pat
     assert "http" not in re.sub(r"arXiv|http://www.w3.org/2000/svg", "", html)
 
 
+def test_the_traffic_of_one_junction_is_no_ones(city: City, tmp_path: Path) -> None:
+    for override in ("traffic.frames=5", "traffic.periods.rush.weight=2", "traffic = {}"):
+        with pytest.raises(InputError) as caught:
+            city_run.run(city, tmp_path / "out", sets=["score.gamma=2", override])
+        assert str(caught.value).startswith(f"--set {override}: the traffic of a city is simulated once")
+        assert f" in {city.file}, then " in str(caught.value)
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("here")
 def test_one_junction_alone_is_chosen(city: City, tmp_path: Path) -> None:
