@@ -64,14 +64,14 @@ def told_done(done: Done) -> str:
 
 
 def print_junctions(ran: CityRun) -> None:
-    """The junctions, the best first, and what was written."""
+    """The junctions, the best first, and what was written; no titles where the terminal is narrow."""
     from pipeline.city.results.words import gain_words
-    from pipeline.cli.terminal import WIDE, console, table
+    from pipeline.cli.terminal import NARROW, WIDE, console, table
 
     out, by = console(WIDE), ran.results[0].best.by
     gain = gain_words(by.name)
     shown = ("rank", "junction", "title", "best site", gain.head, by.head, "entropy seen", "vehicles", "sites")
-    names = [*dict.fromkeys(shown)]
+    names = [name for name in dict.fromkeys(shown) if name != "title" or out.width >= NARROW]
     rows = table(names, left=("junction", "title", "best site"), whole=[name for name in names if name != "title"])
     for its in ran.results:
         best = its.best
