@@ -1,9 +1,9 @@
 """Embree's tree of triangles, asked for eight rays at a time.
 
 embreex brings Embree 4 (https://github.com/RenderKit/embree), and asks it for one ray after the other. Beams that leave
-a sensor side by side enter much the same boxes of the tree, and Embree takes eight of them together in a third of the
-time. So the library that embreex has loaded is called here by its own interface; names, numbers and layouts are those
-of its headers, ``rtcore*.h``.
+a sensor side by side enter much the same boxes of the tree, and Embree takes eight of them together in half the time
+or less. So the library that embreex has loaded is called here by its own interface; names, numbers and layouts are
+those of its headers, ``rtcore*.h``.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any
 
 import embreex.rtcore_scene
 import llvmlite.binding
+import numba
 import numpy as np
 from numba import types
 from numpy.typing import NDArray
@@ -31,7 +32,10 @@ _MAJOR_VERSION, _OUT_OF_MEMORY, _COHERENT, _ALL = 1, 4, 1 << 16, 0xFFFFFFFF
 _ROBUST = 1 << 2  # else packets leak between triangles seen from afar, or along their surface
 
 _BLOCK, _BINS = 512, 512  # rays that are sorted together, and into how many bins
-_STRIDE = 13  # shares no divisor with the number of a sensor's channels
+_STRIDE = 13  # the usual numbers of channels are no multiples of it
+_SMALLEST, _LARGEST = 1e-17, 1e18
+"""Components of directions that are not between these are taken for 0: Embree takes smaller ones for positive, but the
+packet for one that goes along their sign, and then loses hits of all its rays."""
 
 _pointer, _number, _size = ctypes.c_void_p, ctypes.c_uint, ctypes.c_size_t
 _SIGNATURES: dict[str, tuple[Any, ...]] = {  # what each returns, then what it takes
@@ -54,7 +58,12 @@ for _name, (_returned, *_taken) in _SIGNATURES.items():
     getattr(_library, _name).restype, getattr(_library, _name).argtypes = _returned, _taken
 
 llvmlite.binding.add_symbol("rtcIntersect8", ctypes.cast(_library.rtcIntersect8, _pointer).value)
-_intersect = types.ExternalFunction("rtcIntersect8", types.void(types.intp, types.intp, types.intp, types.intp))
+_library.rtcIntersect8.argtypes, _library.rtcIntersect8.restype = (_pointer,) * 4, None
+_intersect = (
+    _library.rtcIntersect8
+    if numba.config.DISABLE_JIT  # type: ignore[attr-defined]
+    else types.ExternalFunction("rtcIntersect8", types.void(types.intp, types.intp, types.intp, types.intp))
+)
 _kernel = compiled()
 _inlined = compiled(forceinline=True)
 
@@ -76,7 +85,7 @@ class Tree:
     def __init__(self, triangles: NDArray[np.float64]) -> None:
         device, count = _device(), len(triangles)
         self._scene = _library.rtcNewScene(device)
-        weakref.finalize(self, _library.rtcReleaseScene, self._scene)
+        weakref.finalize(self, _library.rtcReleaseScene, self._scene).atexit = False  # a thread may still be casting
         _library.rtcSetSceneFlags(self._scene, _ROBUST)
         shape = _library.rtcNewGeometry(device, _TRIANGLES)
         _library.rtcAttachGeometry(self._scene, shape)
@@ -85,10 +94,8 @@ class Tree:
         _fill(shape, _INDICES, _UINT3, np.arange(3 * count, dtype=np.uint32))
         _library.rtcCommitGeometry(shape)
         _library.rtcCommitScene(self._scene)
-        error = _library.rtcGetDeviceError(device)
-        if error:
-            kind = MemoryError if error == _OUT_OF_MEMORY else RuntimeError
-            raise kind(f"Embree built no tree of {count:,} triangles: its error {error}")
+        if error := _error_so_far(f"Embree built no tree of {count:,} triangles"):
+            raise error
 
     def nearest(self, o: NDArray[np.float64], beam: NDArray[np.uint32], d: NDArray[np.float64]) -> NDArray[np.int32]:
         """Which triangle each ray meets first, -1 for none, (n,).
@@ -143,8 +150,16 @@ def _fill(shape: int, kind: int, form: int, values: NDArray[Any]) -> None:
     """Give a shape its corners, or which three of them make each triangle."""
     room = _library.rtcSetNewGeometryBuffer(shape, kind, 0, form, 12, values.size // 3)
     if room is None:
-        raise MemoryError(f"Embree has no room for {values.nbytes:,} bytes")
+        what = f"Embree has no room for {values.nbytes:,} bytes"
+        raise _error_so_far(what) or MemoryError(what)
     ctypes.memmove(room, values.ctypes.data, values.nbytes)
+
+
+def _error_so_far(what: str) -> Exception | None:
+    """What went wrong in this thread since the last call, if anything; Embree forgets it."""
+    code = _library.rtcGetDeviceError(_device())
+    kind = MemoryError if code == _OUT_OF_MEMORY else RuntimeError
+    return kind(f"{what}: its error {code}") if code else None
 
 
 def _aligned(rows: int) -> NDArray[np.float32]:
@@ -201,7 +216,9 @@ def _ask(scene, asked, o, beam, d, order, valid, packet, words, found):  # type:
     for start in range(0, count, _PACKET):
         for k in range(_PACKET):
             n = beam[order[min(start + k, count - 1)]]
-            packet[_DIRECTION, k], packet[_DIRECTION + 1, k], packet[_DIRECTION + 2, k] = d[n, 0], d[n, 1], d[n, 2]
+            for axis in range(3):
+                part = d[n, axis]
+                packet[_DIRECTION + axis, k] = part if _SMALLEST < abs(part) < _LARGEST else 0.0
             packet[_FAR, k] = np.inf
             words[_TRIANGLE, k], words[_SHAPE, k] = _NONE, _NONE
         _intersect(valid.ctypes.data, scene, packet.ctypes.data, asked)

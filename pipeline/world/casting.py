@@ -11,8 +11,9 @@ Embree (float32) answers *which triangle*, float64 *where*:
    of an edge, or met a surface at less than 0.6 degrees, is doubtful (one in a thousand); its first hit is searched
    among all true triangles in float64.
 
-What is left to float32: where a surface stands on the middle of another (a wall on the ground), a beam within some 1e-5
-m of the line between them may be given the farther of the two, which then lies less than 1 mm behind the nearer.
+What is left to float32: where two surfaces come within some 1e-5 m of each other, a beam that meets both there may be
+given the farther one. Where a wall stands on the ground, that lies less than 1 mm behind the nearer; for surfaces that
+almost coincide and are seen at a degree, some millimetres (``docs/numerics.md``).
 """
 
 from __future__ import annotations
