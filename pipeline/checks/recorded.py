@@ -32,11 +32,12 @@ def in_region(boxes: float, trajectories: Path) -> Iterator[Finding]:
     """
     if boxes >= limits.FEW_BOXES:
         return
-    cure = "a region where vehicles drive, more traffic, or coordinates of one frame"
     if boxes == 0:
         what = f"no vehicle is ever in it{_extent(trajectories)}: the sites cannot be ranked"
+        cure = "a region where vehicles drive, more traffic, or coordinates of one frame"
         yield Finding("traffic in the region", "roi", what, cure)
     else:
+        cure = "more vehicles in [traffic], or a region that holds more of the road"
         what = f"{boxes:.2g} vehicles are in it in a mean frame: the ranking rests on hardly any traffic"
         yield Finding("traffic in the region", "roi", what, cure)
 

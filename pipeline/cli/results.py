@@ -134,6 +134,11 @@ def print_new_scenario(made: NewScenario) -> None:
     out = console(_FILE_WIDTH)
     for key, value in made.to_json().items():
         out.print(f"{key}: {in_words(value) if isinstance(value, dict) else value_in_words(value)}")
+    hourly = made.to_json()["assumed_traffic"]["vehicles_per_hour"]
+    out.print(
+        f"warning: the traffic is assumed ({hourly:,} vehicles an hour), and the order of sites hangs on it; put what "
+        f"was counted there into [traffic] of {made.folder / 'scenario.toml'} before you build on a ranking"
+    )
     out.print(f"next: egvs run {made.folder}")
 
 
