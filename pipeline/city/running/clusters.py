@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import logging
 import re
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from pipeline.core import parallel, plugins
-from pipeline.core.errors import InputError
+from pipeline.core.errors import InputError, RunError
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -34,6 +35,12 @@ _TALKERS = ("distributed", "distributed.client", "tornado.application")
 
 _MOST = 1000
 """Processes on one machine."""
+
+LOOK_S = 5.0
+"""So often a run that hears nothing looks after the processes of this machine."""
+
+_GONE_S, _MOST_TIMES = 60.0, 3
+"""A process that is away for so long is replaced; so often, while nothing is done."""
 
 
 @contextmanager
@@ -80,6 +87,45 @@ def connected(where: str, *, memory_limit: str = "auto") -> Iterator[Client]:
             Client(cluster, set_as_default=False) as client,
         ):  # fmt: skip
             yield client
+
+
+class Crew:
+    """The processes of a cluster on this machine: Dask starts one again that was ended, but not when it is ended while
+    it starts; then nobody would do its work, and the run would wait for ever. Of another cluster nothing is asked.
+
+    Parameters
+    ----------
+    client
+        Of the cluster.
+    """
+
+    def __init__(self, client: Client) -> None:
+        self._client, self._times = client, 0
+        self._looked = self._all_there = time.monotonic()
+
+    def works(self) -> None:
+        """Something was done."""
+        self._times = 0
+
+    def look(self) -> None:
+        """Replace processes that are away for long, if it is time to look; RunError where that was of no use."""
+        cluster, now = self._client.cluster, time.monotonic()
+        if cluster is None or now - self._looked < LOOK_S:
+            return
+        self._looked = now
+        there = {its["name"] for its in self._client.scheduler_info(n_workers=-1)["workers"].values()}
+        gone = [name for name in cluster.worker_spec if name not in there]
+        if not gone:
+            self._all_there = now
+        elif now - self._all_there > _GONE_S:
+            if self._times == _MOST_TIMES:
+                found = f"{len(gone)} processes of this machine ended as soon as they were started"
+                raise RunError(f"{found}; mostly memory is wanting: fewer processes; what is done is kept")
+            self._all_there, self._times = now, self._times + 1
+            count = len(cluster.worker_spec)
+            for name in gone:
+                del cluster.worker_spec[name]
+            cluster.scale(count)
 
 
 def check(where: str) -> None:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from pipeline.city.running import graph, tasks
+from pipeline.city.running import clusters, graph, tasks
 from pipeline.city.running.jobs import Done, Failed, Job, Order, program
 from pipeline.core.errors import EgvsError, InputError, RunError
 from pipeline.core.progress import Progress, silent
@@ -108,9 +108,20 @@ def _workers(client: Client) -> int:
 
 
 def _finished(client: Client, futures: list[Future]) -> Iterator[Future]:
-    from distributed import as_completed
+    """Futures as they are done, while there are workers; see :class:`pipeline.city.running.clusters.Crew`."""
+    from distributed import wait
 
-    yield from as_completed(futures, loop=client.loop)
+    left, crew = list(futures), clusters.Crew(client)
+    while left:
+        crew.look()
+        try:
+            with client.as_current():
+                done = wait(left, timeout=clusters.LOOK_S, return_when="FIRST_COMPLETED").done
+        except TimeoutError:
+            continue
+        crew.works()
+        yield from (future for future in left if future in done)
+        left = [future for future in left if future not in done]
 
 
 def _result(future: Future, junctions: Sequence[str]) -> Any:

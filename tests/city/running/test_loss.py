@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
+from contextlib import suppress
 from pathlib import Path
 
+import psutil
 import pytest
 
 from pipeline.city.running import clusters, running
 from pipeline.city.running.jobs import Done, Job
+from pipeline.core.errors import RunError
 from tests.city.running.test_running import alone, assert_same
 
 pytestmark = pytest.mark.slow
@@ -36,3 +40,50 @@ def test_a_killed_worker_costs_no_byte(jobs: list[Job], tmp_path: Path, monkeypa
     with clusters.connected("processes=1") as client:
         running.run(client, jobs, heard=again.append)
     assert [its.made for its in again] == [()] * 3
+
+
+def test_a_worker_that_dask_does_not_start_again_is_replaced(jobs: list[Job], monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where it is killed a second time before it is quite there."""
+
+    async def fails() -> None:
+        raise RuntimeError("the process ended before it was there")
+
+    monkeypatch.setattr(clusters, "LOOK_S", 0.5)
+    monkeypatch.setattr(clusters, "_GONE_S", 8.0)
+    done: list[Done] = []
+    with clusters.connected("processes=1") as client:
+        (nanny,) = client.cluster.workers.values()
+        monkeypatch.setattr(nanny, "instantiate", fails)
+        (killed,) = workers()
+        os.kill(killed, signal.SIGKILL)
+        running.run(client, jobs, heard=done.append)
+        assert killed not in workers()
+    assert len(done) == 3
+
+
+def workers() -> list[int]:
+    """The processes of this one's cluster, whether or not they are there for it yet."""
+    children = psutil.Process().children(recursive=True)
+    return [its.pid for its in children if its.is_running() and "spawn_main" in " ".join(its.cmdline())]
+
+
+def test_workers_that_never_start_are_told(jobs: list[Job], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clusters, "LOOK_S", 0.2)
+    monkeypatch.setattr(clusters, "_GONE_S", 1.0)
+    ended = threading.Event()
+
+    def kill() -> None:
+        while not ended.wait(0.05):
+            for pid in workers():
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+
+    with clusters.connected("processes=1") as client:
+        killer = threading.Thread(target=kill)
+        killer.start()
+        try:
+            with pytest.raises(RunError, match="ended as soon as they were started"):
+                running.run(client, jobs)
+        finally:
+            ended.set()
+            killer.join()
