@@ -26,11 +26,12 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 from scipy.stats import qmc
 
 from benchmarks.scaling import Size, prepare, sides
@@ -186,7 +187,7 @@ def kills(folder: Path, seed: int, count: int = KILLS) -> None:
             stop = threading.Event()
             moments = sorted(rng.uniform(0.0, seconds) for _ in range(min(3, count - killed)))
             told: list[str] = []
-            killer = threading.Thread(target=_kill, args=(client, moments, rng.random(), stop, told))
+            killer = threading.Thread(target=_kill, args=(moments, random.Random(rng.random()), stop, told))
             with fresh(jobs):
                 killer.start()
                 running.run(client, jobs)
@@ -201,16 +202,26 @@ def kills(folder: Path, seed: int, count: int = KILLS) -> None:
     print(f"{killed} kills in {runs} runs: the same bytes in all")
 
 
-def _kill(client: Any, moments: list[float], which: float, stop: threading.Event, told: list[str]) -> None:
+def _kill(moments: list[float], rng: random.Random, stop: threading.Event, told: list[str]) -> None:
     start = time.perf_counter()
     for moment in moments:
         if stop.wait(max(0.0, moment - (time.perf_counter() - start))):
             return
-        pids = sorted(client.run(os.getpid).values())
-        if pids:
-            pid = pids[int(which * len(pids))]
-            os.kill(pid, signal.SIGKILL)
-            told.append(f"worker {pid} killed after {time.perf_counter() - start:.1f} s")
+        if pids := workers():
+            pid = rng.choice(pids)
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+                told.append(f"worker {pid} killed after {time.perf_counter() - start:.1f} s")
+
+
+def workers() -> list[int]:
+    """The processes that Dask has started here, those that only start as well."""
+    found = []
+    for its in psutil.Process().children(recursive=True):
+        with suppress(psutil.Error):  # it has ended meanwhile
+            if any("spawn_main" in word for word in its.cmdline()):
+                found.append(its.pid)
+    return found
 
 
 def digests(jobs: list[Job]) -> dict[str, str]:

@@ -25,9 +25,9 @@ from pipeline.kernels.compile_cache import compiled
 _PACKET = 8  # on a processor that cannot, Embree takes them one after the other
 _ALIGNMENT = 32  # bytes
 _ORIGIN, _NEAR, _DIRECTION, _TIME, _FAR, _MASK, _ID, _FLAGS = 0, 3, 4, 7, 8, 9, 10, 11  # rows of a packet: its rays,
-_TRIANGLE, _SHAPE, _ROWS = 17, 18, 24  # and its hits, some rows to spare; eight of 4 bytes in each
+_PRIM_ID, _GEOM_ID, _ROWS = 17, 18, 24  # and its hits, some rows to spare; eight of 4 bytes in each
 _NONE = 0xFFFFFFFF  # RTC_INVALID_GEOMETRY_ID
-_TRIANGLES, _INDICES, _CORNERS, _UINT3, _FLOAT3 = 0, 0, 1, 0x5003, 0x9003
+_TRIANGLE_TYPE, _INDEX_BUFFER, _VERTEX_BUFFER, _UINT3, _FLOAT3 = 0, 0, 1, 0x5003, 0x9003
 _MAJOR_VERSION, _OUT_OF_MEMORY, _COHERENT, _ALL = 1, 4, 1 << 16, 0xFFFFFFFF
 _ROBUST = 1 << 2  # else packets leak between triangles seen from afar, or along their surface
 
@@ -87,11 +87,11 @@ class Tree:
         self._scene = _library.rtcNewScene(device)
         weakref.finalize(self, _library.rtcReleaseScene, self._scene).atexit = False  # a thread may still be casting
         _library.rtcSetSceneFlags(self._scene, _ROBUST)
-        shape = _library.rtcNewGeometry(device, _TRIANGLES)
+        shape = _library.rtcNewGeometry(device, _TRIANGLE_TYPE)
         _library.rtcAttachGeometry(self._scene, shape)
         _library.rtcReleaseGeometry(shape)  # the scene keeps it
-        _fill(shape, _CORNERS, _FLOAT3, triangles.astype(np.float32))
-        _fill(shape, _INDICES, _UINT3, np.arange(3 * count, dtype=np.uint32))
+        _fill(shape, _VERTEX_BUFFER, _FLOAT3, triangles.astype(np.float32))
+        _fill(shape, _INDEX_BUFFER, _UINT3, np.arange(3 * count, dtype=np.uint32))
         _library.rtcCommitGeometry(shape)
         _library.rtcCommitScene(self._scene)
         if error := _error_so_far(f"Embree built no tree of {count:,} triangles"):
@@ -220,7 +220,7 @@ def _ask(scene, asked, o, beam, d, order, valid, packet, words, found):  # type:
                 part = d[n, axis]
                 packet[_DIRECTION + axis, k] = part if _SMALLEST < abs(part) < _LARGEST else 0.0
             packet[_FAR, k] = np.inf
-            words[_TRIANGLE, k], words[_SHAPE, k] = _NONE, _NONE
+            words[_PRIM_ID, k], words[_GEOM_ID, k] = _NONE, _NONE
         _intersect(valid.ctypes.data, scene, packet.ctypes.data, asked)
         for k in range(min(_PACKET, count - start)):
-            found[order[start + k]] = np.int32(words[_TRIANGLE, k])
+            found[order[start + k]] = np.int32(words[_PRIM_ID, k])

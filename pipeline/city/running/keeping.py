@@ -71,6 +71,14 @@ class Kept:
                 built.users -= 1
                 self._drop_oldest()
 
+    def drop(self, token: str, job: Job) -> None:
+        """Nobody here will ask for the scene of a junction again; one that is lent stays."""
+        with self._lock:
+            built, stack = self._kept.get((token, job), (None, None))
+            if built is not None and stack is not None and not built.users:
+                del self._kept[token, job]
+                stack.close()
+
     def _take(self, key: tuple[str, Job]) -> Built:
         if key not in self._kept:
             stack = ExitStack()

@@ -40,13 +40,15 @@ def from_store(parts: int) -> Callable[[SiteScoring], Iterator[ScoredSite]]:
     def scored(scoring: SiteScoring) -> Iterator[ScoredSite]:
         score_key = stage_keys.inputs("score", scoring.work).key
         for part in cut(len(scoring.names), parts):
-            with files.scratch() as folder:
-                yield from _bring(scoring, score_key, scoring.names[part], folder) if scoring.names[part] else ()
+            if names := scoring.names[part]:
+                with files.scratch() as folder:
+                    yield from scored_parts.read(_bring(scoring, score_key, names, folder))
 
     return scored
 
 
-def _bring(scoring: SiteScoring, score_key: str, names: tuple[str, ...], folder: Path) -> list[ScoredSite]:
+def _bring(scoring: SiteScoring, score_key: str, names: tuple[str, ...], folder: Path) -> Path:
+    """The file of some sites in a folder, from the store, where it is put if it is not there."""
     store, path = Store.default(), folder / PART
     program = code_digest.of(scored_parts.__name__).digest
     key = files.hash_of({"score": score_key, "sites": names, "program": program})
@@ -55,6 +57,6 @@ def _bring(scoring: SiteScoring, score_key: str, names: tuple[str, ...], folder:
             store.fetch(KIND, key)
             if store.take(KIND, key, folder) is None:  # nor has another one made it meanwhile
                 with measured() as cost:
-                    scored_parts.write(path, list(scoring.all_sites(only=names)))
+                    scored_parts.write(path, scoring.all_sites(only=names))
                 store.put(KIND, key, folder, Made({PART: files.sha256_of(path)}, {}, {}, cost))
-    return scored_parts.read(path)
+    return path

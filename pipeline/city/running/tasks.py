@@ -2,7 +2,8 @@
 
 A small junction is run whole, some of them in one task. Of a large one the artefacts that sites are scored from are
 made (:func:`prepare`), then its sites are scored in parts (:func:`score_part`), then its run is brought to its end
-(:func:`finish`), which takes from the store what the others have put there, and makes what is missing.
+(:func:`finish`), which takes from the store what the others have put there, and makes what is missing. What a task
+has left of memory, the next one gives back first: so a worker takes no more, however many sites there are.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import Any
 from pipeline.city.running import parts
 from pipeline.city.running.jobs import Done, Failed, Job, Order, told
 from pipeline.city.running.keeping import KEPT
+from pipeline.core.cost import let_go
 from pipeline.runs import workflow
 from pipeline.sensing import sensors, sites
 
@@ -51,6 +53,7 @@ def score_part(job: Job, order: Order, part: tuple[int, int], prepared: Failed |
     """Score one of some parts of the sites, (number, of how many); how many sites that were."""
     if prepared is not None:
         return prepared
+    let_go()
     with order.obeyed(), KEPT.lent(order.token, job) as built:
         scoring = built.ready()
         return parts.keep(scoring, built.score_key, parts.cut(len(scoring.names), part[1])[part[0]])
@@ -61,11 +64,13 @@ def finish(job: Job, order: Order, scored: Sequence[int | Failed]) -> Sequence[D
     failed = [its for its in scored if isinstance(its, Failed)]
     if failed:
         return failed[:1]
+    KEPT.drop(order.token, job)
     return [_run(job, order, {"score": {"scored_elsewhere": parts.from_store(len(scored))}})]
 
 
 @told
 def _run(job: Job, order: Order, help_from: dict[str, dict[str, Any]]) -> Done:
+    let_go()
     made: list[str] = []
     begin = perf_counter()
     with order.obeyed():

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import json
 import zipfile
-from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +29,8 @@ _KINDS = ("float64", "int64", "int32")
 _ABOUT = "about"
 
 
-def write(path: Path, sites: Sequence[ScoredSite]) -> None:
-    """Write some sites (none of them audited), in order."""
+def write(path: Path, sites: Iterable[ScoredSite]) -> None:
+    """Write some sites (none of them audited), in order; no more than one is held beside its numbers."""
     pool = _Pool()
     about = [pool.of_site(site) for site in sites]
     with files.aside(path) as partial, partial.open("wb") as file:
@@ -39,13 +38,14 @@ def write(path: Path, sites: Sequence[ScoredSite]) -> None:
         np.savez(file, allow_pickle=False, **{_ABOUT: text}, **pool.joined())
 
 
-def read(path: Path) -> list[ScoredSite]:
-    """The sites of a file; InputError where it is none."""
+def read(path: Path) -> Iterator[ScoredSite]:
+    """The sites of a file, one by one; InputError where it is none."""
     try:
         with np.load(path, allow_pickle=False) as stored:
             about = json.loads(stored[_ABOUT].tobytes())
-            arrays = {kind: stored[kind] for kind in _KINDS}
-            return [_site(value, _of(arrays), path) for value in about]
+            find = _of({kind: stored[kind] for kind in _KINDS})
+        for value in about:
+            yield _site(value, find, path)
     except (OSError, EOFError, ValueError, LookupError, TypeError, zipfile.BadZipFile) as error:
         raise InputError(path, f"is no part of a score ({error})", "remove it, and run again") from None
 
@@ -54,16 +54,15 @@ class _Pool:
     """Arrays, one after another, by their type."""
 
     def __init__(self) -> None:
-        self._parts: dict[str, list[NDArray[Any]]] = defaultdict(list)
-        self._length: dict[str, int] = defaultdict(int)
+        self._numbers = {kind: bytearray() for kind in _KINDS}
 
     def add(self, array: NDArray[Any] | None) -> list[Any] | None:
         """Where an array (n,) stands; None for none."""
         if array is None:
             return None
-        kind, start = str(array.dtype), self._length[str(array.dtype)]
-        self._parts[kind].append(array)
-        self._length[kind] += len(array)
+        kind = str(array.dtype)
+        start = len(self._numbers[kind]) // array.itemsize
+        self._numbers[kind] += array.tobytes()
         return [kind, start, len(array)]
 
     def many(self, arrays: Mapping[str, NDArray[Any]] | None) -> dict[str, Any] | None:
@@ -72,7 +71,7 @@ class _Pool:
 
     def joined(self) -> dict[str, NDArray[Any]]:
         """All of them, one array a type."""
-        return {kind: np.concatenate([np.empty(0, dtype=kind), *self._parts[kind]]) for kind in _KINDS}
+        return {kind: np.frombuffer(numbers, dtype=kind) for kind, numbers in self._numbers.items()}
 
     def of_site(self, its: ScoredSite) -> dict[str, Any]:
         """A site, its arrays by where they stand."""

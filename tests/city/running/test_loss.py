@@ -8,9 +8,9 @@ import threading
 from contextlib import suppress
 from pathlib import Path
 
-import psutil
 import pytest
 
+from benchmarks.city import workers
 from pipeline.city.running import clusters, running
 from pipeline.city.running.jobs import Done, Job
 from pipeline.core.errors import RunError
@@ -59,12 +59,6 @@ def test_a_worker_that_dask_does_not_start_again_is_replaced(jobs: list[Job], mo
         running.run(client, jobs, heard=done.append)
         assert killed not in workers()
     assert len(done) == 3
-
-
-def workers() -> list[int]:
-    """The processes of this one's cluster, whether or not they are there for it yet."""
-    children = psutil.Process().children(recursive=True)
-    return [its.pid for its in children if its.is_running() and "spawn_main" in " ".join(its.cmdline())]
 
 
 def test_workers_that_never_start_are_told(jobs: list[Job], monkeypatch: pytest.MonkeyPatch) -> None:

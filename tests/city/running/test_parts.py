@@ -41,7 +41,7 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     sites = [site("a", rng, full=True), site("b", rng, full=False), site("c", rng, full=True)]
     scored_parts.write(tmp_path / "part.npz", sites)
-    found = scored_parts.read(tmp_path / "part.npz")
+    found = list(scored_parts.read(tmp_path / "part.npz"))
     assert same([s.site for s in found], [s.site for s in sites])
     for there, here in zip(found, sites, strict=True):
         assert same((there.score, there.targets), (here.score, here.targets))
@@ -60,4 +60,4 @@ def test_the_same_sites_are_the_same_bytes(tmp_path: Path) -> None:
 def test_what_is_no_part_is_refused(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "part.npz").write_bytes(content)
     with pytest.raises(InputError, match="is no part of a score"):
-        scored_parts.read(tmp_path / "part.npz")
+        list(scored_parts.read(tmp_path / "part.npz"))

@@ -141,6 +141,18 @@ def test_a_worker_keeps_few_scenes(jobs: list[Job]) -> None:
         assert anew.work.folder != folders[2]
 
 
+def test_a_scene_that_nobody_will_ask_for_goes(jobs: list[Job]) -> None:
+    kept = keeping.Kept()
+    with kept.lent("token", jobs[0]) as built:
+        kept.drop("token", jobs[0])
+        assert built.work.folder.is_dir()  # it is still lent
+    kept.drop("another run", jobs[0])
+    assert built.work.folder.is_dir()
+    kept.drop("token", jobs[0])
+    assert not built.work.folder.exists()
+    kept.drop("token", jobs[0])
+
+
 def test_the_order_names_a_place_that_other_folders_can_be_left_for(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
