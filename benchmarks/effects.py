@@ -11,6 +11,9 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 import pipeline
 from pipeline.artefacts.readers import Tpog, read_tpog
 from pipeline.effects import scene_resolving
@@ -42,6 +45,7 @@ class Work:
 
     visibility: Visibility
     beams: list[Beams]
+    cells: NDArray[np.int64]
 
     @classmethod
     def of(cls, settings: list[str], world: World, tpog: Tpog, run: Path) -> Work:
@@ -49,13 +53,13 @@ class Work:
         scene = scene_resolving.resolve(pipeline.load(SCENARIO, settings), world)
         scanner = Scanner(scene)
         beams = [Beams.of(scanner.scan_site(site)) for site in scene.sites[:SITES]]
-        return cls(Visibility(scene, tpog, run / "trajectories.parquet"), beams)
+        return cls(Visibility(scene, tpog, run / "trajectories.parquet"), beams, np.flatnonzero(tpog.counts))
 
     def seconds(self) -> float:
         """Processor seconds of a round."""
         start = time.process_time()
         for beams in self.beams:
-            self.visibility.borrowed_hits(beams)
+            self.visibility.borrowed_hits(beams, self.cells)
         return time.process_time() - start
 
 

@@ -19,6 +19,7 @@ from pipeline.placement.solving.sight import Floats, GrowingSight, Ints, Row, Si
 from pipeline.scoring.targets.named import WORTHS
 from pipeline.scoring.targets.seen import SeenTargets
 from pipeline.scoring.visibility import Beams, Visibility
+from pipeline.scoring.voxel_shares import ever_occupied
 from pipeline.stages.base import Workspace
 from pipeline.stages.shared.scans import SiteBeams, scans
 from pipeline.stages.shared.scene import scene_of
@@ -40,7 +41,7 @@ class VoxelView:
     """
 
     def __init__(self, work: Workspace, tpogs: list[Tpog], most: float) -> None:
-        self.voxels: Ints = terms.voxels_that_count(tpogs)
+        self.voxels: Ints = ever_occupied(tpogs)
         self._visibility = Visibility(scene_of(work), tpogs[0], work.path(TRAJECTORIES))
         self.unit = self._visibility.unit
         highest, holds = most * self.unit, _MOST_BEAMS if self.unit == 1 else _MOST_SHARES
@@ -53,7 +54,7 @@ class VoxelView:
 
     def row(self, beams: Beams) -> Row:
         """What an empty scan hits."""
-        hits = self._visibility.borrowed_hits(beams)
+        hits = self._visibility.borrowed_hits(beams, self.voxels)
         return Row.of(hits[self.voxels], max(1, self._most))
 
 

@@ -89,6 +89,7 @@ class Scorer:
         self._asked: tuple[str, ...] = tuple(name for name in voxel_shares.NAMES if name in scene.scenario.score.asked)
         self._periods = tuple(_Field.of(its.tpog, its.leave_out) for its in periods)
         self._whole = _Field.of(tpog, leave_out)
+        self._cells = voxel_shares.ever_occupied([tpog, *(its.tpog for its in periods)])
         self._gamma, self.field = scene.scenario.gamma, self._whole.entropy
         self._visibility = Visibility(scene, tpog, trajectories)
 
@@ -109,7 +110,7 @@ class Scorer:
 
     def score(self, scan: Scan | Beams) -> SiteScore:
         """The score of one scan."""
-        return self._worth(self._visibility.borrowed_hits(_beams(scan)))
+        return self._worth(self._visibility.borrowed_hits(_beams(scan), self._cells))
 
     def score_and_hits(self, scan: Scan | Beams) -> tuple[SiteScore, NDArray[np.float64]]:
         """The score of one scan, and the beams that cross each voxel, (nx, ny, nz) float64."""

@@ -77,17 +77,19 @@ class RangeTable:
         whole: int,
         o: Floats,
         grid: Grid,
+        cells: NDArray[np.int64],
         thinned: NDArray[np.int64],
     ) -> None:
-        """Fill ``thinned`` with hits * ``whole`` * function(range), see :func:`pipeline.kernels.hits.thinning.thin`."""
+        """Fill ``thinned`` at ``cells`` with hits * ``whole`` * function(range), see
+        :func:`pipeline.kernels.hits.thinning.thin`."""
         shape = np.asarray(grid.shape, dtype=np.int64)
         per_m = 1.0 / self.piece_m
-        if not kernels.thin(hits, whole, o, shape, grid.voxel_m, self.near_m, per_m, self.cubics, thinned):
+        if not kernels.thin(hits, whole, o, shape, grid.voxel_m, self.near_m, per_m, self.cubics, cells, thinned):
             return
-        cells = np.flatnonzero(thinned < 0)
-        centres = np.column_stack(np.unravel_index(cells, grid.shape)) + 0.5
+        left = cells[thinned[cells] < 0]
+        centres = np.column_stack(np.unravel_index(left, grid.shape)) + 0.5
         range_m = np.sqrt(((centres - o) ** 2).sum(axis=1)) * grid.voxel_m
-        thinned[cells] = np.rint(self.function(range_m) * (-1 - thinned[cells])).astype(np.int64)
+        thinned[left] = np.rint(self.function(range_m) * (-1 - thinned[left])).astype(np.int64)
 
 
 def _cubics(function: ByRange, near_m: float, far_m: float, pieces: int) -> Floats:

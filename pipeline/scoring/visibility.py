@@ -97,9 +97,16 @@ class Visibility:
         self.unit = UNIT if transmit or self._detect or scene.weights_beams else 1
         self._local = threading.local()
 
-    def borrowed_hits(self, beams: Beams) -> Hits:
+    def borrowed_hits(self, beams: Beams, cells: NDArray[np.int64] | None = None) -> Hits:
         """Hits of one scan in each voxel, flat, (nx * ny * nz,), in ``unit``; valid until this thread's next call, so
-        that counters of a million voxels are not made anew."""
+        that counters of a million voxels are not made anew.
+
+        Parameters
+        ----------
+        cells
+            Flat index of the voxels that are asked for, (n,) int64: few voxels ever see traffic, and where effects
+            detect, only these are thinned. What stands in others means nothing. None for all.
+        """
         o, d, shape = in_voxels(beams, self._grid)
         self._refuse_too_many(beams)
         counted, weighted = self._counters()
@@ -108,10 +115,10 @@ class Visibility:
             march.count_hits(o, d, shape, self._grid.voxel_m, counted)
             if self.unit == 1:
                 return counted
-            return self._thinned(counted, UNIT, beams.sensor, o, weighted)
+            return self._thinned(counted, UNIT, beams.sensor, o, cells, weighted)
         weighted.fill(0)
         self._add_shares(beams, o, d, weighted)
-        return self._thinned(weighted, 1, beams.sensor, o, weighted)
+        return self._thinned(weighted, 1, beams.sensor, o, cells, weighted)
 
     def _counters(self) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
         """This thread's counters: of beams, and in ``UNIT`` where anything weights beams."""
@@ -123,12 +130,18 @@ class Visibility:
         return counters
 
     def _thinned(
-        self, hits: Hits, whole: int, sensor: Sensor, o: NDArray[np.float64], thinned: NDArray[np.int64]
+        self,
+        hits: Hits,
+        whole: int,
+        sensor: Sensor,
+        o: NDArray[np.float64],
+        cells: NDArray[np.int64] | None,
+        thinned: NDArray[np.int64],
     ) -> NDArray[np.int64]:
-        """``hits`` times ``whole``, less what is not detected, in ``thinned``."""
+        """``hits`` times ``whole``, less what is not detected, in ``thinned`` at ``cells``."""
         if self._detect:
             table = RangeTable.over(partial(self._detected, sensor), o * self._grid.voxel_m, self._grid)
-            table.thin(hits, whole, o, self._grid, thinned)
+            table.thin(hits, whole, o, self._grid, np.arange(len(thinned)) if cells is None else cells, thinned)
         elif hits is not thinned:
             np.multiply(hits, whole, out=thinned, dtype=np.int64)
         return thinned

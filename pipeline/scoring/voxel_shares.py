@@ -8,14 +8,24 @@ with w = 1 where traffic ever is (``coverage``: the rest are blind spots; Kim et
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.artefacts.readers import Tpog
 from pipeline.scoring.thinning import Hits
 
 NAMES = ("entropy_seen", "coverage", "expected_visibility")
+
+
+def ever_occupied(tpogs: Sequence[Tpog]) -> NDArray[np.int64]:
+    """Flat index of every voxel that traffic ever occupies in one of some TPOGs over one grid, ascending."""
+    occupied = np.zeros(tpogs[0].counts.shape, dtype=np.bool_)
+    for tpog in tpogs:
+        occupied |= tpog.counts > 0
+    return np.flatnonzero(occupied)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import pickle
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import pipeline
 from pipeline.core.errors import InputError
-from pipeline.scoring.scorer import Scorer
+from pipeline.scoring.scorer import PeriodTpog, Scorer
 from pipeline.sensing.scanner import Scanner
 from pipeline.sensing.sites import Pose
 
@@ -38,6 +39,19 @@ def test_it_gives_what_the_stage_wrote(run):
         assert (worth.egvs, worth.entropy_seen) == (rows[site.name]["egvs"], rows[site.name]["entropy_seen"])
         assert np.array_equal(hits, pipeline.read_visibility(folder / "visibility.parquet", site.name))
         assert rows[site.name]["egvs_limit"] == scorer.limit
+
+
+def test_a_score_is_that_of_the_hits_of_all_voxels(run):
+    """Also where a period alone has traffic that the whole has not."""
+    scene, folder = run
+    scanner, tpog = Scanner(scene), pipeline.read_tpog(folder / "tpog.parquet")
+    elsewhere = PeriodTpog("elsewhere", replace(tpog, counts=np.roll(tpog.counts, 5, axis=1)))
+    for site in scene.sites:
+        scan = scanner.scan_site(site)
+        scorer = Scorer(scene, tpog, folder / "trajectories.parquet", periods=(elsewhere,))
+        whole, _ = Scorer(scene, tpog, folder / "trajectories.parquet", periods=(elsewhere,)).score_and_hits(scan)
+        assert scorer.score(scan) == whole
+        assert whole.by_period[0].egvs not in (0.0, whole.egvs)
 
 
 def test_hits_belong_to_the_caller_and_scores_to_no_order(run):

@@ -13,6 +13,7 @@ from pipeline.scoring.thinning import TOLERANCE, ByRange, RangeTable
 
 GRID = Grid((0.0, 0.0, 0.0), 0.5, (30, 20, 6))
 WHOLE = 2**32
+ALL = np.arange(math.prod(GRID.shape))
 
 FUNCTIONS: dict[str, ByRange] = {
     "nothing is lost": np.ones_like,
@@ -50,14 +51,25 @@ def test_every_voxel_is_thinned_by_its_range(name: str, sensor: str) -> None:
     o_m, hits = np.array(SENSORS[sensor]), np.random.default_rng(1).integers(0, 9, math.prod(GRID.shape))
     hits[:3] = 0, 2**20, 1
     table, thinned = RangeTable.over(FUNCTIONS[name], o_m, GRID), np.empty(len(hits), dtype=np.int64)
-    table.thin(hits.astype(np.uint32), WHOLE, o_m / GRID.voxel_m, GRID, thinned)
+    table.thin(hits.astype(np.uint32), WHOLE, o_m / GRID.voxel_m, GRID, ALL, thinned)
     # From afar a rounding of the range is 1e-9 m, and these functions are not that smooth.
     steep = 1e-9 * 700 if sensor == "far away" else 1e-12 * 700
     off = np.abs(thinned - hits * WHOLE * asked(FUNCTIONS[name], SENSORS[sensor]))
     assert (off <= 0.5 + hits * WHOLE * (1.1 * TOLERANCE + steep)).all()
     weighted = hits * WHOLE
-    table.thin(weighted, 1, o_m / GRID.voxel_m, GRID, weighted)
+    table.thin(weighted, 1, o_m / GRID.voxel_m, GRID, ALL, weighted)
     assert weighted.tolist() == thinned.tolist()
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_only_voxels_that_are_asked_for_are_touched(name: str) -> None:
+    o_m, hits = np.array(SENSORS["inside"]), np.random.default_rng(2).integers(0, 9, len(ALL)).astype(np.uint32)
+    table, whole, some = RangeTable.over(FUNCTIONS[name], o_m, GRID), np.empty(len(ALL), np.int64), ALL[5::7]
+    table.thin(hits, WHOLE, o_m / GRID.voxel_m, GRID, ALL, whole)
+    thinned = np.full(len(ALL), -77)
+    table.thin(hits, WHOLE, o_m / GRID.voxel_m, GRID, some, thinned)
+    assert thinned[some].tolist() == whole[some].tolist()
+    assert (np.delete(thinned, some) == -77).all()
 
 
 def test_a_limit_is_met_to_the_last_bit() -> None:
@@ -66,7 +78,7 @@ def test_a_limit_is_met_to_the_last_bit() -> None:
     for limit_m, seen in ((7.0, 15), (math.nextafter(7.0, 0.0), 14)):
         table = RangeTable.over(lambda r, limit_m=limit_m: (r <= limit_m).astype(float), o * GRID.voxel_m, GRID)
         thinned = np.empty(len(ones), dtype=np.int64)
-        table.thin(ones, WHOLE, o, GRID, thinned)
+        table.thin(ones, WHOLE, o, GRID, ALL, thinned)
         assert thinned.reshape(GRID.shape)[:, 0, 0].tolist() == [WHOLE] * seen + [0] * (30 - seen)
 
 
@@ -81,6 +93,6 @@ def test_a_smooth_function_is_asked_seldom_and_a_rough_one_for_each_voxel() -> N
         calls.clear()
         table = RangeTable.over(counted(FUNCTIONS[name]), o_m, GRID)
         tried, thinned = len(calls), np.empty(len(hits), dtype=np.int64)
-        table.thin(hits, WHOLE, o_m / GRID.voxel_m, GRID, thinned)
+        table.thin(hits, WHOLE, o_m / GRID.voxel_m, GRID, ALL, thinned)
         assert sum(calls[tried:]) <= most
         assert tried == (1 if name != "narrow bands" else 3)

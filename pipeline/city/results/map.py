@@ -73,12 +73,13 @@ def box_of(places_m: Sequence[tuple[float, float]]) -> Box:
 
 
 def street_paths(path: Path | None, box: Box) -> list[str]:
-    """The middle lines of a network's roads within a box, as paths of its :func:`frame`; none without a network."""
+    """The middle lines of a network's roads within a box, those over junctions as well, as paths of its :func:`frame`;
+    none without a network."""
     if path is None:
         return []
     plan, paths = frame(box), []
     for edge in network.read(path).all_edges:
-        if edge.function or not edge.lanes:
+        if edge.function not in ("", "internal") or not edge.lanes:
             continue
         line = edge.lanes[-1].shape_m[:, :2]
         low, high = line.min(axis=0), line.max(axis=0)

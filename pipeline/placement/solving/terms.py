@@ -73,21 +73,13 @@ VOXEL_SCORES = ("egvs", "entropy_seen", "coverage", "expected_visibility")
 """The scores whose cells are voxels; those of all others are vehicle-frames."""
 
 
-def voxels_that_count(tpogs: list[Tpog]) -> Ints:
-    """Flat index of every voxel that traffic ever occupies in one of some TPOGs over one grid, ascending."""
-    occupied = np.zeros(int(np.prod(tpogs[0].grid.shape)), dtype=np.bool_)
-    for tpog in tpogs:
-        occupied |= tpog.counts.ravel() > 0
-    return np.flatnonzero(occupied).astype(np.int64)
-
-
 def voxel_term(name: str, score: str, sight: Sight, tpog: Tpog, voxels: Ints, gamma: float, unit: int) -> Term:
     """One of :data:`VOXEL_SCORES`.
 
     Parameters
     ----------
     voxels
-        The cells of ``sight``, see :func:`voxels_that_count`.
+        The cells of ``sight``, see :func:`pipeline.scoring.voxel_shares.ever_occupied`.
     gamma, unit
         Cap on the hits of a voxel, and what a whole beam adds to them.
     """
