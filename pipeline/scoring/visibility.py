@@ -104,8 +104,8 @@ class Visibility:
         Parameters
         ----------
         cells
-            Flat index of the voxels that are asked for, (n,) int64: few voxels ever see traffic, and where effects
-            detect, only these are thinned. What stands in others means nothing. None for all.
+            Flat index of the voxels that are asked for, (n,) int64: scores look only where traffic ever is, and where
+            effects detect, only these are thinned. What stands in others means nothing. None for all.
         """
         o, d, shape = in_voxels(beams, self._grid)
         self._refuse_too_many(beams)
