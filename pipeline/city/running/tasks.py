@@ -3,7 +3,7 @@
 A small junction is run whole, some of them in one task. Of a large one the artefacts that sites are scored from are
 made (:func:`prepare`), then its sites are scored in parts (:func:`score_part`), then its run is brought to its end
 (:func:`finish`), which takes from the store what the others have put there, and makes what is missing. What a task
-has left of memory, the next one gives back first: so a worker takes no more, however many sites there are.
+has left of memory, the next one gives back first: so a worker takes hardly more for many sites than for a few.
 """
 
 from __future__ import annotations
