@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: run test test-slow test-train unit lint bench scaling numerics validity detectability pictures schema docs fuzz clean
+.PHONY: run test test-slow test-train unit lint bench scaling numerics validity detectability pictures schema reference docs fuzz clean
 
 run: $(VENV)/.installed
 	$(BIN)/egvs run scenarios/nishishinjuku
@@ -64,8 +64,12 @@ fuzz: $(VENV)/.installed-dev
 	$(BIN)/python -m tests.fuzz $(FUZZ)
 
 schema: $(VENV)/.installed
-	$(BIN)/python -c "from pipeline.scenario.loading import json_schema; print(json_schema(), end='')" > data_schemas/scenario.schema.json
-	$(BIN)/python -c "from pipeline.city.model import json_schema; print(json_schema(), end='')" > data_schemas/city_file.schema.json
+	$(BIN)/python -c "from egvs.scenario.loading import json_schema; print(json_schema(), end='')" > data_schemas/scenario.schema.json
+	$(BIN)/python -c "from egvs.city.model import city_json_schema; print(city_json_schema(), end='')" > data_schemas/city_file.schema.json
+
+# The reference pages: every scenario key, every artefact column. Run it after `make schema`.
+reference: $(VENV)/.installed
+	$(BIN)/python docs/mkdocs/reference.py
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	@$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11) and 'egvs needs Python 3.11 or newer; name one with: make PYTHON=...')"

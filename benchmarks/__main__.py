@@ -23,19 +23,18 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-import pipeline
+import egvs
 from benchmarks import casting, clouds, detection, effects, guards, judging, others, savings, stability
 from benchmarks.scenes import run_stage
-from pipeline.artefacts.readers import read_tpog
-from pipeline.core.parallel import in_order
-from pipeline.effects import scene_resolving
-from pipeline.kernels import march
-from pipeline.scoring.scorer import Scorer
-from pipeline.scoring.visibility import Beams, Visibility, in_voxels
-from pipeline.sensing.scanner import Scanner
-from pipeline.sensing.sites import Site
-from pipeline.stages import tpog
-from pipeline.world.mesh import read_ply
+from egvs.artefacts.tpog import read_tpog
+from egvs.core.runtime import map_ordered
+from egvs.kernels import traversal
+from egvs.scoring.scorer import Scorer
+from egvs.scoring.visibility import Beams, HitCounter, to_voxel_units
+from egvs.sensors.scanner import Scanner
+from egvs.sensors.sites import Site
+from egvs.stages import inputs, tpog
+from egvs.world.mesh import read_ply
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENARIO = ROOT / "scenarios" / "nishishinjuku"
@@ -62,14 +61,14 @@ def once(work: Callable[[], Any]) -> float:
 
 def every(work: Callable[[Site], object], sites: Iterable[Site], threads: int = 1) -> None:
     """Do the work for every site."""
-    for _ in in_order(work, sites, threads):
+    for _ in map_ordered(work, sites, threads):
         pass
 
 
-def egvs(*arguments: str) -> tuple[float, float]:
+def run_egvs(*arguments: str) -> tuple[float, float]:
     """Wall seconds and peak memory in MB of the command line in a process of its own."""
     code = (
-        "import resource, sys; from pipeline.cli.app import main\n"
+        "import resource, sys; from egvs.cli.app import main\n"
         "try: main()\n"
         "finally: print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024, file=sys.stderr)"
     )
@@ -87,7 +86,7 @@ def egvs(*arguments: str) -> tuple[float, float]:
 
 def whole_run(folder: Path) -> tuple[list[tuple[str, str, str, bool]], float]:
     """The main job from nothing, and the yardstick: SUMO's own seconds."""
-    egvs(
+    run_egvs(
         "run",
         str(SCENARIO),
         "--out",
@@ -97,10 +96,10 @@ def whole_run(folder: Path) -> tuple[list[tuple[str, str, str, bool]], float]:
         "--set",
         "traffic.warmup_s=50",
     )
-    took, peak = egvs("run", str(SCENARIO), "--out", str(folder / "run"))
+    took, peak = run_egvs("run", str(SCENARIO), "--out", str(folder / "run"))
     record = json.loads((folder / "run" / "run.json").read_text())
     sumo = record["stages"]["traffic"]["summary"]["sumo_seconds"]
-    helped = statistics.median(egvs("--help")[0] for _ in range(5))
+    helped = statistics.median(run_egvs("--help")[0] for _ in range(5))
     allowed = 2 * sumo + 3
     return [
         (
@@ -117,7 +116,7 @@ def whole_run(folder: Path) -> tuple[list[tuple[str, str, str, bool]], float]:
 
 def occupancy(folder: Path, sumo: float) -> list[tuple[str, str, str, bool]]:
     """From trajectories.parquet to tpog.parquet."""
-    scenario = pipeline.load(SCENARIO)
+    scenario = egvs.load(SCENARIO)
     took = seconds(lambda: run_stage(tpog, scenario, folder / "run"))
     share = took / sumo
     return [("tpog, 5000 frames x 50 vehicles", f"{took:.3f} s = {share:.1%} of SUMO's time", "20 %", share < 0.20)]
@@ -125,10 +124,10 @@ def occupancy(folder: Path, sumo: float) -> list[tuple[str, str, str, bool]]:
 
 def sites(folder: Path) -> list[tuple[str, str, str, bool]]:
     """Scan and score, site by site: from the static world and the TPOG in memory to a score."""
-    scenario, run = pipeline.load(SCENARIO), folder / "run"
-    scene = scene_resolving.resolve(scenario, read_ply(run / "statics.ply")[0])
+    scenario, run = egvs.load(SCENARIO), folder / "run"
+    scene = inputs.resolve_scene(scenario, read_ply(run / "statics.ply")[0])
     counted = read_tpog(run / "tpog.parquet")
-    scanner, scorer, visibility = Scanner(scene), Scorer(scene, counted), Visibility(scene, counted)
+    scanner, scorer, visibility = Scanner(scene), Scorer(scene, counted), HitCounter(scene, counted)
     beams = {site: Beams.of(scanner.scan_site(site)) for site in scene.sites}
     hits = np.zeros(int(np.prod(counted.grid.shape)), dtype=np.uint32)
 
@@ -136,9 +135,9 @@ def sites(folder: Path) -> list[tuple[str, str, str, bool]]:
         return scorer.score(scanner.scan_site(site)).egvs
 
     def march_one(site: Site) -> None:
-        o, d, shape = in_voxels(beams[site], counted.grid)
+        o, d, shape = to_voxel_units(beams[site], counted.grid)
         hits.fill(0)
-        march.count_hits(o, d, shape, counted.grid.voxel_m, hits)
+        traversal.count_hits(o, d, shape, counted.grid.voxel_m, hits)
 
     whole = statistics.median(seconds(partial(score_one, site)) for site in scene.sites)
     part = statistics.median(seconds(partial(march_one, site)) for site in scene.sites)
@@ -165,7 +164,7 @@ def main() -> None:
         "measured",
         "must reach",
         "reached",
-        title=f"egvs {pipeline.__version__}, {os.cpu_count()} cores",
+        title=f"egvs {egvs.__version__}, {os.cpu_count()} cores",
         box=None,
     )
     with tempfile.TemporaryDirectory() as temporary:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.validation.clouds import bodies
+from egvs.validation import cloud_simulation
 
 COLOURS = {
     "paint": (0.36, 0.47, 0.68),
@@ -33,7 +33,7 @@ def draw(path: Path) -> None:
     for row, kinds in enumerate(ROWS):
         at = np.array([0.0, -ROW_M * row])
         for kind in kinds:
-            size = np.array(bodies.drawn_size_m(kind))
+            size = np.array(cloud_simulation.drawn_size_m(kind))
             edges, _ = _seen(_edges(size))
             left, right = edges[:, :, 0].min(), edges[:, :, 0].max()
             spare = max(LABEL_M - (right - left), 0.0) / 2
@@ -41,7 +41,7 @@ def draw(path: Path) -> None:
             shapes, colours = _painted(kind, size)
             axes.add_collection(PolyCollection(shapes + at, facecolors=colours, edgecolors=colours, linewidths=0.4))
             axes.add_collection(LineCollection(edges + at, colors=(0.55, 0.55, 0.55), linewidths=0.6))
-            count = sum(len(part.triangles) for part in bodies.own()[kind])
+            count = sum(len(part.triangles) for part in cloud_simulation.builtin_bodies()[kind])
             what = " x ".join(f"{value:g}" for value in size)
             text = f"{kind}\n{what} m\n{count} triangles"
             middle, below = at[0] + (left + right) / 2, at[1] + edges[:, :, 1].min() - 0.2
@@ -69,7 +69,7 @@ def _painted(kind: str, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     import trimesh
 
     found, colours = [], []
-    for part in bodies.own()[kind]:
+    for part in cloud_simulation.builtin_bodies()[kind]:
         corners = (part.triangles * size).reshape(-1, 3)
         vertices, faces = trimesh.remesh.subdivide_to_size(
             corners, np.arange(len(corners)).reshape(-1, 3), FINEST_M, 20

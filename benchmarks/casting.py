@@ -17,12 +17,13 @@ from typing import Any
 
 import numpy as np
 
-import pipeline
-from pipeline.effects.scene_building import build_scene
-from pipeline.kernels import rays
-from pipeline.kernels.embree import Tree
-from pipeline.sensing import sensors, sites
-from pipeline.world.casting import Caster
+import egvs
+from egvs.kernels import ray_triangle
+from egvs.kernels.embree import TriangleTree
+from egvs.sensors import sites
+from egvs.sensors.sensor import scenario_sensor
+from egvs.stages.inputs import build_scene
+from egvs.world.ray_casting import Caster
 
 _SCENARIOS = Path(__file__).resolve().parent.parent / "scenarios"
 _ROUNDS = 21
@@ -33,31 +34,41 @@ def _work(name: str) -> tuple[dict[str, Callable[[], Any]], int, int]:
     from embreex.mesh_construction import TriangleMesh
     from embreex.rtcore_scene import EmbreeScene
 
-    scenario = pipeline.load(_SCENARIOS / name)
-    places = sites.of(scenario)
+    scenario = egvs.load(_SCENARIOS / name)
+    places = sites.candidate_sites(scenario)
     start_m = np.array([site.pose.position_m for site in places])
     caster, origin = (
         Caster(build_scene(scenario).world, scenario.roi.box, start_m),
         np.asarray(scenario.roi.box.origin_m),
     )
-    bare, packets = EmbreeScene(), Tree(caster._triangles)
+    bare, packets = EmbreeScene(), TriangleTree(caster._triangles)
     TriangleMesh(bare, caster._triangles.astype(np.float32))
     assert caster._tree is not None
     tree = caster._tree
     jobs = []
     for site in places:
-        sensor = sensors.of_scenario(site.sensor, scenario, site.name)
+        sensor = scenario_sensor(site.sensor, scenario, site.name)
         directions = sensor.directions(*site.pose.angles_deg)
         beam = caster.scan(site.pose.position_m, directions, sensor.range_m).beam
         o, single = np.asarray(site.pose.position_m) - origin, directions[beam].astype(np.float32)
         start, count = np.tile(o.astype(np.float32), (len(beam), 1)), len(beam)
-        shapes, ray = (caster._triangles, caster._planes), (o, beam, directions, sensor.range_m)
+        mesh = ray_triangle.TriangleMesh(caster._triangles, caster._planes)
+        rays = ray_triangle.Rays(o, beam, directions, sensor.range_m)
         filled = np.empty(count), np.empty(count, dtype=np.int64)
         ends, doubtful = (np.empty((count, 3)), np.empty(count, dtype=np.bool_)), np.empty(count, dtype=np.int64)
-        settled = (tree.nearest(*ray[:3]), caster._owner, *shapes, *ray, *filled, doubtful, *ends)
-        some = doubtful[: rays.settle(*settled)]
-        searched = (some, *shapes, caster._boxes, caster._starts, *ray, *filled, *ends)
-        jobs.append(((site.pose.position_m, directions, sensor.range_m), (start, single), ray[:3], settled, searched))
+        hits = ray_triangle.Hits(*filled, *ends)
+        settled = (tree.nearest(o, beam, directions), caster._owner, mesh, rays, hits, doubtful)
+        some = doubtful[: ray_triangle.resolve_hits(*settled)]
+        searched = (some, mesh, ray_triangle.BoxTree(caster._boxes, caster._starts), rays, hits)
+        jobs.append(
+            (
+                (site.pose.position_m, directions, sensor.range_m),
+                (start, single),
+                (o, beam, directions),
+                settled,
+                searched,
+            )
+        )
 
     def cast() -> None:
         for asked, *_ in jobs:  # each is let go before the next is made, as a run does
@@ -67,8 +78,8 @@ def _work(name: str) -> tuple[dict[str, Callable[[], Any]], int, int]:
         "Embree alone": lambda: [bare.run(*ray) for _, ray, *_ in jobs],
         "Embree alone, eight beams at a time": lambda: [packets.nearest(*ray) for _, _, ray, *_ in jobs],
         "Embree with rims and fins": lambda: [tree.nearest(*ray) for _, _, ray, *_ in jobs],
-        "settle: hits placed in float64": lambda: [rays.settle(*settled) for *_, settled, _ in jobs],
-        "search: doubtful beams": lambda: [rays.search(*searched) for *_, searched in jobs],
+        "settle: hits placed in float64": lambda: [ray_triangle.resolve_hits(*settled) for *_, settled, _ in jobs],
+        "search: doubtful beams": lambda: [ray_triangle.search_triangles(*searched) for *_, searched in jobs],
         "whole cast": cast,
     }
     return work, sum(len(ray[0]) for _, ray, *_ in jobs), sum(len(searched[0]) for *_, searched in jobs)

@@ -35,11 +35,11 @@ import psutil
 from scipy.stats import qmc
 
 from benchmarks.scaling import Size, prepare, sides
-from pipeline.artefacts.run_record import RunRecord
-from pipeline.city.running import clusters, graph, parts, running
-from pipeline.city.running.jobs import Done, Job
-from pipeline.runs import workflow
-from pipeline.runs.store import Store
+from egvs.artefacts.run_folder import RunRecord
+from egvs.city import scheduler, tasks
+from egvs.city.tasks import Job, JobResult
+from egvs.runs import run
+from egvs.runs.store import Store
 
 KILLS = 10
 
@@ -64,12 +64,12 @@ def fresh(jobs: list[Job]) -> Iterator[None]:
         yield
 
 
-def timed(client: Any, jobs: list[Job]) -> tuple[float, list[Done]]:
+def timed(client: Any, jobs: list[Job]) -> tuple[float, list[JobResult]]:
     """Seconds of a run that finds nothing, and what its tasks say."""
-    done: list[Done] = []
+    done: list[JobResult] = []
     with fresh(jobs):
         start = time.perf_counter()
-        running.run(client, jobs, heard=done.append)
+        scheduler.run_jobs(client, jobs, on_done=done.append)
         return time.perf_counter() - start, done
 
 
@@ -82,7 +82,7 @@ def warm(client: Any, folder: Path) -> None:
 
 def _warm(job: Job, number: int) -> None:
     os.environ["EGVS_STORE"] = ""
-    workflow.run(job.scenario(), job.out.with_name(f"{job.out.name}{number}"), jobs=1)
+    run.run(job.scenario(), job.out.with_name(f"{job.out.name}{number}"), jobs=1)
 
 
 # ---- speed
@@ -96,7 +96,7 @@ def speed(folder: Path, repeats: int) -> None:
     rates: dict[int, list[float]] = {1: [], 2: []}
     for _ in range(repeats):
         for count in (1, 2):
-            with clusters.connected(f"processes={count}") as client:
+            with scheduler.connect(f"processes={count}") as client:
                 warm(client, folder)
                 seconds, _ = timed(client, jobs)
                 rates[count].append(sites / seconds)
@@ -111,7 +111,7 @@ def overhead(folder: Path) -> None:
     from distributed import get_task_stream
 
     jobs = build(folder / "one", {"big": Size(sites=2400, frames=100, beams=57_600 // 2)})
-    with clusters.connected("processes=2") as client:
+    with scheduler.connect("processes=2") as client:
         warm(client, folder)
         empty = []
         for _ in range(200):
@@ -119,8 +119,10 @@ def overhead(folder: Path) -> None:
             client.submit(int, 1, pure=False).result()
             empty.append(time.perf_counter() - start)
         with fresh(jobs), get_task_stream(client) as stream:
-            running.run(client, jobs)
-            work_s = sum(entry.made.cost.seconds for entry in Store.default().entries() if entry.stage == parts.KIND)
+            scheduler.run_jobs(client, jobs)
+            work_s = sum(
+                entry.made.cost.seconds for entry in Store.default().entries() if entry.stage == tasks.PART_KIND
+            )
     times: dict[str, list[tuple[float, float]]] = collections.defaultdict(list)
     for its in stream.data:
         if its["key"].startswith("score-"):
@@ -136,14 +138,14 @@ def overhead(folder: Path) -> None:
 def flat(folder: Path) -> None:
     """Print what scoring takes a site, from few sites to many and from one junction to many, beside what it takes a
     junction: that of junctions of one site, which is taken off."""
-    with clusters.connected("processes=2") as client:
+    with scheduler.connect("processes=2") as client:
         warm(client, folder)
 
         def costs(junctions: int, sites: int) -> tuple[float, float, float]:
             jobs = spread(folder / f"{junctions}x{sites}", junctions, Size(sites=sites, frames=100))
             with fresh(jobs):
-                running.run(client, jobs)
-                made = [entry.made for entry in Store.default().entries() if entry.stage == parts.KIND]
+                scheduler.run_jobs(client, jobs)
+                made = [entry.made for entry in Store.default().entries() if entry.stage == tasks.PART_KIND]
             stages = [RunRecord.read(job.out).stages for job in jobs]
             scoring = sum(its["score"].cost.seconds for its in stages) + sum(its.cost.seconds for its in made)
             report = sum(its["report"].cost.seconds for its in stages)
@@ -178,7 +180,7 @@ def kills(folder: Path, seed: int, count: int = KILLS) -> None:
     rng, sizes = random.Random(seed), {f"j{i}": Size(sites=10, frames=50) for i in range(3)}
     sizes["big"] = Size(sites=120, frames=50)
     jobs, killed, runs = build(folder / "kills", sizes), 0, 0
-    with clusters.connected("processes=2") as client:
+    with scheduler.connect("processes=2") as client:
         warm(client, folder)
         seconds, _ = timed(client, jobs)
         wanted = digests(jobs)
@@ -190,7 +192,7 @@ def kills(folder: Path, seed: int, count: int = KILLS) -> None:
             killer = threading.Thread(target=_kill, args=(moments, random.Random(rng.random()), stop, told))
             with fresh(jobs):
                 killer.start()
-                running.run(client, jobs)
+                scheduler.run_jobs(client, jobs)
                 stop.set()
                 killer.join()
             killed, runs = killed + len(told), runs + 1
@@ -239,7 +241,7 @@ def main() -> None:
     parser.add_argument("--most-beams", type=int, help="of a task, so that small cities are cut too")
     asked = parser.parse_args()
     if asked.most_beams:
-        graph.LEAST_BEAMS = graph.MOST_BEAMS = asked.most_beams
+        scheduler.LEAST_BEAMS = scheduler.MOST_BEAMS = asked.most_beams
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         match asked.what:

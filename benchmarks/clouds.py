@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-import pipeline
-from pipeline.artefacts import traffic_frames
-from pipeline.artefacts.traffic_frames import TrafficFrame
-from pipeline.validation.clouds.point_clouds import CloudMaker, random_of
+import egvs
+from egvs.artefacts import traffic_frames
+from egvs.artefacts.traffic_frames import TrafficFrame
+from egvs.validation.cloud_simulation import CloudSimulator, sweep_rng
 
 BOUND_S = 0.003
 FRAMES = 100
@@ -20,17 +20,17 @@ NEAREST = 10
 
 def rows(scenario: Path, run: Path) -> list[tuple[str, str, str, bool]]:
     """Milliseconds a frame on one core, over the first sites of a scenario and frames of its finished run."""
-    scene = pipeline.build_scene(pipeline.load(scenario))
-    makers = [CloudMaker.of_site(scene, site) for site in scene.sites[:3]]
-    recorded = list(traffic_frames.read(run / "trajectories.parquet", np.arange(FRAMES, dtype=np.int64) * 50))
+    scene = egvs.build_scene(egvs.load(scenario))
+    makers = [CloudSimulator.of_site(scene, site) for site in scene.sites[:3]]
+    recorded = list(traffic_frames.read_frames(run / "trajectories.parquet", np.arange(FRAMES, dtype=np.int64) * 50))
     measured = []
     for what, some in (("all its vehicles", len), (f"the nearest {NEAREST}", lambda _: NEAREST)):
         took, on = [], []
         for maker in makers:
             near = [_nearest(frame, maker.view.pose.position_m[:2], some(frame.boxes)) for frame in recorded]
-            maker.sweep(near[0], random_of(0, "warm", 0))
+            maker.sweep(near[0], sweep_rng(0, "warm", 0))
             for frame in near:
-                random = random_of(0, maker.view.site, frame.number)
+                random = sweep_rng(0, maker.view.site, frame.number)
                 start = time.perf_counter()
                 cloud = maker.sweep(frame, random)
                 took.append(time.perf_counter() - start)

@@ -13,11 +13,9 @@ from collections import defaultdict
 from typing import Any
 
 import numpy as np
-
-from pipeline.validation.statistics.coefficients import KINDS
-from pipeline.validation.statistics.correlation import Correlation, Study
-from pipeline.validation.statistics.intervals import Interval
 from tests.validation.statistics import made_up
+
+from egvs.validation.correlation import COEFFICIENT_KINDS, ConfidenceInterval, Correlation, CorrelationStudy
 
 SITES, RHOS, STUDIES, RESAMPLES = (13, 40), (0.0, 0.5, 0.8, 0.95), 1000, 1000
 PAIR = (0.8, 0.5)
@@ -25,7 +23,7 @@ PAIR = (0.8, 0.5)
 
 def line(what: str, found: list[Correlation], truth: float) -> str:
     """One row of the table."""
-    intervals: list[Interval] = [its.interval for its in found if not np.isnan(its.interval.low)]
+    intervals: list[ConfidenceInterval] = [its.interval for its in found if not np.isnan(its.interval.low)]
     low, high = (np.array([getattr(its, end) for its in intervals]) for end in ("low", "high"))
     held = (low <= truth) & (truth <= high)
     return (
@@ -43,17 +41,17 @@ def main() -> None:
         for rho in RHOS:
             single: dict[Any, list[Correlation]] = defaultdict(list)
             for seed in range(studies):
-                study = Study([made_up.junction(rng, sites, (rho,))], seed, RESAMPLES)
-                for kind in KINDS:
+                study = CorrelationStudy([made_up.junction(rng, sites, (rho,))], seed, RESAMPLES)
+                for kind in COEFFICIENT_KINDS:
                     single[kind].append(study.correlation("s0", "ap", kind))
-            for kind in KINDS:
+            for kind in COEFFICIENT_KINDS:
                 print(line(f"{sites}, {rho}, {kind}", single[kind], made_up.truth(rho, kind)), flush=True)
         both: dict[Any, list[Correlation]] = defaultdict(list)
         for seed in range(studies):
-            study = Study([made_up.junction(rng, sites, PAIR)], seed, RESAMPLES)
-            for kind in KINDS:
+            study = CorrelationStudy([made_up.junction(rng, sites, PAIR)], seed, RESAMPLES)
+            for kind in COEFFICIENT_KINDS:
                 both[kind].append(study.difference("s0", "s1", "ap", kind))
-        for kind in KINDS:
+        for kind in COEFFICIENT_KINDS:
             truth = made_up.truth(PAIR[0], kind) - made_up.truth(PAIR[1], kind)
             print(line(f"{sites}, {PAIR[0]} less {PAIR[1]}, {kind}", both[kind], truth), flush=True)
 

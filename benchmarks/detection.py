@@ -10,14 +10,13 @@ import time
 
 import numpy as np
 
-from pipeline.validation.metrics.average_precision import evaluate
-from pipeline.validation.metrics.matching import Objects, Record
-from pipeline.validation.sweeps import Detections
+from egvs.validation.detection_metrics import EvaluationFrames, GroundTruth, evaluate
+from egvs.validation.sweeps import Detections
 
 SITES, FRAMES, DETECTORS, MOST_S = 13, 1000, 3, 60.0
 
 
-def made_up(rng: np.random.Generator, frames: int) -> tuple[list[Objects], list[Detections]]:
+def made_up(rng: np.random.Generator, frames: int) -> tuple[list[GroundTruth], list[Detections]]:
     """Objects and what a fair detector makes of them: most are found, some twice, and some are not there."""
     objects, found = [], []
     for _ in range(frames):
@@ -25,7 +24,7 @@ def made_up(rng: np.random.Generator, frames: int) -> tuple[list[Objects], list[
         where = np.column_stack([rng.uniform(0, 50, n), rng.uniform(0, 100, n), np.full(n, 0.8)])
         size, yaw = rng.uniform([3.5, 1.6, 1.4], [5.0, 2.2, 1.8], (n, 3)), rng.uniform(-3, 3, n)
         boxes = np.column_stack([where, size, yaw])
-        objects.append(Objects(boxes, rng.random(n) < 0.8, rng.integers(0, 60, n)))
+        objects.append(GroundTruth(boxes, rng.random(n) < 0.8, rng.integers(0, 60, n)))
         seen = np.repeat(boxes, rng.choice([0, 1, 2], n, p=[0.1, 0.7, 0.2]), axis=0)
         seen = seen + rng.normal(0, [0.2, 0.1, 0.05, 0.2, 0.1, 0.1, 0.05], seen.shape)
         astray = np.column_stack([rng.uniform(0, 50, (2, 2)), np.tile([0.8, 4.5, 1.8, 1.5, 0.0], (2, 1))])
@@ -37,13 +36,13 @@ def made_up(rng: np.random.Generator, frames: int) -> tuple[list[Objects], list[
 def rows() -> list[tuple[str, str, str, bool]]:
     """Lines of the table of ``make bench``."""
     rng = np.random.default_rng(0)
-    evaluate(Record.of(*made_up(rng, 20)))  # compiles
+    evaluate(EvaluationFrames.of(*made_up(rng, 20)))  # compiles
     took, measures = 0.0, 0
     for _ in range(DETECTORS):
         objects, found = made_up(rng, FRAMES)
         for _ in range(SITES):
             start = time.perf_counter()
-            measures = len(evaluate(Record.of(objects, found)).measures)
+            measures = len(evaluate(EvaluationFrames.of(objects, found)).measures)
             took += time.perf_counter() - start
     what = f"AP: {SITES} sites x {FRAMES} frames x {DETECTORS} detectors, {measures} measures, 10 blocks left out"
     return [(what, f"{took:.1f} s", f"{MOST_S:.0f} s", took < MOST_S)]

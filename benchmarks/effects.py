@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-import pipeline
-from pipeline.artefacts.readers import Tpog, read_tpog
-from pipeline.effects import scene_resolving
-from pipeline.scoring.visibility import Beams, Visibility
-from pipeline.sensing.scanner import Scanner
-from pipeline.world.mesh import World, read_ply
+import egvs
+from egvs.artefacts.tpog import Tpog, read_tpog
+from egvs.scoring.visibility import Beams, HitCounter
+from egvs.sensors.scanner import Scanner
+from egvs.stages import inputs
+from egvs.world.mesh import World, read_ply
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENARIO = ROOT / "scenarios" / "nishishinjuku"
@@ -43,17 +43,17 @@ COSTS: dict[str, tuple[list[str], float | None]] = {
 class Work:
     """Scans of some sites, and what counts their hits."""
 
-    visibility: Visibility
+    visibility: HitCounter
     beams: list[Beams]
     cells: NDArray[np.int64]
 
     @classmethod
     def of(cls, settings: list[str], world: World, tpog: Tpog, run: Path) -> Work:
         """For a finished run's static world, TPOG and trajectories."""
-        scene = scene_resolving.resolve(pipeline.load(SCENARIO, settings), world)
+        scene = inputs.resolve_scene(egvs.load(SCENARIO, settings), world)
         scanner = Scanner(scene)
         beams = [Beams.of(scanner.scan_site(site)) for site in scene.sites[:SITES]]
-        return cls(Visibility(scene, tpog, run / "trajectories.parquet"), beams, np.flatnonzero(tpog.counts))
+        return cls(HitCounter(scene, tpog, run / "trajectories.parquet"), beams, np.flatnonzero(tpog.counts))
 
     def seconds(self) -> float:
         """Processor seconds of a round."""

@@ -20,11 +20,11 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.explore.opening import open_session
-from pipeline.explore.page import Page
-from pipeline.explore.view import LAYERS
-from pipeline.sensing.sensors import CATALOGUE
-from pipeline.sensing.sites import Site
+from egvs.explore.page import Page
+from egvs.explore.settings import open_session
+from egvs.explore.view_state import LAYERS
+from egvs.sensors.sensor import CATALOGUE
+from egvs.sensors.sites import Site
 
 _PAGE = resource.getpagesize()
 

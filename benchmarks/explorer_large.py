@@ -21,8 +21,8 @@ import numpy as np
 
 from benchmarks import scaling
 from benchmarks.explorer import memory_mb, moved, shown_ms
-from pipeline.explore.opening import open_session
-from pipeline.explore.page import Page
+from egvs.explore.page import Page
+from egvs.explore.settings import open_session
 
 GRAPHICS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 _FRAMES = """seconds => new Promise(done => {

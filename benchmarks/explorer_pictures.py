@@ -19,11 +19,11 @@ from typing import Any
 
 import numpy as np
 
-import pipeline
-from pipeline.explore.opening import open_session
-from pipeline.explore.page import Page
-from pipeline.explore.view import Camera
-from pipeline.sensing.sites import Pose
+import egvs
+from egvs.explore.page import Page
+from egvs.explore.settings import open_session
+from egvs.explore.view_state import Camera
+from egvs.sensors.sites import Pose
 
 SCENARIO = Path("scenarios/nishishinjuku")
 GRAPHICS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
@@ -54,7 +54,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         run = asked.run or Path(scratch) / "run"
         if not (run / "placement.parquet").is_file():
-            pipeline.place(pipeline.load(SCENARIO, ["placement.count=2"]), run)
+            egvs.place(egvs.load(SCENARIO, ["placement.count=2"]), run)
         with _tab(Path(scratch), run) as (page, tab):
             for name, (camera, view) in PICTURES.items():
                 if name in asked.only:

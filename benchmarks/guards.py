@@ -22,17 +22,16 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-import pipeline
-from pipeline.runs import workflow
-from pipeline.traffic import recording, sumo
-from pipeline.traffic.guarded import confined, copies
+import egvs
+from egvs.runs import run as runs_run
+from egvs.traffic import recording, sandbox, sumo, user_files
 
 SCENARIO = Path(__file__).resolve().parent.parent / "scenarios" / "nishishinjuku"
 STARTS, MOST = 15, 0.03
 GUARDS = {
-    "inputs looked for": (workflow, "keep_inputs"),
-    "files read before they are copied": (copies, "copy"),
-    "ends of SUMO's files": (recording, "check_whole"),
+    "inputs looked for": (runs_run, "check_no_overwrite"),
+    "files read before they are copied": (user_files, "copy_checked"),
+    "ends of SUMO's files": (recording, "check_complete"),
 }
 START = "launcher of SUMO"
 
@@ -49,7 +48,7 @@ def run(scenario: Path) -> tuple[dict[str, float], float]:
     for _ in range(2):
         with tempfile.TemporaryDirectory() as folder, patch.dict(os.environ, EGVS_STORE=""), accounted() as spent_s:
             before_s = _busy_s()
-            pipeline.run(pipeline.load(scenario), Path(folder) / "run", jobs=1)
+            egvs.run(egvs.load(scenario), Path(folder) / "run", jobs=1)
             whole_s = _busy_s() - before_s
     return spent_s, whole_s
 
@@ -69,7 +68,7 @@ def accounted() -> Iterator[dict[str, float]]:
 
         return work
 
-    one_s, started = launcher_s(), sumo._started
+    one_s, started = launcher_s(), sumo._start_program
 
     def counted(command: Sequence[str], *more: Any) -> Any:
         spent_s[START] += one_s
@@ -78,13 +77,13 @@ def accounted() -> Iterator[dict[str, float]]:
     with ExitStack() as patches:
         for name, (module, guard) in GUARDS.items():
             patches.enter_context(patch.object(module, guard, timed(name, getattr(module, guard))))
-        patches.enter_context(patch.object(sumo, "_started", counted))
+        patches.enter_context(patch.object(sumo, "_start_program", counted))
         yield spent_s
 
 
 def launcher_s() -> float:
     """Processor seconds that a start by the launcher takes more than one without it."""
-    program, launcher = ["/bin/true"], [sys.executable, "-I", "-S", confined.__file__, os.curdir, str(os.getpid())]
+    program, launcher = ["/bin/true"], [sys.executable, "-I", "-S", sandbox.__file__, os.curdir, str(os.getpid())]
     taken: dict[bool, list[float]] = {False: [], True: []}
     for _ in range(STARTS):
         for by_launcher, several in taken.items():

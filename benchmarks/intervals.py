@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.core.progress import silent
-from pipeline.scenario.loading import load
-from pipeline.studies.measuring import SettingRunner
-from pipeline.studies.seeds import between_seeds
+from egvs.core.runtime import no_progress
+from egvs.scenario.loading import load
+from egvs.studies.measurement import SettingRunner
+from egvs.studies.score_errors import compare_seeds
 
 SEEDS = 32
 
@@ -32,8 +32,8 @@ def main() -> None:
     scenario, *more = sys.argv[1:]
     count = int(more.pop(0)) if more and more[0].isdigit() else SEEDS
     with tempfile.TemporaryDirectory() as folder:
-        runner = SettingRunner(Path(scenario), tuple(more), Path(folder), 1, silent)
-        found = between_seeds(runner, load(scenario, more), count, told)
+        runner = SettingRunner(Path(scenario), tuple(more), Path(folder), 1, no_progress)
+        found = compare_seeds(runner, load(scenario, more), count, told)
     if found is None:
         print("fewer than two seeds went through")
         return

@@ -18,26 +18,25 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import pipeline
-from pipeline.artefacts.readers import read_tpog
-from pipeline.artefacts.traffic_frames import TrafficFrame
-from pipeline.core.cost import measured
-from pipeline.effects import scene_resolving
-from pipeline.runs.workflow import bring
-from pipeline.scoring.scorer import Scorer
-from pipeline.scoring.targets import detectability
-from pipeline.scoring.targets.record import FRAMES, TargetRecord
-from pipeline.scoring.targets.seen import noticed_in, see
-from pipeline.scoring.visibility import Beams
-from pipeline.sensing.scanner import Scanner
-from pipeline.sensing.sites import Site
-from pipeline.stages.base import Workspace
-from pipeline.validation import detection
-from pipeline.validation.detectors import registry
-from pipeline.validation.looking import Look
-from pipeline.validation.site_findings import POINTS
-from pipeline.validation.unseen_record import UnseenRecord, prepare
-from pipeline.world.mesh import read_ply
+import egvs
+from egvs.artefacts.tpog import read_tpog
+from egvs.artefacts.traffic_frames import TrafficFrame
+from egvs.core.runtime import measure_usage
+from egvs.runs.run import ensure_stages
+from egvs.scoring import target_scores
+from egvs.scoring.scorer import Scorer
+from egvs.scoring.targets import REPLAYED_FRAMES, TargetRecord, detection_probability, visible_targets
+from egvs.scoring.visibility import Beams
+from egvs.sensors.scanner import Scanner
+from egvs.sensors.sites import Site
+from egvs.stages import inputs
+from egvs.stages.inputs import open_folder
+from egvs.validation import detection_metrics
+from egvs.validation.detector_runs import SiteDetectionTask
+from egvs.validation.detectors import base
+from egvs.validation.held_out_traffic import HeldOutTraffic, prepare_held_out_traffic
+from egvs.validation.sweeps import POINT_COUNTS_NAME
+from egvs.world.mesh import read_ply
 
 SCENARIO = Path(__file__).resolve().parent.parent / "scenarios" / "nishishinjuku"
 LOOKED_FROM = 2
@@ -55,7 +54,7 @@ def rows() -> list[tuple[str, str, str]]:
     each = [(name, f"{its:.1f} ms", f"{its / egvs:.2f} x EGVS") for name, its in (ms | ap_ms).items()]
     return [
         *each,
-        (f"scores: median of {count} sites; AP: mean of {LOOKED_FROM}, {FRAMES} frames", "", ""),
+        (f"scores: median of {count} sites; AP: mean of {LOOKED_FROM}, {REPLAYED_FRAMES} frames", "", ""),
         ("traffic, once for all sites (of AP alone, the static world included)", f"{simulated_s * 1e3:.0f} ms", ""),
     ]
 
@@ -90,9 +89,9 @@ def _no_store() -> Iterator[None]:
 def _scored(folder: Path) -> tuple[dict[str, float], int]:
     """Milliseconds a site of what is worked out from the scenario's own run, in the median of its sites."""
     folder.mkdir()
-    work = Workspace(pipeline.load(SCENARIO), folder)
-    bring(work, "statics", "traffic", "tpog")  # simulated like any run's, and not counted here
-    scene = scene_resolving.resolve(work.scenario, read_ply(work.path("statics.ply"))[0])
+    work = open_folder(egvs.load(SCENARIO), folder)
+    ensure_stages(work, "statics", "traffic", "tpog")  # simulated like any run's, and not counted here
+    scene = inputs.resolve_scene(work.scenario, read_ply(work.path("statics.ply"))[0])
     counted = read_tpog(work.path("tpog.parquet"))
     record = TargetRecord.read(work.path("trajectories.parquet"), counted.grid)
     scanner, scorer = Scanner(scene), Scorer(scene, counted)
@@ -101,8 +100,8 @@ def _scored(folder: Path) -> tuple[dict[str, float], int]:
         scan, scanned = _timed(partial(scanner.scan_site, site))
         beams = Beams.of(scan)
         _, scored = _timed(partial(scorer.score, scan))
-        seen, counted_s = _timed(partial(see, record, beams, noticed_in(scene, beams.sensor)))
-        _, foretold = _timed(partial(detectability.expected_detections, seen))
+        seen, counted_s = _timed(partial(visible_targets, record, beams, detection_probability(scene, beams.sensor)))
+        _, foretold = _timed(partial(target_scores.expected_detections, seen))
         return [scanned, scored, counted_s + foretold, counted_s, foretold]
 
     timed(scene.sites[0])  # compiles
@@ -115,22 +114,24 @@ def _scored(folder: Path) -> tuple[dict[str, float], int]:
 
 def _looked(folder: Path) -> tuple[dict[str, float], float]:
     """Milliseconds a site of measuring AP, by detector; and seconds until there is traffic for it."""
-    with measured() as cost:  # SUMO's too
-        unseen = prepare(pipeline.load(SCENARIO), folder, FRAMES)
+    with measure_usage() as cost:  # SUMO's too
+        unseen = prepare_held_out_traffic(egvs.load(SCENARIO), folder, REPLAYED_FRAMES)
     frames, sites = list(unseen.read()), unseen.scene.sites[:LOOKED_FROM]
-    return {f"AP by {name}": 1e3 * _ap_s(unseen, frames, sites, name) for name in detectability.DETECTORS}, cost.busy_s
+    return {f"AP by {name}": 1e3 * _ap_s(unseen, frames, sites, name) for name in target_scores.DETECTORS}, cost.busy_s
 
 
-def _ap_s(unseen: UnseenRecord, frames: Sequence[TrafficFrame], sites: Sequence[Site], name: str) -> float:
+def _ap_s(unseen: HeldOutTraffic, frames: Sequence[TrafficFrame], sites: Sequence[Site], name: str) -> float:
     """Seconds a site to scan all beams, make the clouds, look and work out AP."""
-    look = Look(unseen, {name: registry.make(name)})
+    look = SiteDetectionTask(unseen, {name: base.make_detector(name)})
 
     def measure(site: Site) -> None:
-        found = {site.name: look.at(site, [POINTS, name])}
-        detection.measured(frames, unseen.scene.roi, found)
+        found = {site.name: look.at(site, [POINT_COUNTS_NAME, name])}
+        detection_metrics.measure_detection(frames, unseen.scene.roi, found)
 
-    short = UnseenRecord(unseen.scenario, unseen.scene, unseen.trajectories, unseen.numbers[:5], unseen.keys)
-    Look(short, look.detectors).at(sites[0], [POINTS, name])  # compiles, and loads what it needs
+    short = HeldOutTraffic(unseen.scenario, unseen.scene, unseen.trajectories, unseen.numbers[:5], unseen.keys)
+    SiteDetectionTask(short, look.detectors).at(
+        sites[0], [POINT_COUNTS_NAME, name]
+    )  # compiles, and loads what it needs
     return statistics.mean(_timed(partial(measure, site))[1] for site in sites)
 
 

@@ -19,15 +19,14 @@ from rich.console import Console
 from rich.table import Table
 from scipy.stats import kendalltau
 
-import pipeline
-from pipeline.artefacts.readers import read_tpog
-from pipeline.effects.score.moving_occlusion import read_replay
-from pipeline.scenario.effects import EffectsModel
-from pipeline.scenario.models import Scenario
-from pipeline.scoring.scorer import Scorer, ranks
-from pipeline.stages.base import Workspace
-from pipeline.stages.shared.scans import scans
-from pipeline.stages.shared.scene import scene_of
+import egvs
+from egvs.artefacts.tpog import read_tpog
+from egvs.effects.moving_occlusion import read_replay
+from egvs.scenario.effects_config import EffectsConfig
+from egvs.scenario.model import Scenario
+from egvs.scoring.scorer import Scorer, ranks
+from egvs.stages.inputs import get_scene, open_folder
+from egvs.stages.site_scoring import empty_scans
 
 Compared = dict[str, Any]
 
@@ -81,9 +80,9 @@ def scored(scenario: Scenario, out: Path, parameters: dict[str, Any] | None) -> 
     beforehand."""
     others = scenario.effects.without("moving_occlusion").model_dump()
     wanted = others if parameters is None else {**others, "moving_occlusion": parameters}
-    work = Workspace(scenario.with_effects(EffectsModel.of(wanted)), out)
-    tpog, trajectories, found = read_tpog(out / "tpog.parquet"), out / "trajectories.parquet", list(scans(work))
-    scorer = Scorer(scene_of(work), tpog, trajectories)
+    work = open_folder(scenario.with_effects(EffectsConfig.of(wanted)), out)
+    tpog, trajectories, found = read_tpog(out / "tpog.parquet"), out / "trajectories.parquet", list(empty_scans(work))
+    scorer = Scorer(get_scene(work), tpog, trajectories)
     scorer.score(found[0].beams)
     start = time.perf_counter()
     egvs = [scorer.score(scan.beams).egvs for scan in found]
@@ -136,7 +135,7 @@ def show(compared: Compared, console: Console) -> None:
 
 def main() -> None:
     """Compare for 50, 500 and all frames."""
-    scenario, out, console = pipeline.load(sys.argv[1]), Path(sys.argv[2]), Console(width=132)
+    scenario, out, console = egvs.load(sys.argv[1]), Path(sys.argv[2]), Console(width=132)
     for frames in (50, 500, 0):
         console.print(f"frames = {frames or 'all'}")
         show(compare(scenario, out, frames=frames), console)

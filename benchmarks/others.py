@@ -24,19 +24,19 @@ from typing import Any
 import numba
 import numpy as np
 
-import pipeline
+import egvs
 from benchmarks.scenes import recorded_boxes
 from benchmarks.stability import medians, textbook, touching
-from pipeline.artefacts.recorded_boxes import FrameBoxes
-from pipeline.core.grid import Grid
-from pipeline.kernels import boxes, march
-from pipeline.scoring.egvs import EntropyField
-from pipeline.scoring.occupancy import static_voxels
-from pipeline.sensing.scanner import Scanner
-from pipeline.sensing.scene import Scene
-from pipeline.sensing.sites import Site
-from pipeline.world.casting import Caster
-from pipeline.world.mesh import World
+from egvs.artefacts.traffic_frames import FrameBoxes
+from egvs.core.grid import Grid
+from egvs.kernels import occupancy, traversal
+from egvs.scoring.egvs import EntropyField
+from egvs.scoring.occupancy import static_voxels
+from egvs.sensors.scanner import Scanner
+from egvs.sensors.scene import Scene
+from egvs.sensors.sites import Site
+from egvs.world.mesh import World
+from egvs.world.ray_casting import Caster
 
 SCENARIO = Path(__file__).resolve().parent.parent / "scenarios" / "nishishinjuku"
 SITES = ("c08", "c10")
@@ -120,7 +120,7 @@ def accumulated(o: Any, d: Any, shape: Any, voxel_m: float, hits: Any) -> None:
 
 
 MARCHES: dict[str, March] = {
-    "ours": march.count_hits,
+    "ours": traversal.count_hits,
     "samples, 1 voxel (NumPy)": sampled(1.0),
     "samples, 1/2 voxel (NumPy)": sampled(0.5),
     "samples, 1/4 voxel (NumPy)": sampled(0.25),
@@ -156,7 +156,7 @@ def by_centre(batch: FrameBoxes, grid: Grid) -> Any:
     return counts
 
 
-def by_boxes(batch: FrameBoxes, grid: Grid, kernels: Any = boxes) -> Any:
+def by_boxes(batch: FrameBoxes, grid: Grid, kernels: Any = occupancy) -> Any:
     """The same by ``kernels``: ours, or those of boxes that touch."""
     nx, ny, nz = grid.shape
     steps, seen = np.zeros((nz + 1, nx, ny), np.int32), np.full((3, nx, ny), -1, np.int64)
@@ -214,8 +214,8 @@ class Junction:
     @classmethod
     def shipped(cls) -> Junction:
         """Statics built, traffic simulated."""
-        scenario = pipeline.load(SCENARIO, [f"traffic.frames={FRAMES}"])
-        grid, scene = scenario.roi.grid, pipeline.build_scene(scenario)
+        scenario = egvs.load(SCENARIO, [f"traffic.frames={FRAMES}"])
+        grid, scene = scenario.roi.grid, egvs.build_scene(scenario)
         filled = static_voxels(scene.world, grid)
         return cls(grid, scenario.gamma, scene.world, scene, recorded_boxes(scenario), filled)
 
@@ -238,7 +238,7 @@ class Junction:
         """Where a sensor is, in voxels of the grid's frame."""
         return self.grid.to_grid_m(np.asarray(site.pose.position_m)) / self.grid.voxel_m
 
-    def hits(self, site: Any, ends_m: Any, way: March = march.count_hits) -> Any:
+    def hits(self, site: Any, ends_m: Any, way: March = traversal.count_hits) -> Any:
         """Beams in each voxel, flat."""
         found = np.zeros(int(self.shape.prod()), np.uint32)
         way(self.start(site), np.ascontiguousarray(ends_m / self.grid.voxel_m), self.shape, self.grid.voxel_m, found)

@@ -16,25 +16,25 @@ from typing import Any
 
 import numpy as np
 
-import pipeline
+import egvs
 from benchmarks import bodies_picture
-from pipeline.artefacts.readers import read_scores, read_tpog, read_trajectories
-from pipeline.effects import registry
-from pipeline.effects.on_traffic import SELF_ACTING
-from pipeline.report.drawing.map_frame import extent, standalone
-from pipeline.report.drawing.maps import Backdrop, SiteView, site_view
-from pipeline.report.drawing.outlines import outlines_of
-from pipeline.report.drawing.roads import network_file, roads_within
-from pipeline.report.ranking import ScoredSite
-from pipeline.runs import workflow
-from pipeline.scenario.effects import EffectsModel
-from pipeline.scenario.models import Scenario
-from pipeline.scoring.egvs import EntropyField
-from pipeline.scoring.scorer import Scorer
-from pipeline.stages.base import Workspace
-from pipeline.stages.shared.scans import scans
-from pipeline.stages.shared.scene import scene_of
-from pipeline.world.mesh import read_ply
+from egvs.artefacts.readers import read_scores
+from egvs.artefacts.tpog import read_tpog
+from egvs.artefacts.traffic_frames import read_trajectories
+from egvs.effects import registry
+from egvs.effects.registry import SELF_ACTIVATING
+from egvs.report.basemap import network_file, outlines_of, roads_within
+from egvs.report.maps import Backdrop, SiteViewFigure, site_view
+from egvs.report.ranking import RankedSite
+from egvs.report.svg_figures import extent, standalone
+from egvs.runs import run
+from egvs.scenario.effects_config import EffectsConfig
+from egvs.scenario.model import Scenario
+from egvs.scoring.egvs import EntropyField
+from egvs.scoring.scorer import Scorer
+from egvs.stages.inputs import get_scene, open_folder
+from egvs.stages.site_scoring import empty_scans
+from egvs.world.mesh import read_ply
 
 ROOT = Path(__file__).resolve().parent.parent
 IMAGES = ROOT / "docs" / "images"
@@ -67,9 +67,9 @@ def seen(scenario: Scenario, out: Path, site: str) -> tuple[np.ndarray, np.ndarr
     if not site:
         return tpog.p.sum(axis=2), np.ones(tpog.grid.shape, dtype=np.bool_)
     field = EntropyField.of(tpog.counts, tpog.frames, tpog.grid)
-    work = Workspace(scenario, out)
-    scan = next(scans(work, [site]))
-    hits = Scorer(scene_of(work), tpog, out / "trajectories.parquet").hits(scan.beams)
+    work = open_folder(scenario, out)
+    scan = next(empty_scans(work, [site]))
+    hits = Scorer(get_scene(work), tpog, out / "trajectories.parquet").hits(scan.beams)
     worth = field.per_cell_bit * np.minimum(hits.ravel()[field.cells], scenario.gamma)
     nx, ny, nz = tpog.grid.shape
     return np.bincount(field.cells // nz, weights=worth, minlength=nx * ny).reshape(nx, ny), hits > 0
@@ -78,26 +78,26 @@ def seen(scenario: Scenario, out: Path, site: str) -> tuple[np.ndarray, np.ndarr
 def before_and_after(name: str, folder: Path) -> Iterator[tuple[str, str]]:
     """File names and figures of one effect."""
     where, parameters, site = SHOWN[name]
-    base = pipeline.load(ROOT / "scenarios" / where)
+    base = egvs.load(ROOT / "scenarios" / where)
     given = base.effects.named.get(name)
     own = ({} if given is None else given.model_dump(mode="json", exclude_unset=True)) | parameters
     found = []
     for word, named in (("before", {}), ("after", {name: own})):
         scenario, out = (
-            base.with_effects(EffectsModel.of(named)),
+            base.with_effects(EffectsConfig.of(named)),
             folder / where / (word if named else "plain") / (name if named else ""),
         )
-        workflow.run(scenario, out)
+        run.run(scenario, out)
         found.append((word, *seen(scenario, out, site)))
     tpog = read_tpog(out / "tpog.parquet")
-    scored = ScoredSite.all_of(read_scores(out / "scores.parquet"))
+    scored = RankedSite.all_of(read_scores(out / "scores.parquet"))
     place = next(s for s in scored if s.site == (site or scored[0].site))
     box = extent(tpog.grid, [place])
     roads = roads_within(network_file(out), box)
     backdrop = Backdrop(outlines_of(read_ply(out / "statics.ply")[0], box), roads)
     peak = max(float(field.max()) for _, field, _ in found)
     for word, field, crossed in found:
-        view = SiteView(place, crossed, backdrop, box)
+        view = SiteViewFigure(place, crossed, backdrop, box)
         what = f"score of site {site} by column" if site else "mean occupied voxels by column"
         alt = f"{name}, {word}: {what}, from above, 0 to {peak:.3g}"
         drawn = site_view(tpog.grid, field, peak, view, f"{name}-{word}", alt)
@@ -127,12 +127,14 @@ def side_view(out: Path, pitched: bool) -> str:
 
 def main() -> None:
     """Draw the picture of the README and those of the effects."""
-    assert set(SHOWN) == set(registry.names()) - set(SELF_ACTING)  # the slope cannot be left out where there is one
+    assert set(SHOWN) == set(registry.effect_names()) - set(
+        SELF_ACTIVATING
+    )  # the slope cannot be left out where there is one
     (IMAGES / "effects").mkdir(parents=True, exist_ok=True)
     bodies_picture.draw(IMAGES / "bodies.png")
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        pipeline.run(pipeline.load(ROOT / "scenarios" / "nishishinjuku"), folder / "report")
+        egvs.run(egvs.load(ROOT / "scenarios" / "nishishinjuku"), folder / "report")
         page = (folder / "report" / "report.html").read_text(encoding="utf-8")
         (IMAGES / "nishishinjuku.svg").write_text(figure(page, "Map of"), encoding="utf-8")
         for name in SHOWN:

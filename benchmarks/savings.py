@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-import pipeline
-from pipeline.artefacts.recorded_boxes import FrameBoxes
-from pipeline.scoring.occupancy import count
-from pipeline.world.casting import Caster
-from pipeline.world.mesh import World
+import egvs
+from egvs.artefacts.traffic_frames import FrameBoxes
+from egvs.scoring.occupancy import count_occupancy
+from egvs.world.mesh import World
+from egvs.world.ray_casting import Caster
 
 SCENARIO = Path(__file__).resolve().parent.parent / "scenarios" / "nishishinjuku"
 REPEATS = 7
@@ -52,8 +52,8 @@ def rows() -> list[tuple[str, str, str, bool]]:
 
 def _beams() -> list[tuple[str, str, str, bool]]:
     """Only beams that can meet the region of interest are cast."""
-    scenario = pipeline.load(SCENARIO)
-    roi, scene = scenario.roi.box, pipeline.build_scene(scenario)
+    scenario = egvs.load(SCENARIO)
+    roi, scene = scenario.roi.box, egvs.build_scene(scenario)
     sensor = scene.sensor(scene.sites[0].sensor)
     directions, range_m = sensor.directions(), sensor.range_m
     caster = Caster(scene.world, roi, np.array([site.pose.position_m for site in scene.sites]), range_m)
@@ -78,14 +78,14 @@ def _beams() -> list[tuple[str, str, str, bool]]:
 
 def _flat() -> list[tuple[str, str, str, bool]]:
     """Flat boxes take the flat path."""
-    grid = pipeline.load(SCENARIO).roi.grid
+    grid = egvs.load(SCENARIO).roi.grid
     rng, n = np.random.default_rng(5), 20_000
     centres = np.column_stack([rng.uniform(0, 100, n), rng.uniform(0, 50, n), np.full(n, 0.75)])
     sizes = np.tile([4.5, 1.75, 1.5], (n, 1))
     flat = FrameBoxes(np.arange(n) // 20, np.column_stack([centres, rng.uniform(-3, 3, n), np.zeros(n), sizes]))
     tipped = FrameBoxes(flat.frame, flat.values + np.array([0, 0, 0, 0, 1e-15, 0, 0, 0]))
-    same = np.array_equal(count(flat, grid, n // 20), count(tipped, grid, n // 20))
-    took = in_turn(lambda: count(flat, grid, n // 20), lambda: count(tipped, grid, n // 20))
+    same = np.array_equal(count_occupancy(flat, grid, n // 20), count_occupancy(tipped, grid, n // 20))
+    took = in_turn(lambda: count_occupancy(flat, grid, n // 20), lambda: count_occupancy(tipped, grid, n // 20))
     return [
         (
             "flat boxes: flat path / separating axes",
@@ -97,8 +97,8 @@ def _flat() -> list[tuple[str, str, str, bool]]:
 
 
 def _pair(name: str, grown: Callable[[World], World]) -> list[tuple[str, str, str, bool]]:
-    scenario = pipeline.load(SCENARIO)
-    roi, scene = scenario.roi.box, pipeline.build_scene(scenario)
+    scenario = egvs.load(SCENARIO)
+    roi, scene = scenario.roi.box, egvs.build_scene(scenario)
     world = grown(scene.world)
     sites = np.array([site.pose.position_m for site in scene.sites])
     nothing = World(np.empty((0, 3)), np.empty((0, 3), np.int32), np.empty(0, np.int32), ())

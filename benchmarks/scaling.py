@@ -32,10 +32,10 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import csv
 
-import pipeline
-from pipeline.artefacts.run_record import StageRecord
-from pipeline.core.cost import let_go
-from pipeline.runs import workflow
+import egvs
+from egvs.artefacts.run_folder import StageRecord
+from egvs.core.runtime import release_memory
+from egvs.runs import run
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE, FIGURE = ROOT / "docs" / "scaling.md", ROOT / "docs" / "images" / "scaling.png"
@@ -77,9 +77,9 @@ class Axis:
 AXES = (
     Axis("sites", "sites", (10, 50, 200, 1000, 5000), ("score", "report")),
     Axis("frames", "frames", (500, 1500, 5000, 15000, 50000), ("traffic", "tpog", "score")),
-    Axis("vehicles", "vehicles a frame", (10, 30, 100, 250, 500), ("traffic", "tpog", "score"), Size(hectares=2)),
+    Axis("vehicles", "vehicles per frame", (10, 30, 100, 250, 500), ("traffic", "tpog", "score"), Size(hectares=2)),
     Axis("hectares", "region of interest, ha at 0.25 m", (0.5, 1, 2, 5, 10), ("tpog", "score", "report")),
-    Axis("beams", "beams a sensor", (1_000, 10_000, 100_000, 300_000, 1_000_000), ("score", "report")),
+    Axis("beams", "beams per sensor", (1_000, 10_000, 100_000, 300_000, 1_000_000), ("score", "report")),
     Axis(
         "triangles", "triangles", (1_000, 10_000, 100_000, 300_000, 1_000_000), ("statics", "tpog", "score", "report")
     ),
@@ -181,7 +181,7 @@ def _traffic(size: Size, long: float, wide: float, path: Path) -> None:
 
 
 def _held_mb() -> float:
-    let_go()
+    release_memory()
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmRSS:"))
 
@@ -189,12 +189,12 @@ def _held_mb() -> float:
 def measure(size: Size, folder: Path, pipe: Any) -> None:
     """Send seconds and MB of each stage, medians of some runs."""
     os.environ["EGVS_STORE"] = ""  # nothing is fetched that is to be measured
-    workflow.run(pipeline.load(prepare(Size(sites=2, frames=10), folder / "warm")), folder / "warm" / "run")
-    scenario, begin, held = pipeline.load(prepare(size, folder / "scene")), time.perf_counter(), _held_mb()
+    run.run(egvs.load(prepare(Size(sites=2, frames=10), folder / "warm")), folder / "warm" / "run")
+    scenario, begin, held = egvs.load(prepare(size, folder / "scene")), time.perf_counter(), _held_mb()
     found: list[dict[str, tuple[float, float]]] = []
     for turn in range(REPEATS):
         clock = _Clock(held)
-        workflow.run(scenario, folder / f"run{turn}", listener=clock)
+        run.run(scenario, folder / f"run{turn}", listener=clock)
         found.append(clock.costs)
         if time.perf_counter() - begin > ENOUGH_S:
             break

@@ -8,17 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.artefacts.recorded_boxes import FrameBoxes, read_boxes
-from pipeline.scenario.models import Scenario
-from pipeline.scoring.occupancy import near_grid
-from pipeline.stages import traffic
-from pipeline.stages.base import Workspace
+from egvs.artefacts.traffic_frames import FrameBoxes, read_boxes
+from egvs.scenario.model import Scenario
+from egvs.scoring.occupancy import near_grid
+from egvs.stages import traffic
+from egvs.stages.inputs import open_folder
 
 
 def run_stage(stage: Any, scenario: Scenario, folder: Path, **options: Any) -> dict[str, Any]:
     """Run one stage in a folder that holds the artefacts of those before it."""
-    work = Workspace(scenario, folder)
-    found: dict[str, Any] = stage.run(work, stage.inputs(work), **options)
+    work = open_folder(scenario, folder)
+    found: dict[str, Any] = stage.STAGE.run(work, stage.STAGE.dependencies(work), **options)
     return found
 
 

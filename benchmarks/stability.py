@@ -24,10 +24,10 @@ from typing import Any
 import numba
 import numpy as np
 
-import pipeline
+import egvs
 from benchmarks.numerics.march import beams_of, check
 from benchmarks.scenes import recorded_boxes
-from pipeline.kernels import boxes, march
+from egvs.kernels import occupancy, traversal
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENE = "nishishinjuku"
@@ -92,10 +92,10 @@ def textbook(o, d, shape, hits):
 
 def touching() -> Any:
     """The box kernels with boxes that are not shrunk, compiled anew."""
-    source = Path(boxes.__file__).read_text(encoding="utf-8")
+    source = Path(occupancy.__file__).read_text(encoding="utf-8")
     for old, new in (
         (r"^SHRINK_M = .*$", "SHRINK_M = 0.0"),
-        (r"compiled\(\)$", "numba.njit(nogil=True, error_model='numpy')"),
+        (r"njit\(\)$", "numba.njit(nogil=True, error_model='numpy')"),
     ):
         source, found = re.subn(old, new, source, flags=re.MULTILINE)
         assert found
@@ -124,7 +124,7 @@ def march_rows() -> list[tuple[str, float, float, int]]:
 
     def ours() -> None:
         for _, o, d in sites:
-            march.count_hits(o, d, shape, grid.voxel_m, hits)
+            traversal.count_hits(o, d, shape, grid.voxel_m, hits)
 
     def theirs() -> None:
         for _, o, d in sites:
@@ -133,7 +133,7 @@ def march_rows() -> list[tuple[str, float, float, int]]:
     wrong_ours = wrong_theirs = 0
     for _, o, d in sites:
         found, other = np.zeros_like(hits), np.zeros_like(hits)
-        march.count_hits(o, d, shape, grid.voxel_m, found)
+        traversal.count_hits(o, d, shape, grid.voxel_m, found)
         textbook(o, d, shape, other)
         # Every beam of ours is right by exact arithmetic, or counted here; so what differs from ours is wrong.
         wrong_ours += check(np.broadcast_to(o, d.shape), d, grid.shape, grid.voxel_m)[1]
@@ -148,7 +148,7 @@ def march_rows() -> list[tuple[str, float, float, int]]:
 def box_rows() -> list[tuple[str, float, float, int]]:
     """Ours and touching boxes on the shipped traffic, 1000 frames."""
     frames = 1000
-    scenario = pipeline.load(ROOT / "scenarios" / SCENE, [f"traffic.frames={frames}"])
+    scenario = egvs.load(ROOT / "scenarios" / SCENE, [f"traffic.frames={frames}"])
     grid = scenario.roi.grid
     boxes_near = recorded_boxes(scenario)
     frame, values = boxes_near.frame, boxes_near.values
@@ -163,13 +163,13 @@ def box_rows() -> list[tuple[str, float, float, int]]:
 
     plain = touching()
     wrong = []
-    for kernels in (plain, boxes):
+    for kernels in (plain, occupancy):
         before, turned = count(kernels, values).copy(), np.zeros((nz, nx, ny), bool)
         for axis in range(3):
             for nudge in (-1e-9, 1e-9):
                 turned |= count(kernels, values + nudge * np.eye(8)[axis]) != before
         wrong.append(int(turned.sum()))
-    textbooks, mine = medians([lambda: count(plain, values), lambda: count(boxes, values)])
+    textbooks, mine = medians([lambda: count(plain, values), lambda: count(occupancy, values)])
     return [
         (f"boxes, {frames} frames: touching", textbooks, 1.0, wrong[0]),
         (f"boxes, {frames} frames: ours", mine, mine / textbooks, wrong[1]),

@@ -18,10 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.core.parallel import threads
-from pipeline.core.progress import silent
-from pipeline.studies.measuring import SettingRunner
-from pipeline.studies.variants import Setting
+from egvs.core.runtime import no_progress, thread_count
+from egvs.studies.measurement import SettingRunner
+from egvs.studies.study_settings import Setting
 
 SCENARIO = Path(__file__).resolve().parent.parent / "scenarios" / "nishishinjuku"
 WATCHED = ("traffic.frames=5000", "traffic.frame_period_s=1.0")
@@ -32,7 +31,7 @@ def trial(step_s: float, seed: int) -> tuple[list[str], list[float], float]:
     """Sites, their shares of the limit, and seconds of the traffic stage, of one run."""
     os.environ["EGVS_STORE"] = ""  # nothing is fetched that is to be measured
     with tempfile.TemporaryDirectory() as folder:
-        runner = SettingRunner(SCENARIO, WATCHED, Path(folder), 1, silent)
+        runner = SettingRunner(SCENARIO, WATCHED, Path(folder), 1, no_progress)
         found = runner.run(Setting("run", "seed", "seed", (f"seed={seed}", f"traffic.step_s={step_s}")))
         return found.sites, found.shares, runner.times("traffic", found.stages["traffic"]).seconds[0]
 
@@ -48,7 +47,7 @@ def change(shares: Any, against: Any) -> tuple[Any, Any]:
 def main() -> None:
     """Run, and print a table."""
     seeds = range(FIRST_SEED, FIRST_SEED + int(sys.argv[1] if len(sys.argv) > 1 else SEEDS))
-    with ProcessPoolExecutor(threads(None), mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(thread_count(None), mp_context=get_context("spawn")) as pool:
         futures = {(step, seed): pool.submit(trial, step, seed) for seed in seeds for step in STEPS_S}
         found = {key: future.result() for key, future in futures.items()}
     sites = found[STEPS_S[0], FIRST_SEED][0]

@@ -162,16 +162,16 @@ def write_mini(folder: Path) -> Path:
 
 
 @pytest.fixture
-def egvs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+def run_egvs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     """Call the command line in this process: ``code, out, err = egvs("run", folder)``."""
-    from pipeline.cli import app as cli
+    from egvs.cli import app
 
     def call(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["egvs", *(str(a) for a in arguments)])
         capsys.readouterr()
         code = 0
         try:
-            cli.main()
+            app.main()
         except SystemExit as end:
             code = int(end.code or 0)
         out, err = capsys.readouterr()

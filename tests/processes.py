@@ -15,13 +15,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from subprocess import CompletedProcess
 
-EGVS = "from pipeline.cli.app import main; main()"
+EGVS = "from egvs.cli.app import main; main()"
 
 CONTEXT = multiprocessing.get_context("forkserver")
 _STAGES = ("check", "traffic", "statics", "scan", "tpog", "score")
 CONTEXT.set_forkserver_preload(
-    ["pipeline.runs.workflow", "pipeline.report.page", "pipeline.cli.app", "pipeline.cli.results", "pandas",
-     "scipy.special", "trimesh", *(f"pipeline.stages.{name}" for name in _STAGES)]
+    ["egvs.runs.run", "egvs.report.page", "egvs.cli.app", "egvs.cli.run_tables", "pandas",
+     "scipy.special", "trimesh", *(f"egvs.stages.{name}" for name in _STAGES)]
 )  # fmt: skip
 
 
@@ -51,7 +51,7 @@ def python(code: str, *arguments: object, beside: Path | None = None) -> Complet
     return Started(code, *arguments, beside=beside).ended()
 
 
-def egvs(*arguments: object, beside: Path | None = None) -> CompletedProcess[str]:
+def run_egvs(*arguments: object, beside: Path | None = None) -> CompletedProcess[str]:
     """The command line in a process of its own that finds what is installed in the folder ``beside``."""
     return python(EGVS, *arguments, beside=beside)
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from pipeline.core.progress import Progress, silent
-from pipeline.scenario.models import Scenario
-from pipeline.stages.base import StageInputs, Workspace
+from egvs.core.runtime import ProgressCallback, no_progress
+from egvs.scenario.model import Scenario
+from egvs.stages.base import StageDependencies
+from egvs.stages.inputs import open_folder
 
 
 def run_stage(
@@ -15,17 +16,17 @@ def run_stage(
     scenario: Scenario,
     out: Path,
     jobs: int | None = None,
-    progress: Progress = silent,
+    progress: ProgressCallback = no_progress,
     **options: Any,
 ) -> dict[str, Any]:
     """Run one stage in a folder that holds the artefacts of those before it; its summary."""
     out.mkdir(parents=True, exist_ok=True)
-    work = Workspace(scenario, out, jobs=jobs, progress=progress)
-    summary: dict[str, Any] = stage.run(work, stage.inputs(work), **options)
+    work = open_folder(scenario, out, jobs=jobs, progress=progress)
+    summary: dict[str, Any] = stage.STAGE.run(work, stage.STAGE.dependencies(work), **options)
     return summary
 
 
-def inputs_of(stage: Any, scenario: Scenario, out: Path) -> StageInputs:
+def inputs_of(stage: Any, scenario: Scenario, out: Path) -> StageDependencies:
     """What a stage reads."""
-    found: StageInputs = stage.inputs(Workspace(scenario, out))
+    found: StageDependencies = stage.STAGE.dependencies(open_folder(scenario, out))
     return found

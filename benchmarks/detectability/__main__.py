@@ -20,14 +20,14 @@ from benchmarks.detectability.fitting import elsewhere, fitted
 from benchmarks.validity import junctions, poses, study
 from benchmarks.validity.junctions import Role
 from benchmarks.validity.study import Extent
-from pipeline.cli import arguments
-from pipeline.core import files
-from pipeline.core.errors import EgvsError, InputError
-from pipeline.core.progress import Progress
-from pipeline.scoring.targets.detectability import DETECTORS, FILE
-from pipeline.validation.detectors import registry
-from pipeline.validation.detectors.base import Detector
-from pipeline.validation.site_findings import POINTS
+from egvs.cli import options
+from egvs.core import files
+from egvs.core.errors import EgvsError, InputError
+from egvs.core.runtime import ProgressCallback
+from egvs.scoring.target_scores import DETECTORS, MODEL_FILE
+from egvs.validation.detectors import base
+from egvs.validation.detectors.base import Detector
+from egvs.validation.sweeps import POINT_COUNTS_NAME
 
 ROOT = Path(__file__).resolve().parents[2]
 SAID_EVERY_S = 30.0
@@ -60,12 +60,12 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(chosen: argparse.Namespace) -> None:
-    models = chosen.out / FILE.name if chosen.out else FILE
+    models = chosen.out / MODEL_FILE.name if chosen.out else MODEL_FILE
     picture = (chosen.out or ROOT / "docs" / "images") / figures.NAME
     if not chosen.only_draw:
         text = _learnt(chosen)
         models.parent.mkdir(parents=True, exist_ok=True)
-        with files.aside(models) as partial:
+        with files.atomic_write(models) as partial:
             partial.write_text(text, encoding="utf-8")
         print(models)
     elif not models.is_file():
@@ -81,7 +81,7 @@ def _learnt(chosen: argparse.Namespace) -> str:
     def told(text: str) -> None:
         print(f"{time.monotonic() - begun:6.0f} s  {text}", flush=True)
 
-    detectors = {name: registry.make(name) for name in DETECTORS}
+    detectors = {name: base.make_detector(name) for name in DETECTORS}
     homes = _homes(chosen)
     chosen.data.mkdir(parents=True, exist_ok=True)
     told(f"preparing {', '.join(name for name, _, _ in homes)}")
@@ -92,7 +92,7 @@ def _learnt(chosen: argparse.Namespace) -> str:
         )
         for name, its in each.items()
     }
-    settings = {name: files.hash_of(detector.settings) for name, detector in detectors.items()}
+    settings = {name: files.hash_json(detector.settings) for name, detector in detectors.items()}
     about = writing.About(learnt_on, chosen.frames, settings, sklearn.__version__)
     models = {}
     for name in detectors:
@@ -113,7 +113,7 @@ def _homes(chosen: argparse.Namespace) -> list[tuple[str, Role, Path]]:
             "--junction", repr(unknown[0]), f"one of {', '.join(known)}: others are quoted, not learnt from"
         )
     homes = junctions.shipped(names)
-    at = arguments.latitude_and_longitude(chosen.osm_training_at) if chosen.osm_training_at else None
+    at = options.latitude_and_longitude(chosen.osm_training_at) if chosen.osm_training_at else None
     if chosen.osm_training is not None:
         homes.append(junctions.from_osm("training", chosen.osm_training, at, chosen.data / "junctions"))
     elif at is not None:
@@ -134,14 +134,14 @@ def _examples(
     junction = junctions.ready(*home, chosen.data / "worlds" / name, chosen.places)
     junctions.check_unseen(junction.scenario)
     extent = Extent(chosen.frames, 0, chosen.places)
-    (part,) = study.parts([junction], [POINTS, *detectors], extent, chosen.data)
+    (part,) = study.parts([junction], [POINT_COUNTS_NAME, *detectors], extent, chosen.data)
     looks = ", ".join(f"{detector} from {len(part.detectors[detector])}" for detector in detectors)
     minutes = study.reckoned_s(part) / 60
     told(f"{name}: {part.frames} frames {part.apart_s:g} s apart, {looks}; some {minutes:.0f} minutes of one core")
     return examples.examples_of(part, detectors, chosen.data, jobs=chosen.jobs, progress=_progress(name, told))
 
 
-def _progress(name: str, told: Callable[[str], None]) -> Progress:
+def _progress(name: str, told: Callable[[str], None]) -> ProgressCallback:
     """A line every half minute."""
     said_at = time.monotonic()
 

@@ -19,24 +19,21 @@ import numpy as np
 from benchmarks.detectability.fitting import Examples, Floats
 from benchmarks.validity.measuring import Part
 from benchmarks.validity.record import BOXED
-from pipeline.core import parallel
-from pipeline.core.errors import InputError
-from pipeline.core.progress import Progress, silent
-from pipeline.kernels.matching import EXCEED
-from pipeline.scoring.targets.detectability import features_of
-from pipeline.scoring.targets.record import TargetRecord
-from pipeline.scoring.targets.seen import noticed_in, see
-from pipeline.scoring.visibility import Beams
-from pipeline.sensing.scanner import Scanner
-from pipeline.sensing.sites import Site
-from pipeline.validation import detection
-from pipeline.validation.detection import ALL
-from pipeline.validation.detectors.base import Detector
-from pipeline.validation.looking import Look, look_from
-from pipeline.validation.metrics.average_precision import IOUS
-from pipeline.validation.metrics.overlap import VIEWS, overlap_each
-from pipeline.validation.site_findings import Found, FoundBoxes
-from pipeline.validation.unseen_record import UnseenRecord, prepare
+from egvs.core import runtime
+from egvs.core.errors import InputError
+from egvs.core.runtime import ProgressCallback, no_progress
+from egvs.kernels.detection import OVERLAP_TOLERANCE
+from egvs.scoring.target_scores import detectability_features
+from egvs.scoring.targets import TargetRecord, detection_probability, visible_targets
+from egvs.scoring.visibility import Beams
+from egvs.sensors.scanner import Scanner
+from egvs.sensors.sites import Site
+from egvs.validation import detection_metrics
+from egvs.validation.detection_metrics import ALL_OBJECTS, IOUS, VIEWS, paired_overlap
+from egvs.validation.detector_runs import SiteDetectionTask, run_detectors
+from egvs.validation.detectors.base import Detector
+from egvs.validation.held_out_traffic import HeldOutTraffic, prepare_held_out_traffic
+from egvs.validation.sweeps import DetectedBoxes, DetectorResult
 
 IOU = IOUS[0]
 AP = BOXED[0]
@@ -69,7 +66,7 @@ def examples_of(
     folder: Path,
     *,
     jobs: int | None = None,
-    progress: Progress = silent,
+    progress: ProgressCallback = no_progress,
 ) -> JunctionExamples:
     """Every vehicle-frame of a junction, as seen from each site, and whether it was found.
 
@@ -86,7 +83,7 @@ def examples_of(
         For traffic without any vehicle in the region of interest.
     """
     with tempfile.TemporaryDirectory(prefix=".work-", dir=folder) as temporary:
-        unseen = prepare(
+        unseen = prepare_held_out_traffic(
             part.scenario, Path(temporary), part.frames, apart_s=part.apart_s, jobs=jobs, progress=progress
         )
         record = TargetRecord.of(list(unseen.read()), part.scenario.roi.grid)
@@ -97,7 +94,7 @@ def examples_of(
         by_detector = {}
         for name, detector in detectors.items():
             sites = [site for site in unseen.scene.sites if site.name in part.detectors[name]]
-            found_from = look_from(sites, Look(unseen, {name: detector}), jobs=jobs, progress=progress)
+            found_from = run_detectors(sites, SiteDetectionTask(unseen, {name: detector}), jobs=jobs, progress=progress)
             hits = [hits_of(record, _boxes(its[name])) for its in found_from.values()]
             seen = [features[site] for site in found_from]
             by_detector[name] = Examples(seen, hits, _ap(unseen, found_from, name))
@@ -105,23 +102,25 @@ def examples_of(
     return JunctionExamples(part.name, sensors, len(record), by_detector)
 
 
-def _features(unseen: UnseenRecord, record: TargetRecord, jobs: int | None, progress: Progress) -> dict[str, Floats]:
+def _features(
+    unseen: HeldOutTraffic, record: TargetRecord, jobs: int | None, progress: ProgressCallback
+) -> dict[str, Floats]:
     """What a model learns from, of each site."""
     scanner, sites = Scanner(unseen.scene), unseen.scene.sites
 
     def of(site: Site) -> Floats:
         beams = Beams.of(scanner.scan_site(site))
-        return features_of(see(record, beams, noticed_in(unseen.scene, beams.sensor)))
+        return detectability_features(visible_targets(record, beams, detection_probability(unseen.scene, beams.sensor)))
 
     found: dict[str, Floats] = {}
-    for site, its in zip(sites, parallel.in_order(of, sites, parallel.threads(jobs)), strict=True):
+    for site, its in zip(sites, runtime.map_ordered(of, sites, runtime.thread_count(jobs)), strict=True):
         found[site.name] = its
         progress("sites seen from", len(found), len(sites))
     return found
 
 
-def _boxes(found: Found) -> list[Floats]:
-    assert isinstance(found, FoundBoxes)
+def _boxes(found: DetectorResult) -> list[Floats]:
+    assert isinstance(found, DetectedBoxes)
     return [its.boxes for its in found.frames]
 
 
@@ -132,7 +131,7 @@ def hits_of(record: TargetRecord, found: Sequence[Floats]) -> Floats:
     ----------
     found
         Detections of each frame of the record, (m, 7) float64 each, as
-        :data:`pipeline.artefacts.traffic_frames.BOX`.
+        :data:`egvs.artefacts.traffic_frames.BOX_COLUMNS`.
     """
     each = np.split(record.boxes, np.searchsorted(record.frame, np.arange(1, len(record.numbers))))
     return np.concatenate([_overlapped(boxes, its) for boxes, its in zip(each, found, strict=True)])
@@ -140,13 +139,13 @@ def hits_of(record: TargetRecord, found: Sequence[Floats]) -> Floats:
 
 def _overlapped(boxes: Floats, found: Floats) -> Floats:
     box, its = (number.ravel() for number in np.indices((len(boxes), len(found))))
-    overlap = overlap_each(boxes[box], found[its]).reshape(len(VIEWS), len(boxes), len(found))
-    shares: Floats = (overlap > IOU + EXCEED).any(axis=2).mean(axis=0)
+    overlap = paired_overlap(boxes[box], found[its]).reshape(len(VIEWS), len(boxes), len(found))
+    shares: Floats = (overlap > IOU + OVERLAP_TOLERANCE).any(axis=2).mean(axis=0)
     return shares
 
 
-def _ap(unseen: UnseenRecord, found: Mapping[str, Mapping[str, Found]], name: str) -> list[float]:
+def _ap(unseen: HeldOutTraffic, found: Mapping[str, Mapping[str, DetectorResult]], name: str) -> list[float]:
     """AP of a detector, of each site."""
-    rows, _ = detection.measured(list(unseen.read()), unseen.scene.roi, found)
-    of = {row.site: row.measures[AP].value for row in rows if row.detector == name and row.objects_of == ALL}
+    rows, _ = detection_metrics.measure_detection(list(unseen.read()), unseen.scene.roi, found)
+    of = {row.site: row.measures[AP].value for row in rows if row.detector == name and row.objects_of == ALL_OBJECTS}
     return [of[site] for site in found]

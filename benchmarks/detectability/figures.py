@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.core import files
+from egvs.core import files
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -19,7 +19,7 @@ _OTHER = "#777777"
 
 def draw(path: Path, source: Path) -> None:
     """Write the calibration of every detector of a file of models, as PNG."""
-    with files.aside(path) as partial:
+    with files.atomic_write(path) as partial:
         figure = calibration(json.loads(source.read_text(encoding="utf-8")))
         figure.savefig(partial, dpi=130, format="png", metadata={"Software": None})
 

@@ -1,7 +1,7 @@
 """Fits the chance that a detector finds a vehicle, and says how well that holds on a junction it was not learnt from.
 
 A boosted model of few small trees (scikit-learn's histogram boosting), held to rise and fall as
-:data:`pipeline.scoring.targets.detectability.RISES` says. Its size was settled on the training junctions, each foretold
+:data:`egvs.scoring.target_scores.MONOTONICITY` says. Its size was settled on the training junctions, each foretold
 by the model of the others: docs/validation.md has what more trees, or none of these directions, would change.
 """
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.stats import spearmanr
 from sklearn.ensemble import HistGradientBoostingClassifier
 
-from pipeline.scoring.targets.detectability import RISES, Model
+from egvs.scoring.target_scores import MONOTONICITY, DetectabilityModel
 
 TREES, LEAVES, RATE, FEWEST = 60, 12, 0.15, 600
 """Trees, leaves of each, how much of each is taken, and vehicle-frames (a hit and a miss count as two) in a leaf."""
@@ -57,7 +57,7 @@ def fitted(examples: Sequence[Examples]) -> dict[str, Any]:
     kept = weight > 0.0
     found = HistGradientBoostingClassifier(
         max_iter=TREES, learning_rate=RATE, max_leaf_nodes=LEAVES, min_samples_leaf=FEWEST,
-        monotonic_cst=list(RISES.values()), early_stopping=False, random_state=0,
+        monotonic_cst=list(MONOTONICITY.values()), early_stopping=False, random_state=0,
     ).fit(np.concatenate([x, x])[kept], label[kept], sample_weight=weight[kept])  # fmt: skip
     trees = [[_node(node) for node in predictor[0].nodes] for predictor in found._predictors]
     return {"base": _short(found._baseline_prediction.item()), "trees": trees}
@@ -78,7 +78,7 @@ def elsewhere(examples: Mapping[str, Examples]) -> dict[str, Any]:
     rho = dict[str, float]()
     chances, hits = list[Floats](), list[Floats]()
     for name, its in examples.items():
-        model = Model.of(fitted([e for other, e in examples.items() if other != name]))
+        model = DetectabilityModel.of(fitted([e for other, e in examples.items() if other != name]))
         each = [model.chances(features) for features in its.features]
         rho[name] = round(float(spearmanr([c.mean() for c in each], its.ap).statistic), 3)
         chances += each

@@ -1,4 +1,4 @@
-"""The file of models, ``pipeline/scoring/targets/detectability.json``: what was learnt, from what, how well it holds.
+"""The file of models, ``pipeline/egvs/scoring/target_scores.json``: what was learnt, from what, how well it holds.
 
 A line a tree and a line a part of the calibration curve, so that a change shows where it is.
 """
@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from pipeline.scoring.targets.detectability import FEATURES
+from egvs.scoring.target_scores import FEATURES
 
 MADE_BY = "python -m benchmarks.detectability"
 FINDS = "a box that overlaps the vehicle by more than 0.7, in the mean of seen from above and in space"

@@ -14,15 +14,15 @@ from pathlib import Path
 import mpmath
 import numba
 import numpy as np
+from tests.oracles import boxes as oracle
 
-import pipeline
+import egvs
 from benchmarks.numerics.row import Row
 from benchmarks.scenes import recorded_boxes
-from pipeline.artefacts.recorded_boxes import FrameBoxes
-from pipeline.core.grid import Grid
-from pipeline.kernels import boxes
-from pipeline.scoring.occupancy import count
-from tests.oracles import boxes as oracle
+from egvs.artefacts.traffic_frames import FrameBoxes
+from egvs.core.grid import Grid
+from egvs.kernels import occupancy
+from egvs.scoring.occupancy import count_occupancy
 
 ROOT = Path(__file__).resolve().parents[2]
 RULE = "depth > 0.1 mm + 1 nm"
@@ -89,8 +89,8 @@ def compare(values, shape, voxel_m, doubtful, nearest):
         box = values[b]
         steps[:] = 0
         frame[0] = b
-        boxes.count_boxes(frame, values[b : b + 1], shape, voxel_m, steps, seen)
-        boxes.sum_layers(steps)
+        occupancy.count_boxes(frame, values[b : b + 1], shape, voxel_m, steps, seen)
+        occupancy.sum_layers(steps)
         _prepare(box, axes, normals)
         for a in range(3):
             reach = 0.01
@@ -202,19 +202,19 @@ def real(scale):
     """Rows of the shipped traffic: every box against its depths, and the counts after a move of 1e-9 m along each
     axis."""
     frames = max(100, round(5000 * min(scale, 1.0) / 100) * 100)
-    scenario = pipeline.load(ROOT / "scenarios" / "nishishinjuku", [f"traffic.frames={frames}"])
+    scenario = egvs.load(ROOT / "scenarios" / "nishishinjuku", [f"traffic.frames={frames}"])
     grid, recorded = scenario.roi.grid, recorded_boxes(scenario)
     frame, values = recorded.frame, recorded.values
     doubtful, nearest = np.empty((len(values), 5), np.int64), np.empty(len(values))
     some = np.ascontiguousarray(values[:: max(1, round(1 / max(scale, 1e-9) / 2))])
     wrong, pairs, _ = compare(some, np.asarray(grid.shape, np.int64), grid.voxel_m, doubtful, nearest)
     close = int((nearest[: len(some)] <= 1e-9).sum())
-    before = count(recorded, grid, frames)
+    before = count_occupancy(recorded, grid, frames)
     turned = 0
     for axis in range(3):
         for sign in (-1, 1):
             moved = values + sign * 1e-9 * np.eye(8)[axis]
-            turned += int((count(FrameBoxes(frame, moved), grid, frames) != before).sum())
+            turned += int((count_occupancy(FrameBoxes(frame, moved), grid, frames) != before).sum())
     return [
         Row(
             "boxes of nishishinjuku",
@@ -265,8 +265,8 @@ def in_decimals(scale):
             for a, b, count_ in zip(*sides, shape, strict=True)
         ]
         expected[np.ix_(*spans)] = 1
-        mismatches += bool((count(FrameBoxes(np.zeros(1, np.int64), values), grid, 1) != expected).any())
-    told = f"fractions of the decimals; {on_bound} with a side on the bound of 0.1 mm"
+        mismatches += bool((count_occupancy(FrameBoxes(np.zeros(1, np.int64), values), grid, 1) != expected).any())
+    told = f"rational arithmetic on the decimals; {on_bound} with a side on the bound of 0.1 mm"
     return Row("boxes with sides on planes of 0.1 to 0.3 m, moved by tenths", RULE, told, done, 0, mismatches, "-")
 
 
@@ -277,8 +277,8 @@ def rows(scale: float) -> list[Row]:
         return max(50, round(n * scale))
 
     return [
-        hunt("hostile boxes, 0.25 m", hostile, 21, some(500_000), (8, 7, 5), 0.25),
-        hunt("hostile boxes, 0.1 m", hostile, 22, some(200_000), (9, 8, 7), 0.1),
+        hunt("adversarial boxes, 0.25 m", hostile, 21, some(500_000), (8, 7, 5), 0.25),
+        hunt("adversarial boxes, 0.1 m", hostile, 22, some(200_000), (9, 8, 7), 0.1),
         hunt("random vehicles", vehicles, 23, some(300_000), (24, 20, 12), 0.25),
         in_decimals(scale),
         *real(scale),

@@ -14,16 +14,17 @@ from typing import Any
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-
-import pipeline
-from benchmarks.numerics.row import Row
-from pipeline.core.grid import Roi
-from pipeline.scenario.models import Scenario
-from pipeline.sensing import sensors, sites
-from pipeline.world import static_world
-from pipeline.world.casting import Caster
-from pipeline.world.mesh import World
 from tests.oracles import cast
+
+import egvs
+from benchmarks.numerics.row import Row
+from egvs.core.grid import Roi
+from egvs.scenario.model import Scenario
+from egvs.sensors import sensor, sites
+from egvs.sensors.sensor import scenario_sensor
+from egvs.world import static_world
+from egvs.world.mesh import World
+from egvs.world.ray_casting import Caster
 
 Floats = NDArray[np.float64]
 
@@ -31,8 +32,8 @@ _SCENARIOS = Path(__file__).resolve().parent.parent.parent / "scenarios"
 _SHIPPED = ("nishishinjuku", "ingolstadt")
 _ROI = Roi((0.0, 0.0, 0.0), (100.0, 100.0, 10.0))
 _CENTRE = np.array([50.0, 50.0, 5.0])
-_RANGE_RULE = "range within 1 mm of the answer, no leak"
-_FIRST_RULE = "first triangle met, 1 micrometre round its edges included"
+_RANGE_RULE = "range within 1 mm of the true range, no leak"
+_FIRST_RULE = "first triangle hit, including 1 micrometre around its edges"
 
 
 def rows(scale: float) -> list[Row]:
@@ -171,7 +172,7 @@ def _surfaces(rng: np.random.Generator, scale: float) -> Iterator[Row]:
                 _to(_caster(surface), o, surface[chosen, side] * (1 - s) + surface[chosen, (side + 1) % 3] * s)
             )
         found, true = (np.concatenate(part) for part in zip(*parts, strict=True))
-        yield _known(f"sides and corners of 3,200 coplanar triangles, seen at {graze_deg:g} degrees", found, true)
+        yield _known(f"edges and corners of 3,200 coplanar triangles, seen at {graze_deg:g} degrees", found, true)
 
 
 def _slivers(rng: np.random.Generator, scale: float) -> Row:
@@ -198,14 +199,14 @@ def _t_junction(rng: np.random.Generator, scale: float) -> Row:
 
 
 def _on_a_wall(rng: np.random.Generator, scale: float) -> Row:
-    directions, cases, wrong = sensors.CATALOGUE["VLP-16"].directions()[::7], 0, 0
+    directions, cases, wrong = sensor.CATALOGUE["VLP-16"].directions()[::7], 0, 0
     for _ in range(_many(scale, 1000) // 10):
         turn, away = _turned(rng.uniform(0, 360)), rng.choice([-1e-9, -1e-13, 0.0, 1e-13, 1e-9])
         house = trimesh.creation.box((10, 8, 6)).triangles @ turn.T + _CENTRE
         outwards = directions[directions @ turn[:, 0] > 1e-3]
         ranges, _ = _caster(house).first_hits(turn @ np.array([5.0 + away, *rng.uniform(-2, 2, 2)]) + _CENTRE, outwards)
         cases, wrong = cases + len(outwards), wrong + int(np.isfinite(ranges).sum())
-    rule = "a plane within 1 micrometre of the sensor is not met"
+    rule = "a plane within 1 micrometre of the sensor is not hit"
     return Row("a sensor on an oblique wall", rule, "geometry", cases, 0, wrong, f"{wrong} beams blocked")
 
 
@@ -229,13 +230,13 @@ def _scenes(rng: np.random.Generator, scale: float, lattice: bool) -> Row:
         worst = max(worst, float(np.abs(found[both] - true[both]).max(initial=0.0)))
     name = "random scenes on a coarse lattice" if lattice else "random scenes, needles down to 1 micrometre"
     return Row(
-        f"{name}, aimed at corners, sides, faces", _FIRST_RULE, "float64 brute force", cases, 0, wrong, f"{worst:.1e} m"
+        f"{name}, aimed at corners, edges, faces", _FIRST_RULE, "float64 brute force", cases, 0, wrong, f"{worst:.1e} m"
     )
 
 
 def _scene(name: str) -> tuple[Scenario, Caster, Floats]:
-    scenario = pipeline.load(_SCENARIOS / name)
-    world = static_world.build(scenario)[0]
+    scenario = egvs.load(_SCENARIOS / name)
+    world = static_world.build_world(scenario)[0]
     return scenario, Caster(world, scenario.roi.box), world.triangles_m - np.asarray(scenario.roi.box.origin_m)
 
 
@@ -255,7 +256,7 @@ def _compare(case: str, jobs: Iterator[tuple[Caster, Floats, Floats, Floats]]) -
             max(gap, float(apart[near].max(initial=0.0))),
             max(worst, float(apart[both & ~other].max(initial=0.0))),
         )
-    figure = f"{worst:.1e} m; another surface: {close + wrong}, up to {gap:.1e} m"
+    figure = f"{worst:.1e} m; other surface: {close + wrong}, up to {gap:.1e} m"
     return Row(case, _FIRST_RULE, "float64 brute force", cases, close, wrong, figure)
 
 
@@ -264,8 +265,8 @@ def _shipped(name: str, scale: float) -> Row:
     step = max(1, round(1 / scale))
 
     def jobs() -> Iterator[tuple[Caster, Floats, Floats, Floats]]:
-        for site in sites.of(scenario):
-            sensor = sensors.of_scenario(site.sensor, scenario, site.name)
+        for site in sites.candidate_sites(scenario):
+            sensor = scenario_sensor(site.sensor, scenario, site.name)
             d = sensor.directions(*site.pose.angles_deg)
             kept = caster.scan(site.pose.position_m, d, sensor.range_m).beam[::step]
             yield caster, triangles, np.asarray(site.pose.position_m) - np.asarray(scenario.roi.box.origin_m), d[kept]
@@ -275,7 +276,7 @@ def _shipped(name: str, scale: float) -> Row:
 
 def _aimed(name: str, rng: np.random.Generator, scale: float) -> Row:
     scenario, caster, triangles = _scene(name)
-    places = sites.of(scenario)
+    places = sites.candidate_sites(scenario)
 
     def jobs() -> Iterator[tuple[Caster, Floats, Floats, Floats]]:
         for site in places:
@@ -285,7 +286,7 @@ def _aimed(name: str, rng: np.random.Generator, scale: float) -> Row:
             o = np.asarray(site.pose.position_m) - np.asarray(scenario.roi.box.origin_m)
             yield caster, triangles, o, _unit(on_side + rng.normal(size=(n, 3)) * 1e-3 - o)
 
-    return _compare(f"{name}: aimed within some mm of the sides of its triangles", jobs())
+    return _compare(f"{name}: aimed within a few mm of triangle edges", jobs())
 
 
 def main() -> Any:

@@ -8,9 +8,9 @@ import mpmath
 import numpy as np
 
 from benchmarks.numerics.row import Row
-from pipeline.core.grid import Grid
-from pipeline.scoring.egvs import EntropyField, binary_entropy
-from pipeline.sensing.sensors import CATALOGUE, Sensor
+from egvs.core.grid import Grid
+from egvs.scoring.egvs import EntropyField, binary_entropy
+from egvs.sensors.sensor import CATALOGUE, Sensor
 
 _LARGEST = 2**32 - 1
 
@@ -56,7 +56,7 @@ def _anywhere(rng: np.random.Generator, scale: float) -> Row:
         frames = int(2 ** rng.uniform(0, 32)) if rng.random() < 0.9 else _LARGEST
         frames = min(max(frames, 1), _LARGEST)
         pairs.append((int(rng.integers(0, frames + 1)), frames))
-    return _held("H of any count of any T", pairs)
+    return _held("H of random counts and T", pairs)
 
 
 def _case(rng: np.random.Generator) -> tuple[list[int], int, list[int], float]:
@@ -91,7 +91,7 @@ def _sums(rng: np.random.Generator, scale: float) -> Row:
     return Row(
         "EGVS of random fields, gamma 0 to infinity",
         "the exact sum, rounded once",
-        "fractions",
+        "rational arithmetic",
         cases,
         0,
         wrong,

@@ -13,13 +13,13 @@ from pathlib import Path
 
 import numba
 import numpy as np
-
-import pipeline
-from benchmarks.numerics.row import Row
-from pipeline.core.grid import Grid
-from pipeline.kernels import march
-from pipeline.sensing.scanner import Scanner
 from tests.oracles import march as oracle
+
+import egvs
+from benchmarks.numerics.row import Row
+from egvs.core.grid import Grid
+from egvs.kernels import traversal
+from egvs.sensors.scanner import Scanner
 
 ROOT = Path(__file__).resolve().parents[2]
 SCENES = ("nishishinjuku", "ingolstadt")
@@ -91,10 +91,10 @@ def compare(o, d, shape, voxel_m, verdict):
         np.empty(longest, np.int64),
         np.empty((longest, 2)),
     )
-    hits, crossed = np.zeros(1, np.uint32), 0
+    buffer, crossed = traversal.crossing_buffer(shape), 0
     for i in range(o.shape[0]):
         n = cuts(o[i], d[i], shape, voxel_m, times, mine)
-        count, _, _ = march.walk(o[i], d[i], shape, voxel_m, hits, cells, t_cells)
+        count, _, _ = traversal.list_voxels(o[i], d[i], shape, voxel_m, cells, t_cells, buffer)
         crossed += count
         verdict[i] = 2 if n < 0 else 0 if n == count and np.all(mine[:n] == cells[:count]) else 1
     return crossed
@@ -114,7 +114,7 @@ def walk(o, d, shape, voxel_m):
     """The voxels that the march lists."""
     n = np.asarray(shape, np.int64)
     cells, t_cells = np.empty(n.sum() + 8, np.int64), np.empty((n.sum() + 8, 2))
-    count, _, _ = march.walk(o, d, n, voxel_m, np.zeros(1, np.uint32), cells, t_cells)
+    count, _, _ = traversal.list_voxels(o, d, n, voxel_m, cells, t_cells, traversal.crossing_buffer(n))
     return {tuple(int(i) for i in np.unravel_index(c, tuple(n))) for c in cells[:count]}
 
 
@@ -196,7 +196,7 @@ def hunt(case, make, seed, n, shape, voxel_m, built=False):
         o, d = make(rng, size, shape, voxel_m)
         found = check(o, d, shape, voxel_m)
         excluded, mismatches, asked, done = excluded + found[0], mismatches + found[1], asked + found[2], done + size
-    told = f"sorted cuts with a margin; {asked} by fractions"
+    told = f"sorted cuts with a margin; {asked} in rational arithmetic"
     return Row(case, RULE, told, done, excluded, mismatches, "-" if built else f"{excluded} within 1e-8 m of the bound")
 
 
@@ -272,8 +272,8 @@ def count_fragile(o, d, shape, voxel_m, moved_m):
 
 def beams_of(name):
     """(grid, [(site, o, d)]) of a shipped scene."""
-    scenario = pipeline.load(ROOT / "scenarios" / name)
-    scene, grid = pipeline.build_scene(scenario), scenario.roi.grid
+    scenario = egvs.load(ROOT / "scenarios" / name)
+    scene, grid = egvs.build_scene(scenario), scenario.roi.grid
     scanner = Scanner(scene)
     found = [
         (site.name, *grid.segments(site.pose.position_m, scanner.scan_site(site).rows.ends_m)) for site in scene.sites
@@ -296,19 +296,20 @@ def shipped(name, scale):
         excluded, mismatches, asked = excluded + found[0], mismatches + found[1], asked + found[2]
         found = count_fragile(o, d, shape, grid.voxel_m, 1e-9)
         in_plane, others = in_plane + found[0], others + found[1]
-        found = march.audit(o, d, shape, grid.voxel_m, np.zeros(int(shape.prod()), np.uint32))
+        found = traversal.audit_beams(o, d, shape, grid.voxel_m, np.zeros(int(shape.prod()), np.uint32))
         worst_sum, longest_gap, broken = (
             max(worst_sum, found[0]),
             max(longest_gap, found[1]),
             broken + found[2] + found[3],
         )
     return [
-        Row(f"beams of {name}", RULE, f"sorted cuts with a margin; {asked} by fractions", total, excluded, mismatches,
-            "-"),
-        Row(f"beams of {name}, chords add up", "to 1e-12 of the segment, no voxel twice", "march.audit", total, 0,
+        Row(f"beams of {name}", RULE, f"sorted cuts with a margin; {asked} in rational arithmetic", total,
+            excluded, mismatches, "-"),
+        Row(f"beams of {name}, sum of chords", "equals the segment to 1e-12, no voxel twice", "march.audit", total, 0,
             broken + (worst_sum > 1e-12), f"{worst_sum:.1e} of the segment; longest gap {longest_gap:.1e} m"),
-        Row(f"beams of {name}, ends moved by 1e-9 m", "no voxel may turn", "chords in voxels 1e-9 m larger and smaller",
-            total, in_plane + others, 0, f"{in_plane} beams exactly in a plane, {others} others"),
+        Row(f"beams of {name}, ends moved by 1e-9 m", "no voxel may change",
+            "chords in voxels 1e-9 m larger and smaller", total, in_plane + others, 0,
+            f"{in_plane} beams exactly in a plane, {others} others"),
     ]  # fmt: skip
 
 
@@ -323,7 +324,7 @@ def far_chords(scale):
         o = target - away / np.sqrt((away**2).sum()) * FAR_M / voxel_m
         d = 2 * (target - o)
         exact = oracle.shares(o, d, shape.tolist())
-        count, _, _ = march.walk(o, d, shape, voxel_m, np.zeros(1, np.uint32), cells, t_cells)
+        count, _, _ = traversal.list_voxels(o, d, shape, voxel_m, cells, t_cells, traversal.crossing_buffer(shape))
         for c in range(count):
             i, j, k = (int(i) for i in np.unravel_index(cells[c], tuple(shape)))
             worst = max(
@@ -332,7 +333,7 @@ def far_chords(scale):
     return Row(
         "chords of beams from 1e7 m away",
         "to 4 u R = 4.5e-9 m",
-        "fractions",
+        "rational arithmetic",
         n,
         0,
         int(worst > Fraction(45, 10**10)),
@@ -372,7 +373,7 @@ def in_decimals(scale):
         excluded += bool(doubtful)
         wrong = found[1] ^ oracle.crossed(exact_o, exact_d, shape, Fraction(tenths, 10))
         mismatches += found[0] != found[1] or not wrong <= doubtful
-    told = f"fractions of the decimals, and the same moved by up to 4000 km; {in_plane} beams in a plane"
+    told = f"rational arithmetic on the decimals, and the same moved by up to 4000 km; {in_plane} beams in a plane"
     return Row("beams on tenths of a metre, voxels of 0.1 to 0.3 m", RULE, told, 2 * n, excluded, mismatches, "-")
 
 
@@ -383,9 +384,9 @@ def rows(scale: float) -> list[Row]:
         return max(50, round(n * scale))
 
     found = [
-        hunt("hostile segments, 0.25 m", hostile, 11, some(500_000), (7, 5, 4), 0.25),
-        hunt("hostile segments, 0.1 m, a larger grid", hostile, 12, some(250_000), (40, 24, 10), 0.1),
-        hunt("hostile segments, 16 m", hostile, 13, some(250_000), (12, 9, 6), 16.0),
+        hunt("adversarial segments, 0.25 m", hostile, 11, some(500_000), (7, 5, 4), 0.25),
+        hunt("adversarial segments, 0.1 m, a larger grid", hostile, 12, some(250_000), (40, 24, 10), 0.1),
+        hunt("adversarial segments, 16 m", hostile, 13, some(250_000), (12, 9, 6), 16.0),
         hunt("random segments", uniform, 14, some(10_000_000), (40, 20, 10), 0.25),
         hunt("corners cut by 0.5 to 2 micrometres", near_the_bound, 15, some(20_000), (20, 20, 6), 0.25),
         far_chords(scale),

@@ -15,21 +15,17 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.cli.validation.tables import FusedLines
-from pipeline.core import files
-from pipeline.placement import placing
-from pipeline.scenario.loading import load
-from pipeline.validation import detection
-from pipeline.validation.agreement import main_measure
-from pipeline.validation.detection import ALL, SiteDetection
-from pipeline.validation.fused.gains import difference
-from pipeline.validation.fused.looking import FusedLook
-from pipeline.validation.fused.plans import Group
-from pipeline.validation.fused.validating import joint_detectors
-from pipeline.validation.looking import look_from
-from pipeline.validation.metrics.leave_out import Estimate
-from pipeline.validation.site_findings import POINTS
-from pipeline.validation.unseen_record import prepare
+from egvs.cli.validation_tables import PlanRunDisplay
+from egvs.core import files
+from egvs.placement import plan
+from egvs.scenario.loading import load
+from egvs.validation import detection_metrics
+from egvs.validation.detection_metrics import ALL_OBJECTS, JackknifeEstimate, SiteDetection
+from egvs.validation.detector_runs import run_detectors
+from egvs.validation.held_out_traffic import prepare_held_out_traffic
+from egvs.validation.plan_validation import FusedDetectionTask, SensorGroup, estimate_difference, joint_detectors
+from egvs.validation.results import main_measure
+from egvs.validation.sweeps import POINT_COUNTS_NAME
 
 SCORES = ("egvs", "points_on_target", "expected_detections")
 APART_S = 7.0
@@ -44,7 +40,7 @@ class Chosen:
     """The best plan of so many sensors by one score."""
 
     score: str
-    group: Group
+    group: SensorGroup
     share: float
     is_best: bool
 
@@ -54,8 +50,8 @@ def chosen(home: Path, folder: Path, counts: Sequence[int], jobs: int | None) ->
     for score in SCORES:
         for count in counts:
             scenario = load(home, [f"score.rank_by={score!r}", f"placement.count={count}"])
-            placed = placing.place(scenario, folder / score, exact=True, jobs=jobs)
-            group = Group(tuple(pick.site for pick in placed.picks))
+            placed = plan.place(scenario, folder / score, exact=True, jobs=jobs)
+            group = SensorGroup(tuple(pick.site for pick in placed.sensors))
             yield Chosen(score, group, placed.joint / placed.together, placed.solution.is_best)
 
 
@@ -63,39 +59,39 @@ def look(
     home: Path, folder: Path, plans: Sequence[Chosen], frames: int, detectors: Sequence[str], jobs: int | None
 ) -> Found:
     """What detectors find in the clouds of each plan."""
-    record = prepare(load(home), folder / "unseen", frames, apart_s=APART_S, jobs=jobs)
+    record = prepare_held_out_traffic(load(home), folder / "unseen", frames, apart_s=APART_S, jobs=jobs)
     groups = list({plan.group.name: plan.group for plan in plans}.values())
-    fused = FusedLook(record, joint_detectors(detectors))
-    found = look_from(groups, fused, jobs=jobs, listener=FusedLines(print))
-    rows, _ = detection.measured(list(record.read()), record.scene.roi, found)
-    return {(row.site, row.detector): row for row in rows if row.objects_of == ALL}
+    fused = FusedDetectionTask(record, joint_detectors(detectors))
+    found = run_detectors(groups, fused, jobs=jobs, listener=PlanRunDisplay(print))
+    rows, _ = detection_metrics.measure_detection(list(record.read()), record.scene.roi, found)
+    return {(row.site, row.detector): row for row in rows if row.objects_of == ALL_OBJECTS}
 
 
 def lines(plans: Sequence[Chosen], found: Found, detector: str) -> Iterator[str]:
     """A table of one detector."""
-    measure, by = main_measure(detector), {(plan.score, len(plan.group.sites)): plan for plan in plans}
-    shown = ("seen_5", "seen_20", "seen_50") if detector == POINTS else _SHOWN
+    measure, by = main_measure(detector), {(chosen.score, len(chosen.group.sites)): chosen for chosen in plans}
+    shown = ("seen_5", "seen_20", "seen_50") if detector == POINT_COUNTS_NAME else _SHOWN
     yield f"| plan by | K | sites | share | {' | '.join(shown)} | {measure}, more than K - 1 | than by egvs |"
     yield f"|---|---:|---|---:|{'---:|' * (len(shown) + 2)}"
-    for (score, count), plan in by.items():
-        row = found[plan.group.name, detector]
+    for (score, count), chosen in by.items():
+        row = found[chosen.group.name, detector]
 
         def more(other: Chosen | None, row: SiteDetection = row) -> str:
             if other is None:
                 return ""
             less = found[other.group.name, detector]
-            return _percent(difference(row.measures[measure], less.measures[measure], row.frames))
+            return _percent(estimate_difference(row.measures[measure], less.measures[measure], row.frames))
 
         values = " | ".join(_percent(row.measures[name]) for name in shown)
-        names = plan.group.name + ("" if plan.is_best else " (not proved)")
+        names = chosen.group.name + ("" if chosen.is_best else " (not proved)")
         fewer, egvs = by.get((score, count - 1)), None if score == SCORES[0] else by[SCORES[0], count]
-        yield f"| `{score}` | {count} | {names} | {plan.share:.1%} | {values} | {more(fewer)} | {more(egvs)} |"
+        yield f"| `{score}` | {count} | {names} | {chosen.share:.1%} | {values} | {more(fewer)} | {more(egvs)} |"
 
 
 _SHOWN = ("ap_bev_r40_iou70", "ap_3d_r40_iou70", "ap_bev_r40_iou50", "ap_3d_r40_iou50")
 
 
-def _percent(its: Estimate) -> str:
+def _percent(its: JackknifeEstimate) -> str:
     return f"{100 * its.value:.1f} ± {100 * its.se:.1f}"
 
 
@@ -106,7 +102,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--counts", type=int, nargs="+", default=[1, 2, 3])
     parser.add_argument("--frames", type=int, default=300)
-    parser.add_argument("--detectors", nargs="+", default=[POINTS, "cluster", "pointpillars"])
+    parser.add_argument("--detectors", nargs="+", default=[POINT_COUNTS_NAME, "cluster", "pointpillars"])
     parser.add_argument("--jobs", type=int)
     given = parser.parse_args()
     for home in given.scenarios:
@@ -115,7 +111,7 @@ def main() -> None:
         found = look(home, folder, plans, given.frames, given.detectors, given.jobs)
         some = next(iter(found.values()))
         told = [f"### {home.name}", f"{some.objects} vehicles in {some.frames} frames of unseen traffic, in percent."]
-        for detector in dict.fromkeys([POINTS, *given.detectors]):
+        for detector in dict.fromkeys([POINT_COUNTS_NAME, *given.detectors]):
             told += ["", f"`{detector}`", "", *lines(plans, found, detector)]
         text = "\n".join([*told, ""])
         files.write_text(folder / "fused.md", text)

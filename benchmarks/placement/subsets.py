@@ -15,13 +15,12 @@ import tempfile
 from pathlib import Path
 from time import perf_counter
 
-import pipeline
-from pipeline.artefacts.run_record import RunRecord
-from pipeline.placement import asking, placing
-from pipeline.placement.joint_score import NEEDED
-from pipeline.placement.solving import planning
-from pipeline.runs import stages, workflow
-from pipeline.stages.base import Workspace
+import egvs
+from egvs.artefacts.run_folder import RunRecord
+from egvs.placement import plan, problem_builder, solver
+from egvs.placement.plan import REQUIRED_STAGES
+from egvs.runs import run, stages
+from egvs.stages.inputs import open_folder
 
 SCENARIOS = Path(__file__).parent.parent.parent / "scenarios"
 
@@ -35,30 +34,32 @@ def main() -> None:
 
 
 def _subsets(out: Path) -> None:
-    scenario = pipeline.load(SCENARIOS / "nishishinjuku", ["placement.count=4"])
-    record: RunRecord = workflow.run(scenario, out)
-    asked = asking.ask(Workspace(scenario, out, recorded=stages.recorded(record)), lambda _: None)
+    scenario = egvs.load(SCENARIOS / "nishishinjuku", ["placement.count=4"])
+    record: RunRecord = run.run(scenario, out)
+    asked = problem_builder.build_problem(
+        open_folder(scenario, out, recorded=stages.recorded_digests(record)), lambda _: None
+    )
     for count in (1, 2, 3, 4):
         problem = asked.problem.with_count(count)
-        found = planning.best(problem, search_all=True, time_limit_s=600.0, heard=lambda _: None)
+        found = solver.best_plan(problem, search_all=True, time_limit_s=600.0, on_progress=lambda _: None)
         every = itertools.combinations(range(len(asked.sites)), count)
-        best = max(problem.worth(plan).value for plan in every)
+        best = max(problem.plan_value(plan).value for plan in every)
         names = ", ".join(asked.names[i] for i in found.order)
-        same = "the best of all subsets to the last bit" if found.point.worth.value == best else "NOT THE BEST"
-        print(f"{count}: {names}: {found.point.worth.value!r}, {same}; {found.nodes} nodes")
+        same = "the best of all subsets to the last bit" if found.point.plan_value.value == best else "NOT THE BEST"
+        print(f"{count}: {names}: {found.point.plan_value.value!r}, {same}; {found.nodes} nodes")
     best_site = record.stages["score"].summary["best"]
     print(f"egvs run: best {', '.join(best_site)}")
 
 
 def _many(path: Path, out: Path) -> None:
-    scenario = pipeline.load(path, ["placement.count=5", "scan.keep=false"])
-    workflow.run(scenario, out, only=NEEDED)
+    scenario = egvs.load(path, ["placement.count=5", "scan.keep=false"])
+    run.run(scenario, out, only=REQUIRED_STAGES)
     started = perf_counter()
-    placed = placing.place(scenario, out)
+    placed = plan.place(scenario, out)
     seconds = perf_counter() - started
     memory_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-    picks = ", ".join(pick.site.name for pick in placed.picks)
-    print(f"{placed.candidates} candidates, {len(placed.picks)} sensors: {picks}")
+    picks = ", ".join(pick.site.name for pick in placed.sensors)
+    print(f"{placed.candidates} candidates, {len(placed.sensors)} sensors: {picks}")
     print(f"proved: {placed.certificate:.2%} of the best; {seconds:.1f} s, {memory_gb:.2f} GB at most")
 
 

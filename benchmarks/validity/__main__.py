@@ -19,12 +19,14 @@ from benchmarks.validity.looking_from import FAST
 from benchmarks.validity.measuring import Part, measure
 from benchmarks.validity.record import Record
 from benchmarks.validity.study import Extent
-from pipeline.cli import arguments
-from pipeline.core.errors import EgvsError, InputError, MissingBackendError
-from pipeline.validation.site_findings import POINTS
+from egvs.cli import options
+from egvs.core.errors import EgvsError, InputError, MissingBackendError
+from egvs.validation.sweeps import POINT_COUNTS_NAME
 
 ROOT = Path(__file__).resolve().parents[2]
-TITLE = "Tables of the study of validity"
+DATA = Path("data", "validity")
+"""The tables, in the folder of the documentation; docs/validity-tables.md explains them."""
+
 SAID_EVERY_S = 30.0
 
 
@@ -83,15 +85,14 @@ def _study(chosen: argparse.Namespace) -> None:
         left_out.append("a comparison of sensors")
     words = study.preface(main_ones, with_sensors, detectors, [*without, *left_out])
     write(chosen.docs, words, made)
-    costs = tables.page("What scores cost", [], [study.costs(chosen.data, [junction.name for junction in each])])
+    costs = tables.page("Cost of the scores", [], [study.costs(chosen.data, [junction.name for junction in each])])
     (chosen.docs / "validity-costs.md").write_text(costs, encoding="utf-8")
-    print(f"{chosen.docs / 'validity-tables.md'}: {len(made)} tables, {time.monotonic() - begun:.0f} s")
+    print(f"{chosen.docs / DATA}: {len(made)} tables, {time.monotonic() - begun:.0f} s")
 
 
 def write(docs: Path, words: Sequence[str], made: Sequence[tables.Table]) -> None:
-    """Tables as data and as a page, and the figures."""
-    tables.write(docs / "data" / "validity.json", words, made)
-    (docs / "validity-tables.md").write_text(tables.page(TITLE, words, made), encoding="utf-8")
+    """Write the tables as CSV, and the figures."""
+    tables.write(docs / DATA, words, made)
     figures.draw(docs / "images", made)
 
 
@@ -99,10 +100,10 @@ def _detectors(asked: str | None) -> tuple[list[str], list[str]]:
     """Those asked for, or all that can be made; what is left out, and why."""
     if asked is not None:
         names = [name.strip() for name in asked.split(",") if name.strip()]
-        for name in (name for name in names if name != POINTS):
+        for name in (name for name in names if name != POINT_COUNTS_NAME):
             low_models.make(name)
-        return list(dict.fromkeys([POINTS, *names])), []
-    found, without = [POINTS], []
+        return list(dict.fromkeys([POINT_COUNTS_NAME, *names])), []
+    found, without = [POINT_COUNTS_NAME], []
     for name in sorted(low_models.names(), key=lambda name: (name not in FAST, name)):
         try:
             low_models.make(name)
@@ -127,7 +128,7 @@ def _homes(chosen: argparse.Namespace) -> tuple[list[tuple[str, Role, Path]], li
     }
     for role, (extract, place) in named.items():
         if extract is not None:
-            at = arguments.latitude_and_longitude(place) if place else None
+            at = options.latitude_and_longitude(place) if place else None
             homes.append(junctions.from_osm(role, extract, at, chosen.data / "junctions"))
         else:
             article = "an" if role == "unseen" else "a"

@@ -11,7 +11,7 @@ from benchmarks.validity.pools import DEFAULT, Pools, Setting
 from benchmarks.validity.poses import HEIGHTS_M
 from benchmarks.validity.record import Record, StudySite, measures_of
 from benchmarks.validity.tables import Cell, Column, Table, with_interval
-from pipeline.validation.statistics.correlation import Correlation
+from egvs.validation.correlation import Correlation
 
 TRAINING, HELD_OUT = "training", "held out"
 
@@ -44,7 +44,7 @@ def by_setting(pools: Pools) -> Iterator[Table]:
             cells = [told(pools.rho(name, str(setting), measure)) for name in names]
             rows.append([gamma_word(setting.gamma), f"{setting.voxel_m:g}", _yes(setting.occlusion), *cells])
         head = [Column("gamma"), Column("voxel, m"), Column("moving occlusion"), *(Column(n, "two") for n in names)]
-        caption = f"Spearman's rho of EGVS with the {WORDS[measure]} ({pools.detector})."
+        caption = f"Spearman's rho between EGVS and {WORDS[measure]} ({pools.detector})."
         section = "A. EGVS by gamma, voxel size and moving occlusion"
         yield Table(f"A {pools.detector} {measure}", section, caption, head, rows)
 
@@ -70,10 +70,12 @@ def by_kind_of_site(pools: Pools) -> Iterator[Table]:
         ]
         head = [Column("score"), Column("sites"), *(Column(name, "two") for name in names)]
         caption = (
-            f"Rho with the {WORDS[measure]} ({pools.detector}) among the junction's own sites alone, those of the grid"
-            " alone, and those of one height; of EGVS the default and what is best on the training junctions."
+            f"Rho with {WORDS[measure]} ({pools.detector}): all sites, the given sites only, the grid sites only, and"
+            " the grid sites of one height. EGVS at the default setting, and at the setting that is best on the"
+            " training junctions."
         )
-        yield Table(f"A sites {pools.detector} {measure}", "A. Own sites, and the grid", caption, head, rows)
+        section = "A. Given sites and grid sites separately"
+        yield Table(f"A sites {pools.detector} {measure}", section, caption, head, rows)
 
 
 _B_COLUMNS = [
@@ -82,9 +84,9 @@ _B_COLUMNS = [
     Column("voxel, m"),
     Column("moving occlusion"),
     Column("best gamma, training"),
-    Column("not told apart"),
+    Column("gammas not distinguishable from it"),
     Column("rho, training", "two"),
-    Column("less gamma 10, training", "two"),
+    Column("minus gamma 10, training", "two"),
     Column("rho, held out", "two"),
     Column("gamma 10, held out", "two"),
     Column("difference, held out", "two"),
@@ -101,11 +103,11 @@ def chosen_gamma(each: Sequence[Pools]) -> Table:
         for ground in dict.fromkeys((s.voxel_m, s.occlusion) for s in pools.settings())
     ]
     caption = (
-        "Gamma with the highest rho on the training junctions, gammas that are not told apart from it there (95 %; no"
-        " sign that they are as good), and what the choice is worth on the held-out junctions, against gamma 10 with"
-        " the same voxels."
+        "The gamma with the highest rho on the training junctions; the gammas whose difference from it there has a 95 %"
+        " interval that contains 0 (which does not show that they are as good); and what the choice brings on the"
+        " held-out junctions, compared with gamma 10 at the same voxel size."
     )
-    return Table("B gamma", "B. Gamma chosen on training junctions", caption, _B_COLUMNS, rows)
+    return Table("B gamma", "B. Gamma chosen on the training junctions", caption, _B_COLUMNS, rows)
 
 
 def _chosen_row(pools: Pools, measure: str, settings: Sequence[Setting]) -> list[Cell]:
@@ -143,15 +145,15 @@ def by_sensor(records: Sequence[Record], detectors: Sequence[str]) -> list[Table
             rows += [_sensor_row(sensor, pools, settings, measure) for sensor, pools, settings in cells]
             verdicts.append(_verdict(detector, measure, cells))
     head = [Column("detector"), Column("measure"), Column("sensor"), Column("voxel, m"), Column("best gamma"),
-            Column("not told apart"), Column("rho", "two")]  # fmt: skip
+            Column("gammas not distinguishable from it"), Column("rho", "two")]  # fmt: skip
     section = "B. Gamma by sensor and voxel size"
     first = (
-        "Best gamma on the training junctions by sensor and voxel size, from the same places, without moving occlusion."
+        "Best gamma on the training junctions by sensor and voxel size, at the same locations, without moving"
+        " occlusion."
     )
     second = (
-        "One gamma for all sensors and voxel sizes: the one with the highest mean rho, and in how many of the cells"
-        " above a higher gamma, or a lower one, is better by more than noise. Five differences a cell are looked at, so"
-        " some are by chance."
+        "The gamma with the highest mean rho over all sensors and voxel sizes, and in how many of these cells a higher"
+        " or a lower gamma is better by more than noise. Five differences are tested per cell, so some occur by chance."
     )
     columns = [Column("detector"), Column("measure"), Column("one gamma"), Column("mean rho", "two"),
                Column("cells", "whole"), Column("higher better", "whole"), Column("higher where"),
@@ -219,13 +221,13 @@ def ranked(pools: Pools) -> Iterator[Table]:
             for heading in (
                 "rho, training",
                 "rho, held out",
-                "less default EGVS, held out",
-                "less best of training, held out",
+                "minus default EGVS, held out",
+                "minus best of training, held out",
             )
         ]
         caption = (
-            f"Scores in the order of their rho with the {WORDS[measure]} ({pools.detector}) on the training junctions;"
-            " of EGVS the default and the setting that is best there."
+            f"Scores in descending order of their rho with {WORDS[measure]} ({pools.detector}) on the training"
+            " junctions. EGVS at the default setting, and at the setting that is best there."
         )
         yield Table(f"D {pools.detector} {measure}", "D. All scores", caption, head, rows)
 

@@ -16,7 +16,7 @@ from benchmarks.validity.agreement import TRAINING, WORDS, candidates
 from benchmarks.validity.pools import DEFAULT, Pools, Setting
 from benchmarks.validity.record import Record, measures_of
 from benchmarks.validity.tables import Cell, Column, Table, number
-from pipeline.validation.site_findings import POINTS
+from egvs.validation.sweeps import POINT_COUNTS_NAME
 
 WORST = 3
 """Sites that are named a junction and score."""
@@ -25,7 +25,7 @@ _PER_CENT = 100.0
 
 COLUMNS = [
     Column("junction"), Column("score"), Column("site"), Column("height, m", "one"), Column("detection", "one"),
-    Column("rank by score", "whole"), Column("rank by detection", "whole"), Column("of", "whole"),
+    Column("rank by score", "whole"), Column("rank by detection", "whole"), Column("number of sites", "whole"),
     Column("never seen, %", "one"), Column("1 to 19 points, %", "one"), Column("hidden by statics, %", "one"),
     Column("hidden by traffic, %", "one"), Column("mean distance, m", "one"),
 ]  # fmt: skip
@@ -42,8 +42,8 @@ def tables(each: Sequence[Pools]) -> Iterator[Table]:
         ]
         caption = (
             f"The {WORST} sites of each junction whose ranks by score and by {WORDS[measure]} ({pools.detector}) differ"
-            " most; 1 is best. Detection in per cent. Hidden by statics: share of the traffic's entropy in voxels that"
-            " no beam crosses; by traffic: what moving occlusion takes of the rest."
+            " most; rank 1 is best. Detection in per cent. Hidden by statics: share of the traffic's entropy in voxels"
+            " that no beam crosses. Hidden by traffic: share of the rest that moving occlusion removes."
         )
         yield Table(f"E {pools.detector}", "E. Where scores fail", caption, COLUMNS, rows)
 
@@ -68,7 +68,7 @@ def worst(record: Record, detector: str, measure: str, score: str) -> list[list[
 
 
 def _why(record: Record, site: int) -> list[Cell]:
-    points = record.detections[POINTS]
+    points = record.detections[POINT_COUNTS_NAME]
     seen_1, seen_20 = (points[name].values[site] for name in ("seen_1", "seen_20"))
     seen = record.scores["entropy_seen"][site]
     alone, in_traffic = (str(Setting(1.0, DEFAULT.voxel_m, occlusion)) for occlusion in (False, True))

@@ -13,8 +13,8 @@ from benchmarks.validity import junctions
 from benchmarks.validity.agreement import WORDS
 from benchmarks.validity.record import measures_of
 from benchmarks.validity.tables import Table
-from pipeline.core import files
-from pipeline.validation.site_findings import POINTS
+from egvs.core import files
+from egvs.validation.sweeps import POINT_COUNTS_NAME
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,7 +27,7 @@ _STYLES = {"0.25": (_DARK, "o"), "0.5": (_MID, "s"), "1": (_LIGHT, "^")}
 def draw(folder: Path, tables: Sequence[Table]) -> list[Path]:
     """Write the figures as PNG; those whose tables are there."""
     of = {table.name: table for table in tables}
-    first = {measures_of(POINTS)[0], measures_of("")[0]}
+    first = {measures_of(POINT_COUNTS_NAME)[0], measures_of("")[0]}
     settings = [name for name in of if name.startswith("A ") and not name.startswith("A sites")]
     by_setting = [of[name] for name in settings if name.split()[-1] in first]
     ranked = [of[name] for name in of if name.startswith("D ") and name.split()[-1] in first]
@@ -41,7 +41,7 @@ def draw(folder: Path, tables: Sequence[Table]) -> list[Path]:
     written = []
     for name, figure in made.items():
         if figure is not None:
-            with files.aside(folder / name) as partial:
+            with files.atomic_write(folder / name) as partial:
                 figure.savefig(partial, dpi=130, format="png", metadata={"Software": None})
             written.append(folder / name)
     return written
@@ -96,7 +96,7 @@ def heights(table: Table) -> Figure:
     rows = -(-len(kinds) // _ABREAST)
     figure, panels = _panels(rows, min(len(kinds), _ABREAST), 4.0, 3.4)
     marks = [
-        column.heading for column in table.columns if column.heading.endswith(" m") and "less" not in column.heading
+        column.heading for column in table.columns if column.heading.endswith(" m") and "minus" not in column.heading
     ]
     metres = [float(mark.split()[0]) for mark in marks]
     lines = [name for name in dict.fromkeys(table.column("junction")) if name not in ("training", "held out")]
@@ -121,7 +121,7 @@ def heights(table: Table) -> Figure:
                 line = "-" if roles.get(name) == "held out" else "--"
                 axes.plot(metres, values, line, color=colours[name], linewidth=1.0, marker=".", label=name)
         axes.set(xlabel="height above the ground, m", ylabel=f"{measure}, %", xticks=metres)
-        axes.set_ylim(0.0, 100.0 if detector == POINTS else 200.0)
+        axes.set_ylim(0.0, 100.0 if detector == POINT_COUNTS_NAME else 200.0)
         axes.set_title(detector, fontsize=9)
     panels[0, 0].legend(fontsize=6.5, loc="lower left")
     return figure
@@ -148,7 +148,7 @@ def recommendation(tables: Sequence[Table]) -> Figure:
     """Rho at junctions that nothing was learnt from: the recommended score with its interval, and the EGVS."""
     marks = [
         ("EGVS, gamma 10", "EGVS, gamma 10", "o", "white", _LIGHT),
-        ("its rho", "EGVS at its best there, known afterwards", "^", "white", _MID),
+        ("rho of that setting", "EGVS at its best there, known afterwards", "^", "white", _MID),
         ("recommended", "recommended: expected_detections", "o", _DARK, _DARK),
     ]
     figure, panels = _panels(1, len(tables), 5.2, 1.2 + 0.27 * max(len(table.rows) for table in tables))
@@ -162,7 +162,7 @@ def recommendation(tables: Sequence[Table]) -> Figure:
             for line, cell in cells:
                 if heading == "recommended" and cell[1] is not None:
                     axes.plot(cell[1:], [line, line], color=edge, linewidth=1.3, zorder=2)
-        names = zip(table.column("junction"), table.column("sites"), table.column("number"), strict=True)
+        names = zip(table.column("junction"), table.column("sites"), table.column("number of sites"), strict=True)
         axes.set_yticks(range(len(table.rows)), [f"{name}, {its}: {n}" for name, its, n in names], fontsize=7)
         axes.set(ylim=(len(table.rows) - 0.5, -0.5), xlim=(0.0, 1.02), xlabel="rho")
         axes.set_title(_what(table), fontsize=9)

@@ -17,9 +17,9 @@ from benchmarks.validity.failures import COLUMNS, worst
 from benchmarks.validity.pools import DEFAULT, Pools, Setting
 from benchmarks.validity.record import Record, StudySite, measures_of
 from benchmarks.validity.tables import Cell, Column, Table
-from pipeline.scoring.targets.detectability import DETECTORS
-from pipeline.validation.agreement import ScoreName
-from pipeline.validation.site_findings import POINTS
+from egvs.scoring.target_scores import DETECTORS
+from egvs.validation.results import ScoreName
+from egvs.validation.sweeps import POINT_COUNTS_NAME
 
 RECOMMENDED = str(ScoreName("expected_detections", f'{{"detectors": "{"+".join(DETECTORS)}"}}'))
 """What is recommended: the mean chance over the detectors that have a model."""
@@ -52,13 +52,16 @@ def tables(records: Sequence[Record], detectors: Sequence[str]) -> Iterator[Tabl
     pairs = [(name, [its for its in held if name in its.detections]) for name in named]
     for name, mine in ((name, its) for name, its in pairs if its):
         yield from (_coefficients(mine, name, measure) for measure in measures_of(name))
-    if boxed := [(name, its) for name, its in pairs if its and name != POINTS]:
+    if boxed := [(name, its) for name, its in pairs if its and name != POINT_COUNTS_NAME]:
         yield _every_score(boxed)
     for name, mine in ((name, its) for name, its in pairs if its):
         measure = measures_of(name)[0]
         rows = [row for record in mine for row in worst(record, name, measure, RECOMMENDED)]
-        caption = f"The sites that {RECOMMENDED} ranks farthest from their rank by {WORDS[measure]} ({name}), as in E."
-        yield Table(f"F worst {name}", "F. Where it fails", caption, COLUMNS, rows)
+        caption = (
+            f"The sites whose rank by {RECOMMENDED} differs most from their rank by {WORDS[measure]} ({name}); columns"
+            " as in E."
+        )
+        yield Table(f"F worst {name}", "F. Where the recommended score fails", caption, COLUMNS, rows)
 
 
 def _coefficients(records: Sequence[Record], detector: str, measure: str) -> Table:
@@ -68,15 +71,21 @@ def _coefficients(records: Sequence[Record], detector: str, measure: str) -> Tab
         pools = Pools([its for its in some if its.detections[detector][measure].sites], detector)
         names = [name for name in pools.studies if name != HELD_OUT or len(pools.records) > 1]
         rows += [_row(pools, name, kind, measure) for name in names]
-    head = [Column("junction"), Column("sites"), Column("number", "whole")]
-    head += [Column(its, "two") for its in ("recommended", "EGVS, gamma 10", "recommended less that", "EGVS, gamma 2")]
-    head += [Column("EGVS at its best here"), Column("its rho", "two"), Column("recommended less its", "two")]
+    head = [Column("junction"), Column("sites"), Column("number of sites", "whole")]
+    head += [
+        Column(its, "two") for its in ("recommended", "EGVS, gamma 10", "recommended minus gamma 10", "EGVS, gamma 2")
+    ]
+    head += [
+        Column("best EGVS setting here"),
+        Column("rho of that setting", "two"),
+        Column("recommended minus that", "two"),
+    ]
     caption = (
-        f"Rho of the recommended score, {RECOMMENDED}, with the {WORDS[measure]} ({detector}) at junctions that it was"
-        " not learnt from, beside the EGVS with voxels of 0.25 m, and with the gamma, voxels and moving occlusion that"
-        " are best at the very sites of the row."
+        f"Rho of the recommended score, {RECOMMENDED}, with {WORDS[measure]} ({detector}) at junctions that it was not"
+        " trained on; next to it EGVS with 0.25 m voxels, and EGVS with the gamma, voxel size and moving occlusion that"
+        " are best at the sites of that row."
     )
-    return Table(f"F {detector} {measure}", "F. The score that is recommended", caption, head, rows)
+    return Table(f"F {detector} {measure}", "F. The recommended score", caption, head, rows)
 
 
 def _every_score(boxed: Sequence[tuple[str, Sequence[Record]]]) -> Table:
@@ -93,8 +102,8 @@ def _every_score(boxed: Sequence[tuple[str, Sequence[Record]]]) -> Table:
     rows: list[list[Cell]] = [[name, *(told(its[name]) for its in rho)] for name in order]
     head = [Column("score"), *(Column(pools.detector, "two") for pools in together)]
     caption = (
-        f"Rho of every score with the {WORDS[measures[0]]}, over all junctions that nothing was learnt from together,"
-        " given sites and grid."
+        f"Rho of every score with {WORDS[measures[0]]}, over all junctions that were not used for training, given and"
+        " grid sites together."
     )
     return Table("F all", "F. All scores", caption, head, rows)
 

@@ -24,11 +24,11 @@ def table(each: Sequence[Pools], records: Sequence[Record]) -> Table:
                             its.why or None,
                         ])  # fmt: skip
     rows += [[None, None, record.junction, None, None, None, what] for record in records for what in record.skipped]
-    head = [Column("detector"), Column("measure"), Column("junctions"), Column("score"), Column("sites left", "whole"),
-            Column("left out"), Column("why")]  # fmt: skip
+    head = [Column("detector"), Column("measure"), Column("junctions"), Column("score"), Column("sites used", "whole"),
+            Column("excluded sites"), Column("reason")]  # fmt: skip
     caption = (
-        "Sites at which a score or what is detected is not defined, which its coefficients are without; and scores that"
-        " have no coefficient, or no interval, together with why. A score that is the same at all sites of one junction"
-        " has none over several."
+        "Sites where a score or a detection measure is undefined; they are excluded from its coefficients. Scores"
+        " without a coefficient or an interval, with the reason. A score that is the same at all sites of one junction"
+        " has no coefficient over several junctions."
     )
-    return Table("0 left out", "What is not defined", caption, head, rows)
+    return Table("0 left out", "Undefined values", caption, head, rows)

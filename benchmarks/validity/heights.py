@@ -19,10 +19,8 @@ from benchmarks.validity.pools import SEED
 from benchmarks.validity.poses import HEIGHTS_M
 from benchmarks.validity.record import Record, measures_of
 from benchmarks.validity.tables import Cell, Column, Table, with_interval
-from pipeline.validation.detectors.pointpillars.detector import PointPillars
-from pipeline.validation.statistics.correlation import FEWEST_PLACES, RESAMPLES
-from pipeline.validation.statistics.intervals import Interval
-from pipeline.validation.statistics.junctions import Draws, Measured
+from egvs.validation.correlation import MIN_PLACES, RESAMPLES, ConfidenceInterval, MeasureValues, Resamples
+from egvs.validation.detectors.pointpillars import PointPillars
 
 Floats = NDArray[np.float64]
 
@@ -45,12 +43,12 @@ def table(records: Sequence[Record], detectors: Sequence[str]) -> Table:
                 each = [by_height(record, first, second, measure, few) for record in group]
                 rows.append([what, WORDS[measure], name, *_cells([r.junction for r in group], each)])
     low, *above = HEIGHTS_M
-    head = [Column("detector"), Column("measure"), Column("junction"), Column("places", "whole")]
-    head += [Column(f"{h:g} m", "one") for h in HEIGHTS_M] + [Column(f"{h:g} less {low:g} m", "one") for h in above]
+    head = [Column("detector"), Column("measure"), Column("junction"), Column("locations", "whole")]
+    head += [Column(f"{h:g} m", "one") for h in HEIGHTS_M] + [Column(f"{h:g} minus {low:g} m", "one") for h in above]
     caption = (
-        "Mean over the places of the grid at each mounting height, and differences at the same places. Shares of"
-        " vehicles and AP in per cent (BEV + 3D: up to 200), log points times 100. Of two detectors, the first less the"
-        " second from the same sites."
+        "Mean over the grid locations at each mounting height, and differences at the same locations. Shares of"
+        " vehicles and AP in per cent (BEV + 3D: up to 200), log points times 100. For two detectors: the first minus"
+        " the second, at the same sites."
     )
     return Table("C heights", "C. Mounting height", caption, head, rows)
 
@@ -62,13 +60,13 @@ def _compared(detectors: Sequence[str]) -> Iterator[tuple[str, str, str | None, 
     if any(name in detectors for name in LESS):
         for name in FAST:
             if name in detectors:
-                yield f"{name}, first {FEW_PLACES} places", name, None, FEW_PLACES
+                yield f"{name}, first {FEW_PLACES} locations", name, None, FEW_PLACES
     for first, second in LESS.items():
         if first in detectors and second in detectors:
-            yield f"{first} less {second}", first, second, None
+            yield f"{first} minus {second}", first, second, None
 
 
-def _cells(junctions: Sequence[str], each: Sequence[list[Measured]]) -> list[Cell]:
+def _cells(junctions: Sequence[str], each: Sequence[list[MeasureValues]]) -> list[Cell]:
     number = sum(len(its[0].values) for its in each)
     if not number:
         return [0, *[None] * (2 * len(HEIGHTS_M) - 1)]
@@ -77,7 +75,7 @@ def _cells(junctions: Sequence[str], each: Sequence[list[Measured]]) -> list[Cel
     return [number, *means, *gaps]
 
 
-def by_height(record: Record, detector: str, less: str | None, measure: str, few: int | None) -> list[Measured]:
+def by_height(record: Record, detector: str, less: str | None, measure: str, few: int | None) -> list[MeasureValues]:
     """The measure at the places that have all heights, one a height, place by place in the same order.
 
     Parameters
@@ -95,7 +93,7 @@ def by_height(record: Record, detector: str, less: str | None, measure: str, few
         for name, places in zip((detector, less), every, strict=False):
             assert name is not None
             measured, rows = record.detections[name][measure].measured(), [places[place][height_m] for place in shared]
-            each.append(Measured(measured.values[rows], measured.left_out[rows]))
+            each.append(MeasureValues(measured.values[rows], measured.left_out[rows]))
         found.append(each[0] if less is None else _less(*each))
     return found
 
@@ -113,19 +111,19 @@ def _places(record: Record, detector: str, measure: str) -> dict[str, dict[float
     }
 
 
-def _less(first: Measured, second: Measured) -> Measured:
-    return Measured(first.values - second.values, first.left_out - second.left_out)
+def _less(first: MeasureValues, second: MeasureValues) -> MeasureValues:
+    return MeasureValues(first.values - second.values, first.left_out - second.left_out)
 
 
-def _mean(junctions: Sequence[str], each: Sequence[Measured]) -> Cell:
+def _mean(junctions: Sequence[str], each: Sequence[MeasureValues]) -> Cell:
     """The mean over places of all junctions, in per cent, with its interval."""
     weights = np.array([len(its.values) for its in each], dtype=np.float64)
     value = sum(float(its.values.sum()) for its in each) / weights.sum()
     draws: Floats = np.zeros(RESAMPLES)
     for name, its, weight in zip(junctions, each, weights.tolist(), strict=True):
         if weight:
-            drawn = Draws.of(name, len(its.values), its.left_out.shape[1], RESAMPLES, SEED)
+            drawn = Resamples.of(name, len(its.values), its.left_out.shape[1], RESAMPLES, SEED)
             draws += drawn.of_measure(its, np.ones(len(its.values), dtype=np.bool_)).mean(axis=1) * weight
-    if 0 < min(filter(None, weights.tolist())) < FEWEST_PLACES:
-        return with_interval(100.0 * value, Interval.unknown("too few places"))
-    return with_interval(100.0 * value, Interval.of(100.0 * value, 100.0 * draws / weights.sum()))
+    if 0 < min(filter(None, weights.tolist())) < MIN_PLACES:
+        return with_interval(100.0 * value, ConfidenceInterval.unknown("too few places"))
+    return with_interval(100.0 * value, ConfidenceInterval.of(100.0 * value, 100.0 * draws / weights.sum()))

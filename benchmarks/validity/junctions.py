@@ -17,17 +17,16 @@ from pathlib import Path
 from typing import Literal
 
 from benchmarks.validity import poses
-from pipeline.core import files
-from pipeline.core.errors import InputError
-from pipeline.importers import openstreetmap
-from pipeline.runs.workflow import bring
-from pipeline.scenario.loading import load
-from pipeline.scenario.models import Scenario, SitesModel
-from pipeline.sensing.sites import Site
-from pipeline.stages.base import Workspace
-from pipeline.stages.shared.scene import scene_of
-from pipeline.traffic import network, sumo_folder
-from pipeline.world.carriageway import Carriageway
+from egvs.core import files
+from egvs.core.errors import InputError
+from egvs.importers import openstreetmap
+from egvs.runs.run import ensure_stages
+from egvs.scenario.loading import load
+from egvs.scenario.model import Scenario, SitesConfig
+from egvs.sensors.sites import Site
+from egvs.stages.inputs import get_scene, open_folder
+from egvs.traffic import network, sumo_folder
+from egvs.world.carriageway import Carriageway
 
 Role = Literal["training", "held out", "unseen"]
 ROLES: tuple[Role, ...] = ("training", "held out", "unseen")
@@ -77,12 +76,12 @@ def from_osm(role: Role, extract: Path, at: tuple[float, float] | None, folder: 
     home, note = folder / name, folder / f"{name}.json"
     if not extract.is_file():
         raise InputError(_option(role), f"no such file ({extract})", "an OpenStreetMap extract")
-    key = files.canonical_json({"extract": files.sha256_of(extract), "at": at})
+    key = files.canonical_json({"extract": files.hash_file(extract), "at": at})
     if not (home.is_dir() and note.is_file() and note.read_bytes() == key):
         if home.is_dir():
             raise InputError(home, "is of another extract or place", "to remove it, so that it is made anew")
         folder.mkdir(parents=True, exist_ok=True)
-        openstreetmap.new(home, extract, at)
+        openstreetmap.create_scenario(home, extract, at)
         note.write_bytes(key)
     return name, role, home
 
@@ -123,7 +122,7 @@ def _option(role: Role) -> str:
 def _on_map(home: Path) -> tuple[str, float, float]:
     """The projection of a scenario from OpenStreetMap, and where its region of interest is in it, in metres."""
     scenario = load(home)
-    location = network.location_of(home / "network.net.xml")
+    location = network.read_location(home / "network.net.xml")
     assert location is not None, "netconvert says where a map's network lies"
     x, y, _ = scenario.roi.center_m
     return location.projection, x - location.offset_m[0], y - location.offset_m[1]
@@ -139,11 +138,11 @@ def ready(name: str, role: Role, home: Path, folder: Path, places: int = poses.P
     """
     scenario = load(home)
     folder.mkdir(parents=True, exist_ok=True)
-    work = Workspace(scenario, folder)
-    bring(work, "statics")
-    scene = scene_of(work)
+    work = open_folder(scenario, folder)
+    ensure_stages(work, "statics")
+    scene = get_scene(work)
     given = tuple(site for site in scene.sites if site.pose.pitch_deg == site.pose.roll_deg == 0.0 and not site.points)
-    roads = sumo_folder.roads(scenario)
+    roads = sumo_folder.read_network(scenario)
     carriageway = None if roads is None else Carriageway.of(roads)
     grid = poses.grid_poses(scene, carriageway, scenario.sites.sensor, places)
     return StudyJunction(name, role, scenario, given, grid)
@@ -151,12 +150,12 @@ def ready(name: str, role: Role, home: Path, folder: Path, places: int = poses.P
 
 def posed(scenario: Scenario, sites: Sequence[Site], file: Path, sensor: str | None = None) -> Scenario:
     """The scenario with these sites, written as a CSV; all with another sensor where one is named."""
-    with files.aside(file) as partial, partial.open("w", encoding="utf-8", newline="") as out:
+    with files.atomic_write(file) as partial, partial.open("w", encoding="utf-8", newline="") as out:
         rows = csv.writer(out, lineterminator="\n")
         rows.writerow(["site", "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg", "sensor"])
         for site in sites:
             rows.writerow(
                 [site.name, *map(repr, (*site.pose.position_m, *site.pose.angles_deg)), sensor or site.sensor]
             )
-    model = SitesModel(file=str(file.resolve()), sensor=sensor or scenario.sites.sensor)
+    model = SitesConfig(file=str(file.resolve()), sensor=sensor or scenario.sites.sensor)
     return scenario.model_copy(update={"sites": model})

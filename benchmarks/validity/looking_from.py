@@ -8,10 +8,10 @@ import numpy as np
 
 from benchmarks.validity import low_models, poses
 from benchmarks.validity.junctions import Role, StudyJunction
-from pipeline.sensing.sites import Site
-from pipeline.validation.site_findings import POINTS
+from egvs.sensors.sites import Site
+from egvs.validation.sweeps import POINT_COUNTS_NAME
 
-FAST = (POINTS, "cluster")
+FAST = (POINT_COUNTS_NAME, "cluster")
 """Detectors that look from every site, and with every sensor; others look from some."""
 
 FEW_PLACES = 5

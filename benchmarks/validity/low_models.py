@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pipeline.core.errors import MissingBackendError
-from pipeline.validation.detectors import registry
-from pipeline.validation.detectors.base import Detector
-from pipeline.validation.detectors.pointpillars.detector import PointPillars
+from egvs.core.errors import MissingBackendError
+from egvs.validation.detectors import base
+from egvs.validation.detectors.base import Detector
+from egvs.validation.detectors.pointpillars import PointPillars
 
 LOW, SENSOR = "pointpillars_2m", "pointpillars_sensor"
 NAMES = (LOW, SENSOR)
@@ -32,8 +32,8 @@ def make(name: str) -> Detector:
         Also where the file of the model is not there.
     """
     if name not in NAMES:
-        return registry.make(name)
-    registry.make(PointPillars.NAME)  # needs what that needs
+        return base.make_detector(name)
+    base.make_detector(PointPillars.NAME)  # needs what that needs
     if not model(name).is_file():
         raise MissingBackendError(f"{model(name).name} is not there")
     return PointPillars(model(name))
@@ -41,4 +41,4 @@ def make(name: str) -> Detector:
 
 def names() -> list[str]:
     """Every detector of the study."""
-    return [*registry.names(), *NAMES]
+    return [*base.detector_names(), *NAMES]

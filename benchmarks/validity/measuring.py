@@ -1,6 +1,6 @@
 """Measures one part of the study: the sites of one junction with one sensor, by all detectors and scores.
 
-What detectors find from a site is in the store (:mod:`pipeline.validation.looking`), so a part that was interrupted
+What detectors find from a site is in the store (:mod:`egvs.validation.detector_runs`), so a part that was interrupted
 goes on site by site; a part that is whole is kept in the study's folder under the hash of all that it depends on.
 """
 
@@ -16,20 +16,20 @@ import numpy as np
 
 from benchmarks.validity import low_models
 from benchmarks.validity.record import Estimates, Record, StudySite, beside_of, measures_of
-from pipeline.artefacts.traffic_frames import TrafficFrame
-from pipeline.core import code_digest, files
-from pipeline.core.progress import Progress, silent
-from pipeline.scenario.models import Scenario
-from pipeline.sensing import placing
-from pipeline.sensing.sites import Site
-from pipeline.validation import detection
-from pipeline.validation.agreement import ScoreName
-from pipeline.validation.detection import ALL, SiteDetection
-from pipeline.validation.looking import Look, look_from
-from pipeline.validation.site_findings import POINTS, Found
-from pipeline.validation.surrogates import gathering
-from pipeline.validation.surrogates.gathering import Surrogates
-from pipeline.validation.unseen_record import UnseenRecord, prepare
+from egvs.artefacts.traffic_frames import TrafficFrame
+from egvs.core import files
+from egvs.core.runtime import ProgressCallback, no_progress
+from egvs.runs import stages
+from egvs.scenario.model import Scenario
+from egvs.sensors import site_feasibility
+from egvs.sensors.sites import Site
+from egvs.validation import detection_metrics, surrogates
+from egvs.validation.detection_metrics import ALL_OBJECTS, SiteDetection
+from egvs.validation.detector_runs import SiteDetectionTask, run_detectors
+from egvs.validation.held_out_traffic import HeldOutTraffic, prepare_held_out_traffic
+from egvs.validation.results import ScoreName
+from egvs.validation.surrogates import Surrogates
+from egvs.validation.sweeps import POINT_COUNTS_NAME, DetectorResult
 
 
 @dataclass(frozen=True)
@@ -70,29 +70,31 @@ def measure(
     folder: Path,
     *,
     jobs: int | None = None,
-    progress: Progress = silent,
+    progress: ProgressCallback = no_progress,
     told: Callable[[str], None] = print,
 ) -> Record:
     """The record of a part, kept or made; milliseconds that scores took lie beside it, in ``NAME.costs.json``."""
     path = folder / f"{part.name}.json"
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".work-", dir=folder) as temporary:
-        unseen = prepare(
+        unseen = prepare_held_out_traffic(
             part.scenario, Path(temporary) / "unseen", part.frames, apart_s=part.apart_s, jobs=jobs, progress=progress
         )
-        made = {name: {name: low_models.make(name)} if name != POINTS else {} for name in part.detectors}
-        looks = {name: Look(unseen, its) for name, its in made.items()}
+        made = {name: {name: low_models.make(name)} if name != POINT_COUNTS_NAME else {} for name in part.detectors}
+        looks = {name: SiteDetectionTask(unseen, its) for name, its in made.items()}
         key = _key(part, looks)
         if path.is_file() and (kept := Record.read(path)).key == key:
             told(f"{part.name}: kept")
             return kept
-        found: dict[str, dict[str, Found]] = {site.name: {} for site in unseen.scene.sites}
+        found: dict[str, dict[str, DetectorResult]] = {site.name: {} for site in unseen.scene.sites}
         for name, look in looks.items():
-            mine = [site for site in unseen.scene.sites if name == POINTS or site.name in part.detectors[name]]
-            for site, its in look_from(mine, look, jobs=jobs, progress=progress).items():
+            mine = [
+                site for site in unseen.scene.sites if name == POINT_COUNTS_NAME or site.name in part.detectors[name]
+            ]
+            for site, its in run_detectors(mine, look, jobs=jobs, progress=progress).items():
                 found[site] |= its
-        rows, _ = detection.measured(list(unseen.read()), unseen.scene.roi, found)
-        scored = gathering.surrogates_of(
+        rows, _ = detection_metrics.measure_detection(list(unseen.read()), unseen.scene.roi, found)
+        scored = surrogates.compute_surrogates(
             part.scenario, Path(temporary) / "scores", part.scores, jobs=jobs, progress=progress
         )
         record = _record(part, key, unseen, rows, scored)
@@ -101,39 +103,39 @@ def measure(
     return record
 
 
-def _key(part: Part, looks: Mapping[str, Look]) -> str:
+def _key(part: Part, looks: Mapping[str, SiteDetectionTask]) -> str:
     """Hash of everything that a record depends on."""
     looked = {
         name: [
             look.key(site, name)
             for site in look.record.scene.sites
-            if name == POINTS or site.name in part.detectors[name]
+            if name == POINT_COUNTS_NAME or site.name in part.detectors[name]
         ]
         for name, look in looks.items()
     }
-    source = code_digest.of(detection.__name__, gathering.__name__)
+    source = stages.source_digest(detection_metrics.__name__, surrogates.__name__)
     about = {
         "part": [part.name, part.junction, part.role, part.sensor, sorted(part.given), part.frames, part.apart_s],
         "looked": looked,
-        "scores": gathering.inputs_key(part.scenario, part.scores),
+        "scores": surrogates.surrogates_key(part.scenario, part.scores),
         "program": [
             source.digest,
-            files.sha256_of(Path(__file__)),
-            files.sha256_of(Path(__file__).with_name("record.py")),
+            files.hash_file(Path(__file__)),
+            files.hash_file(Path(__file__).with_name("record.py")),
         ],
-        "libraries": code_digest.versions(source.libraries),
+        "libraries": stages.library_versions(source.libraries),
     }
-    return files.hash_of(about)
+    return files.hash_json(about)
 
 
-def _record(part: Part, key: str, unseen: UnseenRecord, rows: Sequence[SiteDetection], scored: Surrogates) -> Record:
+def _record(part: Part, key: str, unseen: HeldOutTraffic, rows: Sequence[SiteDetection], scored: Surrogates) -> Record:
     sites = tuple(site.name for site in unseen.scene.sites)
     place = {name: number for number, name in enumerate(sites)}
     scores: dict[str, list[float]] = {}
     for row in scored.rows:
         name = str(ScoreName(row.score, row.parameters_json))
         scores.setdefault(name, [float("nan")] * len(sites))[place[row.site]] = row.sign * row.value
-    all_rows = [row for row in rows if row.objects_of == ALL]
+    all_rows = [row for row in rows if row.objects_of == ALL_OBJECTS]
     by_detector = {name: [row for row in all_rows if row.detector == name] for name in part.detectors}
     found = {
         name: {m: _estimates(mine, m, place) for m in (*measures_of(name), *beside_of(name))}
@@ -154,9 +156,9 @@ def _estimates(rows: Sequence[SiteDetection], measure: str, place: Mapping[str, 
     return Estimates([place[row.site] for row in rows], [e.value for e in its], [e.se for e in its], left_out)
 
 
-def _site(site: Site, part: Part, unseen: UnseenRecord, frames: Sequence[TrafficFrame]) -> StudySite:
+def _site(site: Site, part: Part, unseen: HeldOutTraffic, frames: Sequence[TrafficFrame]) -> StudySite:
     scene, pose = unseen.scene, site.pose
-    ground_m = placing.ground_m(scene.world, pose) if scene.scenario.statics.ground else 0.0
-    at = np.concatenate([frame.boxes[frame.wanted(scene.roi), :2] for frame in frames])
+    ground_m = site_feasibility.ground_height_m(scene.world, pose) if scene.scenario.statics.ground else 0.0
+    at = np.concatenate([frame.boxes[frame.target_rows(scene.roi), :2] for frame in frames])
     away_m = float(np.hypot(*(at - np.array(pose.position_m[:2])).T).mean()) if len(at) else float("nan")
     return StudySite(site.name, site.pole, round(pose.z_m - ground_m, 3), away_m, site.name in part.given)

@@ -9,15 +9,14 @@ from functools import cached_property
 
 from benchmarks.validity.junctions import ROLES
 from benchmarks.validity.record import Record
-from pipeline.core import files
-from pipeline.validation.agreement import ScoreName
-from pipeline.validation.statistics.coefficients import Kind
-from pipeline.validation.statistics.correlation import RESAMPLES, Correlation, Study
+from egvs.core import files
+from egvs.validation.correlation import RESAMPLES, CoefficientKind, Correlation, CorrelationStudy
+from egvs.validation.results import ScoreName
 
 SEED = 2504
 """Of the resamples of sites and blocks."""
 
-KIND: Kind = "spearman"
+KIND: CoefficientKind = "spearman"
 """The study compares orders: a planner takes the first of a list."""
 
 GAMMAS = (1.0, 2.0, 5.0, 10.0, 20.0, math.inf)
@@ -62,14 +61,14 @@ class Pools:
         self._known: dict[tuple[str, ...], Correlation] = {}
 
     @cached_property
-    def studies(self) -> dict[str, Study]:
+    def studies(self) -> dict[str, CorrelationStudy]:
         """By name of the junction, or by role."""
         together: dict[str, list[Record]] = {record.junction: [record] for record in self.records}
         for role in ROLES:
             if its := [record for record in self.records if record.role == role]:
                 together[role] = its
         return {
-            name: Study([record.junction_of(self.detector) for record in its], SEED, self.resamples)
+            name: CorrelationStudy([record.junction_of(self.detector) for record in its], SEED, self.resamples)
             for name, its in together.items()
         }
 

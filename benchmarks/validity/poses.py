@@ -13,11 +13,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core.errors import InputError
-from pipeline.sensing import free_places, placing
-from pipeline.sensing.scene import Scene
-from pipeline.sensing.sites import Pose, Site
-from pipeline.world.carriageway import Carriageway
+from egvs.core.errors import InputError
+from egvs.sensors import site_feasibility
+from egvs.sensors.scene import Scene
+from egvs.sensors.sites import Pose, Site
+from egvs.world.carriageway import Carriageway
 
 HEIGHTS_M = (2.0, 3.0, 4.5, 6.0)
 """Above the ground."""
@@ -57,7 +57,7 @@ def free_at(scene: Scene, carriageway: Carriageway | None, sensor: str) -> NDArr
     """The places of the lattice where a pole could stand, at every height, (n, 2)."""
     near = _near_lanes(_lattice(scene), carriageway)
     each = [_at_all_heights(scene, at_m, number, sensor) for number, at_m in enumerate(near.tolist())]
-    free = free_places.sort_out([sites[0] for sites in each], scene.world, carriageway).free
+    free = site_feasibility.drop_infeasible([sites[0] for sites in each], scene.world, carriageway).free
     poles = {site.pole for site in free}
     kept = [at_m for at_m, sites in zip(near, each, strict=True) if sites[0].pole in poles and _can_stand(scene, sites)]
     return np.array(kept, dtype=np.float64).reshape(-1, 2)
@@ -67,7 +67,7 @@ def _can_stand(scene: Scene, sites: Sequence[Site]) -> bool:
     """Whether sensors can: above the ground, in no solid, in reach of the region of interest."""
     try:
         for site in sites:
-            placing.check(scene, site.pose, scene.sensor(site.sensor), site.name)
+            site_feasibility.check_pose(scene, site.pose, scene.sensor(site.sensor), site.name)
     except InputError:
         return False
     return True
@@ -111,6 +111,8 @@ def _near_lanes(places_m: NDArray[np.float64], carriageway: Carriageway | None) 
 
 def _at_all_heights(scene: Scene, at_m: Sequence[float], number: int, sensor: str) -> list[Site]:
     x_m, y_m = at_m
-    ground_m = placing.ground_m(scene.world, Pose(x_m, y_m, 0.0)) if scene.scenario.statics.ground else 0.0
+    ground_m = (
+        site_feasibility.ground_height_m(scene.world, Pose(x_m, y_m, 0.0)) if scene.scenario.statics.ground else 0.0
+    )
     pole = f"g{number:02d}"
     return [Site(f"{pole}h{h:g}", Pose(x_m, y_m, ground_m + h), sensor, pole=pole) for h in HEIGHTS_M]

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.core import files
-from pipeline.validation.metrics.leave_out import BLOCKS
-from pipeline.validation.site_findings import POINTS
-from pipeline.validation.statistics.junctions import Junction, Measured
+from egvs.core import files
+from egvs.validation.correlation import JunctionScores, MeasureValues
+from egvs.validation.detection_metrics import BLOCKS
+from egvs.validation.sweeps import POINT_COUNTS_NAME
 
 COUNTED = ("seen_20", "log_points")
 BOXED = ("ap_combined_r40_iou70", "ap_combined_r40_iou50")
@@ -28,12 +28,12 @@ BESIDE_COUNTED, BESIDE_BOXED = ("seen_1", "seen_5"), ("ap_bev_r40_iou70", "ap_3d
 
 def measures_of(detector: str) -> tuple[str, ...]:
     """The measures of a detector."""
-    return COUNTED if detector == POINTS else BOXED
+    return COUNTED if detector == POINT_COUNTS_NAME else BOXED
 
 
 def beside_of(detector: str) -> tuple[str, ...]:
     """What is kept beside them."""
-    return BESIDE_COUNTED if detector == POINTS else BESIDE_BOXED
+    return BESIDE_COUNTED if detector == POINT_COUNTS_NAME else BESIDE_BOXED
 
 
 @dataclass(frozen=True)
@@ -77,9 +77,9 @@ class Estimates:
             [self.left_out[row] for row in rows],
         )
 
-    def measured(self) -> Measured:
+    def measured(self) -> MeasureValues:
         """As the statistics take it."""
-        return Measured(np.array(self.values, dtype=np.float64), np.array(self.left_out).reshape(-1, BLOCKS))
+        return MeasureValues(np.array(self.values, dtype=np.float64), np.array(self.left_out).reshape(-1, BLOCKS))
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ class Record:
 
     def write(self, path: Path) -> None:
         """As JSON."""
-        with files.aside(path) as partial:
+        with files.atomic_write(path) as partial:
             partial.write_text(json.dumps(asdict(self), indent=None, separators=(",", ":")) + "\n", encoding="utf-8")
 
     @classmethod
@@ -125,14 +125,14 @@ class Record:
         found = {d: {m: Estimates(**its) for m, its in by.items()} for d, by in value.pop("detections").items()}
         return cls(sites=sites, detections=found, **value)
 
-    def junction_of(self, detector: str) -> Junction:
+    def junction_of(self, detector: str) -> JunctionScores:
         """The sites that a detector looked from, with all scores."""
         by_measure = self.detections[detector]
         rows = next(iter(by_measure.values())).sites
         values = {name: np.array(its, dtype=np.float64)[rows] for name, its in self.scores.items()}
         measures = {name: its.measured() for name, its in by_measure.items()}
         its = [self.sites[row] for row in rows]
-        return Junction(
+        return JunctionScores(
             self.junction, tuple(site.name for site in its), values, measures, tuple(site.place for site in its)
         )
 

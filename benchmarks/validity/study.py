@@ -18,10 +18,10 @@ from benchmarks.validity.measuring import Part
 from benchmarks.validity.pools import SEED, Pools
 from benchmarks.validity.record import BESIDE_BOXED, Record, measures_of
 from benchmarks.validity.tables import Cell, Column, Table, number
-from pipeline.sensing.sites import Site
-from pipeline.validation.agreement import ScoreName
-from pipeline.validation.site_findings import POINTS
-from pipeline.validation.statistics.correlation import RESAMPLES
+from egvs.sensors.sites import Site
+from egvs.validation.correlation import RESAMPLES
+from egvs.validation.results import ScoreName
+from egvs.validation.sweeps import POINT_COUNTS_NAME
 
 FRAMES, SENSOR_FRAMES = 250, 60
 APART_S, SENSOR_APART_S = 7.0, 29.0
@@ -30,7 +30,7 @@ APART_S, SENSOR_APART_S = 7.0, 29.0
 SENSORS = ("VLP-16", "VLP-32C", "OS1-64", "OS1-128")
 """Compared at the first places of the grid of the training junctions."""
 
-_CORE_MS = {POINTS: 4.0, "cluster": 25.0}
+_CORE_MS = {POINT_COUNTS_NAME: 4.0, "cluster": 25.0}
 _OTHER_CORE_MS = 80.0
 """Of one core, a frame: what the plan reckons with."""
 
@@ -113,7 +113,7 @@ def measured_table(records: Sequence[Record], detectors: Sequence[str]) -> Table
     rows: list[list[Cell]] = []
     for record in records:
         for name in (name for name in detectors if name in record.detections):
-            for measure in (*measures_of(name), *(BESIDE_BOXED if name != POINTS else ())):
+            for measure in (*measures_of(name), *(BESIDE_BOXED if name != POINT_COUNTS_NAME else ())):
                 its = record.detections[name][measure]
                 given = sum(record.sites[site].is_given for site in its.sites)
                 values = np.array([its.values, its.se]) * 100.0
@@ -123,12 +123,12 @@ def measured_table(records: Sequence[Record], detectors: Sequence[str]) -> Table
                     number(float(values[0].mean())), number(float(values[0].max())), number(float(values[1].mean())),
                 ])  # fmt: skip
     head = [Column("junction"), Column("role"), Column("given sites", "whole"), Column("grid", "whole"),
-            Column("frames", "whole"), Column("vehicles a frame", "one"), Column("detector"), Column("measure"),
+            Column("frames", "whole"), Column("vehicles per frame", "one"), Column("detector"), Column("measure"),
             Column("worst site", "one"), Column("mean", "one"), Column("best site", "one"),
             Column("mean standard error", "one")]  # fmt: skip
     caption = (
-        "Sites that each detector looked from, and what it found, in per cent (AP is BEV + 3D: up to 200; log points"
-        " times 100)."
+        "Number of sites that each detector was run at, and what it detected, in per cent (AP is BEV + 3D, up to 200;"
+        " log points times 100)."
     )
     return Table("0 measured", "What was measured", caption, head, rows)
 
@@ -136,11 +136,9 @@ def measured_table(records: Sequence[Record], detectors: Sequence[str]) -> Table
 def preface(
     records: Sequence[Record], with_sensors: Sequence[Record], detectors: Sequence[str], without: Sequence[str]
 ) -> list[str]:
-    """What the page says before its tables: all that they depend on."""
-    seeds = "; ".join(f"{r.junction}: TPOG {r.seeds['TPOG']}, unseen traffic {r.seeds['unseen']}" for r in records)
+    """The conditions of the study: detectors, frames, seeds, and what is missing."""
+    seeds = "; ".join(f"{r.junction}: TPOG {r.seeds['TPOG']}, held-out traffic {r.seeds['unseen']}" for r in records)
     found = [
-        "Made by `make validity`; [Does EGVS foretell detection?](validity.md) says what is meant. Intervals are of"
-        " 95 %; a dash is what is not defined, or has nothing to be compared with.",
         f"Detectors: {', '.join(detectors)}. Frames: {', '.join(f'{r.junction} {r.frames}' for r in records)}"
         + (f"; sensors compared on {with_sensors[0].frames}" if with_sensors else "")
         + f". Seeds: {seeds}; {RESAMPLES} resamples of seed {SEED}.",
@@ -153,7 +151,7 @@ def preface(
 
 
 def costs(folder: Path, names: Sequence[str]) -> Table:
-    """Milliseconds a site of every score, as measured: the mean of the junctions' medians."""
+    """Milliseconds per site of every score: the mean of the junctions' medians."""
     each: dict[str, list[float]] = {}
     for path in (folder / f"{name}.costs.json" for name in names):
         for score, by in json.loads(path.read_text(encoding="utf-8")).items():
@@ -161,7 +159,7 @@ def costs(folder: Path, names: Sequence[str]) -> Table:
                 each.setdefault(str(ScoreName(score, parameters)), []).append(ms)
     rows: list[list[Cell]] = [[name, round(statistics.mean(its), 1)] for name, its in each.items()]
     caption = (
-        "Milliseconds of one core a site, each as if it were the only score, in the mean of the study's junctions, on a"
-        " machine that was busy with it; another machine, or a later version, measures others."
+        "Milliseconds of one core per site, each score as if it were the only one. Mean over the junctions of"
+        " [the study](validity.md), on a machine that was busy with it. Other machines and later versions differ."
     )
-    return Table("costs", "Milliseconds a site", caption, [Column("score"), Column("ms a site", "one")], rows)
+    return Table("costs", "Milliseconds per site", caption, [Column("score"), Column("ms per site", "one")], rows)

@@ -1,26 +1,32 @@
-"""Tables of the study: typed columns, rows of numbers as they are kept, and the page that shows them.
+"""Tables of the study: typed columns, rows of rounded numbers, CSV files, and Markdown.
 
-A cell is a text, a number, or a number with its interval (value, low, high); what is not defined is None and shown as a
-dash. Numbers are rounded before they are kept, so that last digits of sums do not travel on.
+A cell is a text, a number, or a number with its interval (value, low, high). An undefined value is None, an empty
+field in CSV and a dash in Markdown. Numbers are rounded before they are stored, so that the last digits of sums do not
+matter.
 """
 
 from __future__ import annotations
 
+import csv
 import json
 import math
+import re
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pipeline.core import files
-from pipeline.validation.statistics.intervals import Interval
+from egvs.core import files
+from egvs.validation.correlation import ConfidenceInterval
 
 Form = Literal["text", "whole", "one", "two"]
 Cell = str | float | int | None | list[float | None]
 
 _DIGITS = {"whole": 0, "one": 1, "two": 2}
 KEPT_DIGITS = 4
+
+INDEX = "tables.json"
+"""Beside the CSV files: preface, captions and columns."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +63,7 @@ class Table:
         return [row[place] for row in self.rows]
 
 
-def with_interval(value: float, interval: Interval) -> Cell:
+def with_interval(value: float, interval: ConfidenceInterval) -> Cell:
     """A number with its interval of 95 %."""
     return None if math.isnan(value) else [_kept(value), _kept(interval.low), _kept(interval.high)]
 
@@ -104,24 +110,113 @@ def page(title: str, preface: Sequence[str], tables: Sequence[Table]) -> str:
     return "\n".join(parts)
 
 
-def write(path: Path, preface: Sequence[str], tables: Sequence[Table]) -> None:
-    """Keep preface and tables as JSON, one row a line."""
-    out = ["{", f' "preface": {_json(list(preface))},', ' "tables": [']
-    for number_, table in enumerate(tables):
-        head = {key: value for key, value in asdict(table).items() if key != "rows"}
-        rows = ",\n".join(f"   {_json(row)}" for row in table.rows)
-        comma = "," if number_ + 1 < len(tables) else ""
-        out.append(f'  {_json(head)[:-1]}, "rows": [\n{rows}\n  ]}}{comma}')
-    with files.aside(path) as partial:
-        partial.write_text("\n".join([*out, " ]", "}"]) + "\n", encoding="utf-8")
+def write(folder: Path, preface: Sequence[str], tables: Sequence[Table]) -> None:
+    """Write tables as CSV files, and ``tables.json`` with the preface, the captions and the columns of each file.
+
+    Tables of one section with the same columns share a file; its first column names the table. An interval takes three
+    columns: value, low, high.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for old in folder.glob("*.csv"):
+        old.unlink()
+
+    stacked: dict[str, list[Table]] = {}
+    listed: list[dict[str, str]] = []
+    for table in tables:
+        file = _file_of(table, stacked)
+        stacked.setdefault(file, []).append(table)
+        listed.append({"name": table.name, "section": table.section, "caption": table.caption, "file": file})
+    columns = {file: _described_columns(group) for file, group in stacked.items()}
+    for file, group in stacked.items():
+        _write_csv(folder / file, group, columns[file])
+
+    with files.atomic_write(folder / INDEX) as partial:
+        index = {"preface": list(preface), "tables": listed, "columns": columns}
+        text = json.dumps(index, ensure_ascii=False, indent=1)
+        partial.write_text(text + "\n", encoding="utf-8")
 
 
-def read(path: Path) -> tuple[list[str], list[Table]]:
-    """The inverse of :func:`write`."""
-    value = json.loads(path.read_text(encoding="utf-8"))
-    tables = [Table(**(its | {"columns": [Column(**column) for column in its["columns"]]})) for its in value["tables"]]
-    return value["preface"], tables
+def read(folder: Path) -> tuple[list[str], list[Table]]:
+    """Read preface and tables, the inverse of :func:`write`."""
+    index = json.loads((folder / INDEX).read_text(encoding="utf-8"))
+    rows = {file: _read_csv(folder / file, columns) for file, columns in index["columns"].items()}
+    tables = []
+    for listed in index["tables"]:
+        columns = [Column(column["heading"], column["form"]) for column in index["columns"][listed["file"]]]
+        mine = [row for name, row in rows[listed["file"]] if name == listed["name"]]
+        tables.append(Table(listed["name"], listed["section"], listed["caption"], columns, mine))
+    return index["preface"], tables
 
 
-def _json(value: object) -> str:
-    return json.dumps(value, ensure_ascii=False, allow_nan=False)
+def file_names(folder: Path) -> list[str]:
+    """The file of each table, in the order of the tables."""
+    index = json.loads((folder / INDEX).read_text(encoding="utf-8"))
+    return [listed["file"] for listed in index["tables"]]
+
+
+def _file_of(table: Table, stacked: dict[str, list[Table]]) -> str:
+    """The file of the section, or a file named after the table where that one has other columns."""
+    file = f"{_slug(table.section)}.csv"
+    if file in stacked and stacked[file][0].columns != table.columns:
+        file = f"{_slug(table.name)}.csv"
+    return file
+
+
+def _slug(text: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")
+
+
+def _described_columns(group: Sequence[Table]) -> list[dict[str, Any]]:
+    """Heading and form of each column, and whether its numbers have intervals."""
+    described = []
+    for position, column in enumerate(group[0].columns):
+        cells = [row[position] for table in group for row in table.rows]
+        has_interval = any(isinstance(cell, list) for cell in cells)
+        described.append({"heading": column.heading, "form": column.form, "interval": has_interval})
+    return described
+
+
+def _write_csv(path: Path, group: Sequence[Table], columns: Sequence[dict[str, Any]]) -> None:
+    header = ["table"]
+    for column in columns:
+        heading = column["heading"]
+        header += [heading, f"{heading} low", f"{heading} high"] if column["interval"] else [heading]
+    with files.atomic_write(path) as partial, partial.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(header)
+        for table in group:
+            for row in table.rows:
+                line: list[Any] = [table.name]
+                for cell, column in zip(row, columns, strict=True):
+                    if column["interval"]:
+                        line += cell if isinstance(cell, list) else [cell, None, None]
+                    else:
+                        line.append(cell)
+                writer.writerow(line)
+
+
+def _read_csv(path: Path, columns: Sequence[dict[str, Any]]) -> list[tuple[str, list[Cell]]]:
+    """Name of the table and cells of each row."""
+    with path.open(encoding="utf-8", newline="") as file:
+        lines = list(csv.reader(file))[1:]
+    rows = []
+    for line in lines:
+        texts = iter(line)
+        name = next(texts)
+        cells: list[Cell] = []
+        for column in columns:
+            if column["form"] == "text":
+                cells.append(next(texts) or None)
+            elif column["interval"]:
+                interval = [_number_or_none(next(texts)) for _ in range(3)]
+                cells.append(None if interval[0] is None else interval)
+            else:
+                cells.append(_number_or_none(next(texts)))
+        rows.append((name, cells))
+    return rows
+
+
+def _number_or_none(text: str) -> float | None:
+    if not text:
+        return None
+    return int(text) if text.lstrip("-").isdecimal() else float(text)

@@ -1,6 +1,5 @@
-"""Puts into the site, while it is built, what it takes from the program, so that no page repeats it: the picture of the
-packages, tables of the artefacts' columns and of a scenario's keys, a page of reference for each package; and formulas
-as MathML."""
+"""Add to the documentation site what comes from the program: the diagram of the packages, tables of public names
+and of study results, a reference page for each package, and formulas as MathML."""
 
 from __future__ import annotations
 
@@ -23,7 +22,7 @@ from formulas import mathml
 ROOT = Path(__file__).resolve().parents[2]
 _FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
 _ELSEWHERE = "https://unpkg.com/iframe-worker/shim"
-_INSERT = re.compile(r"<!-- (columns of|keys of|names of|picture of) (\w+) -->")
+_INSERT = re.compile(r"<!-- (names of|picture of|study conditions|study table) ([\w-]+) -->")
 
 
 def on_config(config: MkDocsConfig) -> None:
@@ -37,21 +36,22 @@ def on_config(config: MkDocsConfig) -> None:
 def on_files(files: Files, config: MkDocsConfig) -> None:
     """One page a package, with every module that says something."""
     for name in package_diagram.packages():
-        folder = ROOT / "pipeline" / name
-        modules = [".".join(p.relative_to(ROOT).with_suffix("").parts) for p in sorted(folder.rglob("*.py"))]
+        folder = ROOT / "pipeline" / "egvs" / name
+        modules = [
+            ".".join(p.relative_to(ROOT / "pipeline").with_suffix("").parts) for p in sorted(folder.rglob("*.py"))
+        ]
         text = f"# {name}\n\n{_first_line(folder / '__init__.py')}\n"
         text += "".join(f"\n::: {module}\n" for module in modules if not module.endswith("__init__"))
         files.append(File.generated(config, f"api/{name}.md", content=text))
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Tables and pictures in place of ``<!-- columns of scores -->`` and its like."""
+    """Put tables and pictures in place of ``<!-- names of egvs -->`` and the like."""
     del config, files
-    if page.file.src_uri == "artefacts.md":
-        told = {name for what, name in _INSERT.findall(markdown) if what == "columns of"}
-        untold = {p.name.split(".")[0] for p in tables.SCHEMAS.glob("*.schema.json")} - {"scenario", "city_file"} - told
-        if untold:
-            raise ValueError(f"docs/artefacts.md says nothing of {', '.join(sorted(untold))}")
+    if page.file.src_uri == "validity-tables.md":
+        shown = {name for what, name in _INSERT.findall(markdown) if what == "study table"}
+        if missing := tables.study_files() - shown:
+            raise ValueError(f"docs/validity-tables.md does not show {', '.join(sorted(missing))}")
     return _INSERT.sub(lambda m: _MAKE[m[1]](m[2]), markdown)
 
 
@@ -82,8 +82,8 @@ def _first_line(path: Path) -> str:
 
 
 _MAKE = {
-    "columns of": tables.columns,
-    "keys of": tables.keys,
     "names of": tables.names,
     "picture of": lambda _: package_diagram.picture(),
+    "study conditions": tables.study_conditions,
+    "study table": tables.study_tables,
 }

@@ -16,7 +16,7 @@ from itertools import pairwise
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-PACKAGE = ROOT / "pipeline"
+PACKAGE = ROOT / "pipeline" / "egvs"
 _TITLE = "The packages in layers, each with arrows to those that it builds on"
 _TIP = (
     "<defs><marker id='tip' viewBox='0 0 8 8' refX='7' refY='4' markerWidth='7' markerHeight='7' orient='auto'>"
@@ -44,10 +44,10 @@ def _imports(name: str) -> set[str]:
                 found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
             elif isinstance(node, ast.Import):
                 found |= {alias.name for alias in node.names}
-            elif isinstance(node, ast.Constant) and re.fullmatch(r"pipeline\.\w+\.[\w.]*", str(node.value)):
+            elif isinstance(node, ast.Constant) and re.fullmatch(r"egvs\.\w+\.[\w.]*", str(node.value)):
                 found.add(str(node.value))
     parts = [module.split(".") for module in found]
-    return {p[1] for p in parts if p[0] == "pipeline" and len(p) > 1 and p[1] in packages()} - {name}
+    return {p[1] for p in parts if p[0] == "egvs" and len(p) > 1 and p[1] in packages()} - {name}
 
 
 def _reduced() -> dict[str, set[str]]:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from benchmarks import casting, others, savings, scaling, steps
 from scipy import stats
 
-from benchmarks import casting, others, savings, scaling, steps
-from pipeline.artefacts.recorded_boxes import FrameBoxes
-from pipeline.core.grid import Grid
+from egvs.artefacts.traffic_frames import FrameBoxes
+from egvs.core.grid import Grid
 
 SHAPE = np.array([12, 6, 4], np.int64)
 ALONG = {
@@ -88,16 +88,16 @@ def test_the_slope_is_that_of_the_larger_half() -> None:
 
 
 def test_a_synthetic_junction_is_as_large_as_asked(tmp_path) -> None:
-    import pipeline
-    from pipeline.sensing import sensors, sites
-    from pipeline.world import static_world
+    import egvs
+    from egvs.sensors import sensor, sites
+    from egvs.world import static_world
 
-    scenario = pipeline.load(
+    scenario = egvs.load(
         scaling.prepare(scaling.Size(sites=7, frames=10, vehicles=3, beams=960, triangles=600), tmp_path / "s")
     )
-    assert len(sites.of(scenario)) == 7
-    assert sensors.resolve("own", scenario.sensors, "").beams == pytest.approx(960, rel=0.1)
-    assert len(static_world.build(scenario)[0].faces) == pytest.approx(600, abs=10)
+    assert len(sites.candidate_sites(scenario)) == 7
+    assert sensor.resolve_sensor("own", scenario.sensors, "").beams == pytest.approx(960, rel=0.1)
+    assert len(static_world.build_world(scenario)[0].faces) == pytest.approx(600, abs=10)
     assert len((scenario.folder / "fcd.csv").read_text().splitlines()) == 1 + 10 * 3
 
 

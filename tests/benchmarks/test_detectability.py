@@ -7,16 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
 from benchmarks.detectability import __main__ as command
 from benchmarks.detectability import examples, figures, fitting, writing
 from benchmarks.detectability.fitting import Examples
 from benchmarks.validity import junctions, study
-from pipeline.artefacts.traffic_frames import TrafficFrame
-from pipeline.core.grid import Grid
-from pipeline.scoring.targets import detectability
-from pipeline.scoring.targets.detectability import DETECTORS, FEATURES, Model
-from pipeline.scoring.targets.record import TargetRecord
+
+from egvs.artefacts.traffic_frames import TrafficFrame
+from egvs.core.grid import Grid
+from egvs.scoring import target_scores
+from egvs.scoring.target_scores import DETECTORS, FEATURES, DetectabilityModel
+from egvs.scoring.targets import TargetRecord
 from tests.conftest import write_mini
 
 GRID = Grid((0.0, 0.0, 0.0), 1.0, (60, 60, 5))
@@ -116,7 +116,7 @@ def test_a_planted_dependence_is_found_and_holds_elsewhere() -> None:
     given = {name: made_up(seed) for seed, name in enumerate(("one", "two", "three"), start=1)}
     learnt = fitting.fitted(list(given.values()))
     assert learnt == fitting.fitted(list(given.values())) and len(learnt["trees"]) == fitting.TREES
-    model = Model.of(learnt)
+    model = DetectabilityModel.of(learnt)
     x = np.full((50, len(FEATURES)), 0.5)
     x[:, 0], x[:, FEATURES.index("gap_m")] = np.linspace(0.0, 7.0, 50), 12.0
     alone = model.chances(x)
@@ -143,7 +143,7 @@ def about_of(shipped: dict) -> writing.About:
 
 
 def test_the_shipped_file_is_as_it_would_be_written_again() -> None:
-    text = detectability.FILE.read_text(encoding="utf-8")
+    text = target_scores.MODEL_FILE.read_text(encoding="utf-8")
     shipped = json.loads(text)
     assert writing.text(about_of(shipped), shipped["detectors"]) == text
     for name, its in shipped["detectors"].items():
@@ -152,21 +152,21 @@ def test_the_shipped_file_is_as_it_would_be_written_again() -> None:
 
 
 def test_the_shipped_models_are_of_the_detectors_that_are_shipped() -> None:
-    from pipeline.core import files
-    from pipeline.validation.detectors import registry
+    from egvs.core import files
+    from egvs.validation.detectors import base
 
-    shipped = json.loads(detectability.FILE.read_text(encoding="utf-8"))["about"]["settings"]
-    assert shipped == {name: files.hash_of(registry.make(name).settings) for name in DETECTORS}
+    shipped = json.loads(target_scores.MODEL_FILE.read_text(encoding="utf-8"))["about"]["settings"]
+    assert shipped == {name: files.hash_json(base.make_detector(name).settings) for name in DETECTORS}
 
 
 def test_the_picture_shows_every_part_of_the_curves(tmp_path: Path) -> None:
-    shipped = json.loads(detectability.FILE.read_text(encoding="utf-8"))
+    shipped = json.loads(target_scores.MODEL_FILE.read_text(encoding="utf-8"))
     above, below = figures.calibration(shipped).axes
     lines = {line.get_label().partition(",")[0]: line.get_xydata().tolist() for line in above.lines}
     for name, its in shipped["detectors"].items():
         assert lines[name] == [[part["chance"], part["found"]] for part in its["elsewhere"]["calibration"]]
     assert sum(bar.get_height() for bar in below.patches) == pytest.approx(len(DETECTORS))
-    figures.draw(tmp_path / "its.png", detectability.FILE)
+    figures.draw(tmp_path / "its.png", target_scores.MODEL_FILE)
     assert (tmp_path / "its.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -200,7 +200,7 @@ def test_the_whole_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caps
     options = ["--frames", "10", "--places", "1", "--jobs", "1", "--data", str(tmp_path / "data")]
     assert command.main([*options, "--out", str(tmp_path / "out")]) == 0
     assert (tmp_path / "out" / "detectability.png").is_file()
-    learnt = json.loads((tmp_path / "out" / "detectability.json").read_text(encoding="utf-8"))
+    learnt = json.loads((tmp_path / "out" / "target_scores.json").read_text(encoding="utf-8"))
     its = learnt["about"]["learnt_on"]["hill"]
     assert its["sites"] == {"cluster": 6} and its["sensors"] == ["small"] and learnt["about"]["frames"] == 10
     curve = learnt["detectors"]["cluster"]["elsewhere"]["calibration"]

@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-
 from benchmarks import guards
-from pipeline.core.errors import InputError
-from pipeline.traffic import sumo
-from pipeline.traffic.guarded import copies
+
+from egvs.core.errors import InputError
+from egvs.traffic import sumo, user_files
 
 
 @pytest.mark.system
@@ -18,11 +17,11 @@ def test_guards_work_while_their_time_is_taken(tmp_path: Path, monkeypatch: pyte
     (tmp_path / "a.xml").write_text("<additional><include href='b'/></additional>")
     with guards.accounted() as spent_s:
         with pytest.raises(InputError, match="a further file"):
-            copies.copy(tmp_path / "a.xml", tmp_path / "b.xml")
+            user_files.copy_checked(tmp_path / "a.xml", tmp_path / "b.xml")
         for _ in range(3):
-            with sumo._started(["/bin/sh", "-c", "exit 0"], tmp_path, None, None) as process:
-                assert "confined.py" in str(process.args)
+            with sumo._start_program(["/bin/sh", "-c", "exit 0"], tmp_path, None, None) as process:
+                assert "sandbox.py" in str(process.args)
     assert spent_s[guards.START] == 6.0
     assert spent_s["files read before they are copied"] > 0.0
-    with sumo._started(["/bin/sh", "-c", "exit 0"], tmp_path, None, None):
+    with sumo._start_program(["/bin/sh", "-c", "exit 0"], tmp_path, None, None):
         assert spent_s[guards.START] == 6.0

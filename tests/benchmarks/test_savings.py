@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-import pipeline
-from pipeline.artefacts.recorded_boxes import FrameBoxes
-from pipeline.kernels import rays
-from pipeline.scoring.occupancy import count
-from pipeline.sensing.scanner import Scanner
+import egvs
+from egvs.artefacts.traffic_frames import FrameBoxes
+from egvs.kernels import ray_triangle
+from egvs.scoring.occupancy import count_occupancy
+from egvs.sensors.scanner import Scanner
 
 
 def take_all(o, directions, size, range_m, beam) -> int:
@@ -19,9 +19,9 @@ def take_all(o, directions, size, range_m, beam) -> int:
 
 
 def test_beams_that_cannot_meet_the_region_are_not_cast_and_would_change_nothing(mini: Path, monkeypatch) -> None:
-    scene = pipeline.build_scene(pipeline.load(mini))
+    scene = egvs.build_scene(egvs.load(mini))
     lean = [Scanner(scene).scan_site(site).rows for site in scene.sites]
-    monkeypatch.setattr(rays, "take", take_all)
+    monkeypatch.setattr(ray_triangle, "select_beams", take_all)
     for site, few in zip(scene.sites, lean, strict=True):
         every = Scanner(scene).scan_site(site).rows
         assert len(few.beam) < len(every.beam)
@@ -31,12 +31,12 @@ def test_beams_that_cannot_meet_the_region_are_not_cast_and_would_change_nothing
 
 
 def test_flat_boxes_take_the_flat_path_and_count_the_same() -> None:
-    grid = pipeline.load(Path(__file__).resolve().parents[2] / "scenarios" / "nishishinjuku").roi.grid
+    grid = egvs.load(Path(__file__).resolve().parents[2] / "scenarios" / "nishishinjuku").roi.grid
     rng, n = np.random.default_rng(3), 300
     values = np.column_stack(
         [rng.uniform(0, 100, n), rng.uniform(0, 50, n), np.full(n, 0.75), rng.uniform(-3, 3, n), np.zeros(n),
          np.tile([4.5, 1.75, 1.5], (n, 1))]
     )  # fmt: skip
-    flat = count(FrameBoxes(np.arange(n) // 10, values), grid, 30)
+    flat = count_occupancy(FrameBoxes(np.arange(n) // 10, values), grid, 30)
     values[:, 4] = 1e-15  # so little that no voxel can tell, but not the flat path
-    assert np.array_equal(flat, count(FrameBoxes(np.arange(n) // 10, values), grid, 30))
+    assert np.array_equal(flat, count_occupancy(FrameBoxes(np.arange(n) // 10, values), grid, 30))

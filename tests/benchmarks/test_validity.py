@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from dataclasses import replace
@@ -10,8 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-import pipeline
 from benchmarks.validity import __main__ as command
 from benchmarks.validity import (
     agreement,
@@ -38,10 +35,12 @@ from benchmarks.validity.record import (
     Record,
     StudySite,
 )
-from pipeline.core.errors import InputError, MissingBackendError
-from pipeline.sensing.sites import Pose, Site
-from pipeline.validation.detectors.pointpillars.detector import SHIPPED, Model
-from pipeline.validation.looking import Look
+
+import egvs
+from egvs.core.errors import InputError, MissingBackendError
+from egvs.sensors.sites import Pose, Site
+from egvs.validation.detector_runs import SiteDetectionTask
+from egvs.validation.detectors.pointpillars import SHIPPED_MODEL, OnnxModel
 from tests.conftest import write_mini
 
 pytestmark = pytest.mark.slow  # a study is made for all of them
@@ -54,26 +53,26 @@ DOCS = ROOT / "docs"
 
 
 def test_the_grid_is_the_same_each_time_upright_and_at_all_heights(mini: Path) -> None:
-    first, again = (poses.grid_poses(pipeline.build_scene(pipeline.load(mini)), None, "small") for _ in range(2))
+    first, again = (poses.grid_poses(egvs.build_scene(egvs.load(mini)), None, "small") for _ in range(2))
     assert first == again and len(first) == 40
     assert [site.name for site in first[:5]] == ["g01h2", "g01h3", "g01h4.5", "g01h6", "g02h2"]
     assert [site.pose.z_m for site in first[:4]] == [2.0, 3.0, 4.5, 6.0]
     assert all(site.pose.angles_deg == (0.0, 0.0, 0.0) for site in first)
     assert len({(site.pose.x_m, site.pose.y_m) for site in first}) == 10
-    assert poses.grid_poses(pipeline.build_scene(pipeline.load(mini)), None, "small", places=5) == first[:20]
+    assert poses.grid_poses(egvs.build_scene(egvs.load(mini)), None, "small", places=5) == first[:20]
 
 
 def test_no_place_is_in_the_building_or_outside_the_surroundings(mini: Path) -> None:
-    free = poses.free_at(pipeline.build_scene(pipeline.load(mini)), None, "small")
+    free = poses.free_at(egvs.build_scene(egvs.load(mini)), None, "small")
     x, y = free.T
     assert not ((x > 14) & (x < 18) & (y > 5) & (y < 8)).any()
     assert x.min() == -12.0 and x.max() == 52.0 and y.min() == -22.0 and y.max() == 22.0
 
 
 def test_places_are_beside_lanes_and_their_heights_count_from_the_slope() -> None:
-    scenario = pipeline.load(ROOT / "scenarios" / "hill")
-    scene = pipeline.build_scene(scenario)
-    lanes = junctions.Carriageway.of(junctions.sumo_folder.roads(scenario))
+    scenario = egvs.load(ROOT / "scenarios" / "hill")
+    scene = egvs.build_scene(scenario)
+    lanes = junctions.Carriageway.of(junctions.sumo_folder.read_network(scenario))
     grid = poses.grid_poses(scene, lanes, "VLP-32C")
     import shapely
 
@@ -121,7 +120,7 @@ def test_a_part_that_was_measured_is_kept_and_an_interrupted_one_goes_on(mini, t
     assert points.sites == list(range(10)) and max(points.values) <= 1.0
     assert len(made.scores["entropy_seen"]) == 10 and made.sites[9].name == "g02h6"
 
-    monkeypatch.setattr(Look, "at", lambda *_: pytest.fail("looked again"))
+    monkeypatch.setattr(SiteDetectionTask, "at", lambda *_: pytest.fail("looked again"))
     assert measuring.measure(part_of(mini, tmp_path), tmp_path, jobs=1, told=said.append) == made
     assert said == ["mini: kept"]
     kept = (tmp_path / "mini.json").read_bytes()
@@ -131,10 +130,10 @@ def test_a_part_that_was_measured_is_kept_and_an_interrupted_one_goes_on(mini, t
 
 
 def test_a_posed_scenario_has_these_sites_and_no_keys_of_the_old_ones(mini: Path, tmp_path: Path) -> None:
-    scenario = pipeline.load(mini, ["sites.yaw_deg=30"])
-    grid = poses.grid_poses(pipeline.build_scene(scenario), None, "small", places=1)
+    scenario = egvs.load(mini, ["sites.yaw_deg=30"])
+    grid = poses.grid_poses(egvs.build_scene(scenario), None, "small", places=1)
     for sensor in (None, "VLP-16"):
-        sites = pipeline.build_scene(junctions.posed(scenario, grid, tmp_path / "its.csv", sensor)).sites
+        sites = egvs.build_scene(junctions.posed(scenario, grid, tmp_path / "its.csv", sensor)).sites
         assert [(s.name, s.pose) for s in sites] == [(s.name, s.pose) for s in grid]
         assert {s.sensor for s in sites} == {sensor or "small"}
 
@@ -151,8 +150,8 @@ def test_wrong_arguments_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[
 
 def test_traffic_that_scores_have_seen_is_refused(mini: Path) -> None:
     with pytest.raises(InputError, match=r"traffic\.fcd: the traffic is a finished file"):
-        junctions.check_unseen(pipeline.load(mini))
-    junctions.check_unseen(pipeline.load(ROOT / "scenarios" / "hill"))
+        junctions.check_unseen(egvs.load(mini))
+    junctions.check_unseen(egvs.load(ROOT / "scenarios" / "hill"))
 
 
 @pytest.mark.parametrize("other", ["held out", "unseen"])
@@ -213,15 +212,17 @@ def test_the_whole_study_is_the_same_bytes_twice_and_says_what_it_went_without(
         assert "3 parts; looking from all sites takes some 0 minutes on 1 cores" in out
     assert out.count(": kept") == 3
     made = sorted(path.relative_to(docs[0]) for path in docs[0].rglob("*") if path.is_file())
-    assert [str(path) for path in made if path.suffix != ".png"] == [
-        "data/validity.json", "validity-costs.md", "validity-tables.md",
-    ]  # fmt: skip
+    assert {str(path) for path in made if path.suffix not in (".png", ".csv")} == {
+        "data/validity/tables.json", "validity-costs.md",
+    }  # fmt: skip
+    assert {path.parent for path in made if path.suffix == ".csv"} == {Path("data/validity")}
     assert all((docs[0] / path).read_bytes() == (docs[1] / path).read_bytes() for path in made)
-    page = (docs[0] / "validity-tables.md").read_text(encoding="utf-8")
+    conditions = " ".join(tables.read(docs[0] / command.DATA)[0])
     assert (
-        "Without: hill (not in this run); roundabout (not in this run); a training junction from OpenStreetMap" in page
+        "Without: hill (not in this run); roundabout (not in this run); a training junction from OpenStreetMap"
+        in conditions
     )
-    assert "Detectors: points." in page and "ingolstadt: TPOG 7, unseen traffic" in page
+    assert "Detectors: points." in conditions and "ingolstadt: TPOG 7, held-out traffic" in conditions
 
 
 # tables from made-up findings
@@ -288,11 +289,11 @@ def test_where_each_detector_looks_from(mini: Path, tmp_path: Path) -> None:
 
 def test_no_shipped_model_has_seen_a_held_out_junction() -> None:
     for model, convention, heights_m in (
-        (SHIPPED, "ground", [2.0, 7.0]),
+        (SHIPPED_MODEL, "ground", [2.0, 7.0]),
         (low_models.model(low_models.LOW), "ground", [2.0, 2.0]),
         (low_models.model(low_models.SENSOR), "sensor", [2.0, 2.0]),
     ):
-        about = Model.of(model).about
+        about = OnnxModel.of(model).metadata
         assert about["convention"] == convention and about["recipe"]["heights_m"] == heights_m
         assert about["junctions"] == ["ingolstadt", "hill", "roundabout", "east"]
 
@@ -317,7 +318,9 @@ def test_gamma_is_chosen_on_training_junctions_whatever_the_held_out_ones_say(re
     other = Record(**{**vars(records[2]), "scores": {
         name: [-v for v in its] for name, its in records[2].scores.items()}})  # fmt: skip
     its = agreement.chosen_gamma([Pools([*records[:2], other], "points", 200)])
-    assert set(its.column("best gamma, training")) == {"2"} and set(its.column("not told apart")) == {"2"}
+    assert set(its.column("best gamma, training")) == {"2"} and set(
+        its.column("gammas not distinguishable from it")
+    ) == {"2"}
     assert all(cell[0] == 1.0 for cell in its.column("rho, training"))
     assert all(cell[0] == -1.0 for cell in its.column("rho, held out"))
     assert all(cell[0] == -2.0 for cell in its.column("difference, held out"))
@@ -351,8 +354,8 @@ def test_heights_of_two_detectors_are_compared_at_the_same_sites(records: list[R
     }
     both = replace(record, detections=record.detections | {low_models.LOW: low, low_models.SENSOR: less})
     its = heights.table([both], ["points", low_models.LOW, low_models.SENSOR])
-    names = ["points", low_models.LOW, low_models.SENSOR, "points, first 5 places"]
-    assert list(dict.fromkeys(its.column("detector"))) == [*names, f"{low_models.SENSOR} less {low_models.LOW}"]
+    names = ["points", low_models.LOW, low_models.SENSOR, "points, first 5 locations"]
+    assert list(dict.fromkeys(its.column("detector"))) == [*names, f"{low_models.SENSOR} minus {low_models.LOW}"]
     gap = its.rows[-1]
     assert gap[2] == "held out" and gap[3] == 5
     assert [cell[0] for cell in gap[4:8]] == pytest.approx([-4.0, -6.0, -8.0, -10.0])
@@ -394,11 +397,18 @@ def test_figures_are_drawn_from_the_tables_twice_alike(all_tables: list[tables.T
     assert [path.read_bytes() for path in first] == [path.read_bytes() for path in again]
 
 
-def test_tables_are_read_back_and_make_the_same_page(all_tables: list[tables.Table], tmp_path: Path) -> None:
-    tables.write(tmp_path / "its.json", ["Said before."], all_tables)
-    words, back = tables.read(tmp_path / "its.json")
-    assert back == all_tables and words == ["Said before."]
-    assert tables.page("T", words, back) == tables.page("T", ["Said before."], all_tables)
+def test_tables_survive_a_round_trip_through_csv(all_tables: list[tables.Table], tmp_path: Path) -> None:
+    tables.write(tmp_path, ["Conditions."], all_tables)
+    preface, back = tables.read(tmp_path)
+    assert back == all_tables and preface == ["Conditions."]
+    assert len(tables.file_names(tmp_path)) == len(all_tables)
+    assert {path.name for path in tmp_path.glob("*.csv")} == set(tables.file_names(tmp_path))
+
+
+def test_files_of_an_earlier_study_are_removed(all_tables: list[tables.Table], tmp_path: Path) -> None:
+    (tmp_path / "old.csv").write_text("table\n")
+    tables.write(tmp_path, [], all_tables[:1])
+    assert [path.name for path in tmp_path.glob("*.csv")] == tables.file_names(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -418,34 +428,39 @@ def test_cells_as_text(cell: tables.Cell, text: str) -> None:
 # the page
 
 
-def test_the_tables_of_the_docs_are_those_of_their_data() -> None:
-    words, made = tables.read(DOCS / "data" / "validity.json")
-    assert (DOCS / "validity-tables.md").read_text(encoding="utf-8") == tables.page(command.TITLE, words, made)
+def test_the_page_of_tables_links_and_shows_each_file() -> None:
+    page = (DOCS / "validity-tables.md").read_text(encoding="utf-8")
+    folder = DOCS / command.DATA
+    headings = {table.section for table in tables.read(folder)[1]}
+    assert set(re.findall(r"^## (.*)$", page, re.MULTILINE)) == headings
+    for file in tables.file_names(folder):
+        assert f"({command.DATA.as_posix()}/{file})" in page
+        assert f"<!-- study table {Path(file).stem} -->" in page
 
 
 def test_every_number_of_the_answers_stands_in_the_tables() -> None:
     """Numbers with a decimal point: those are measured."""
     answers = (DOCS / "validity.md").read_text(encoding="utf-8").partition("\n## Answers\n")[2]
-    shown = set(re.findall(r"\d+\.\d+", (DOCS / "validity-tables.md").read_text(encoding="utf-8")))
+    shown = set(re.findall(r"\d+\.\d+", tables.page("", *tables.read(DOCS / command.DATA))))
     settings = {"0.25", "0.5", "4.5", "0.7"}
     assert set(re.findall(r"\d+\.\d+", answers)) <= shown | settings
 
 
 def test_the_protocol_says_the_numbers_of_the_program() -> None:
     page = " ".join((DOCS / "validity.md").read_text(encoding="utf-8").split())
-    assert f"judged by {study.FRAMES} frames of another seed, {study.APART_S:g} s apart" in page
+    assert f"evaluated with {study.FRAMES} frames of another seed, {study.APART_S:g} s apart" in page
     assert f"on {study.SENSOR_FRAMES} frames {study.SENSOR_APART_S:g} s apart" in page
     assert (
-        f"first {looking_from.FEW_PLACES} places" in page
+        f"first {looking_from.FEW_PLACES} locations" in page
         and f"at most {looking_from.FEW_GIVEN['held out']} of the given" in page
     )
     assert f"{looking_from.FEW_GIVEN['training']} of a training one" in page
-    assert ", ".join(study.SENSORS) in page and f"{poses.PLACES} places, each 2, 3, 4.5 and 6 m" in page
+    assert ", ".join(study.SENSORS) in page and f"{poses.PLACES} locations, each at 2, 3, 4.5 and 6 m" in page
     assert f"lattice of {poses.SPACING_M:g} m that reaches {poses.BESIDE_M:g} m" in page
     assert f"within {poses.ROAD_M:g} m of a lane" in page
     for name, role in junctions.SHIPPED.items():
         assert re.search(rf"\| {name} \|[^|]*\| {role} \|", page), name
-    assert json.loads((DOCS / "data" / "validity.json").read_text(encoding="utf-8"))["preface"]
+    assert tables.read(DOCS / command.DATA)[0]
 
 
 # the score that is recommended
@@ -463,12 +478,12 @@ def test_the_recommended_score_is_quoted_where_nothing_was_learnt_and_has_no_par
     made = list(foretold.tables(its, ["cluster", low_models.SENSOR]))
     found = table(made, f"F cluster {BOXED[0]}")
     assert found.column("junction")[:3] == ["right", "north", "together"]
-    assert found.column("number")[:9] == [30, 30, 60, 6, 6, 12, 24, 24, 48]
+    assert found.column("number of sites")[:9] == [30, 30, 60, 6, 6, 12, 24, 24, 48]
     assert all(cell[0] == 1.0 for cell in found.column("recommended"))
     assert all(cell[0] == -1.0 for cell in found.column("EGVS, gamma 10"))
-    assert found.column("EGVS at its best here")[0] == "(gamma 2, voxel 0.25)"  # as good as can be too
-    assert found.column("recommended less its")[0][0] == 0.0
-    assert found.column("recommended less that")[0][0] == 2.0
+    assert found.column("best EGVS setting here")[0] == "(gamma 2, voxel 0.25)"  # as good as can be too
+    assert found.column("recommended minus that")[0][0] == 0.0
+    assert found.column("recommended minus gamma 10")[0][0] == 2.0
     worst = table(made, "F worst cluster")
     assert len(worst.rows) == 6 and worst.column("rank by score") == worst.column("rank by detection")
     every = table(made, "F all")

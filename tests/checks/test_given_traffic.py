@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.checks import recorded
+from egvs.scoring import occupancy
 from tests.checks.conftest import net_xml
 from tests.checks.test_checking import found
 
@@ -79,7 +79,7 @@ def test_what_sumo_may_not_read_is_told_before_it_is_simulated(
     assert found(street).get("traffic", []) == [told]
 
 
-def test_routes_of_a_period_without_vehicles_are_told_with_its_name(street: Path, egvs) -> None:
+def test_routes_of_a_period_without_vehicles_are_told_with_its_name(street: Path, run_egvs) -> None:
     configured(street, DEMAND, name="day")
     configured(street, "<routes/>", name="night")
     simulated(street, 'network = "net.net.xml"\n')
@@ -88,7 +88,7 @@ def test_routes_of_a_period_without_vehicles_are_told_with_its_name(street: Path
         "scenario.toml: traffic.periods (night).routes = ['night.rou.xml']: "
         "no vehicle, trip or flow in its files (night.rou.xml)"
     ]
-    code, _, said = egvs("run", street, "--set", periods, "--out", street / "out")
+    code, _, said = run_egvs("run", street, "--set", periods, "--out", street / "out")
     assert (code, "traffic.periods (night).routes" in said) == (2, True)
     assert not list((street / "out").glob("*.p*"))
 
@@ -168,8 +168,8 @@ def test_a_period_whose_network_lies_elsewhere_is_told(street: Path, first: str,
 
 
 def test_a_period_that_nobody_drives_in_is_told() -> None:
-    (told,) = recorded.periods_without({"day": 3.0, "night": 0.0})
-    assert told.place == "scenario.toml: traffic.periods (night)"
-    assert "no vehicle is ever in the region" in told.found
-    assert list(recorded.periods_without({"day": 0.0, "night": 0.0})) == []  # told of all of them at once
-    assert list(recorded.periods_without({"": 0.0})) == []
+    (told,) = occupancy.warn_empty_periods({"day": 3.0, "night": 0.0})
+    assert told.where == "scenario.toml: traffic.periods (night)"
+    assert "no vehicle ever enters the region" in told.problem
+    assert list(occupancy.warn_empty_periods({"day": 0.0, "night": 0.0})) == []  # told of all of them at once
+    assert list(occupancy.warn_empty_periods({"": 0.0})) == []

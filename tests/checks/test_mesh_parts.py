@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 import trimesh
 
-import pipeline
-from pipeline.checks.mesh_parts import digests, pulled_in
-from pipeline.core import files
-from pipeline.runs import workflow
+import egvs
+from egvs.core import files
+from egvs.formats.meshes import mesh_digests, referenced_files
+from egvs.runs import run
 
 
 @pytest.mark.system
@@ -24,24 +24,24 @@ def test_another_buffer_makes_the_statics_anew(mini: Path, tmp_path: Path) -> No
 
     def statics() -> tuple[str, str]:
         seen: dict[str, str] = {}
-        workflow.run(pipeline.load(mini), out, listener=lambda stage, state, _: seen.__setitem__(stage, state))
+        run.run(egvs.load(mini), out, listener=lambda stage, state, _: seen.__setitem__(stage, state))
         return seen["check"], seen["statics"]
 
     lay(3.0)
     statics()
-    mesh, first = (mini / "box.gltf").read_bytes(), files.sha256_of(out / "statics.ply")
-    assert [part.suffix for part in pulled_in(mini / "box.gltf")] == [".bin"] * len(list(mini.glob("*.bin")))
+    mesh, first = (mini / "box.gltf").read_bytes(), files.hash_file(out / "statics.ply")
+    assert [part.suffix for part in referenced_files(mini / "box.gltf")] == [".bin"] * len(list(mini.glob("*.bin")))
     lay(4.0)
     (mini / "box.gltf").write_bytes(mesh)
     assert statics() == ("done", "done")
-    assert files.sha256_of(out / "statics.ply") != first
+    assert files.hash_file(out / "statics.ply") != first
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"buffers": 3}', '{"buffers": [{"uri": 5}, 7]}', "[" * 100_000])
 def test_a_damaged_file_pulls_in_nothing(tmp_path: Path, text: str) -> None:
     for name in ("a.gltf", "a.glb", "a.obj"):
         (tmp_path / name).write_text(text)
-        assert pulled_in(tmp_path / name) == []
+        assert referenced_files(tmp_path / name) == []
 
 
 def test_parts_of_glb_and_obj(tmp_path: Path) -> None:
@@ -49,8 +49,8 @@ def test_parts_of_glb_and_obj(tmp_path: Path) -> None:
     body = b'{"buffers": [{"uri": "b.bin"}, {"uri": "data:,"}, {"uri": "absent.bin"}]}'
     (tmp_path / "a.glb").write_bytes(b"glTF" + bytes(8) + len(body).to_bytes(4, "little") + b"JSON" + body)
     (tmp_path / "a.obj").write_text("mtllib b.bin\nv 0 0 0\n")
-    assert [part.name for part in pulled_in(tmp_path / "a.glb")] == ["b.bin"]
-    assert [part.name for part in pulled_in(tmp_path / "a.obj")] == ["b.bin"]
+    assert [part.name for part in referenced_files(tmp_path / "a.glb")] == ["b.bin"]
+    assert [part.name for part in referenced_files(tmp_path / "a.obj")] == ["b.bin"]
 
 
 def test_textures_and_percent_encoded_names(tmp_path: Path) -> None:
@@ -60,16 +60,16 @@ def test_textures_and_percent_encoded_names(tmp_path: Path) -> None:
         "newmtl x\nKd 1 1 1\nmap_Kd -s 1 1 1 b.png\n  map_Bump skin of car.png\nbump none.png\n"
     )
     (tmp_path / "a.obj").write_text("mtllib m.mtl\n# mtllib not.png\nv 0 0 0\n")
-    assert [part.name for part in pulled_in(tmp_path / "a.obj")] == ["m.mtl", "b.png", "skin of car.png"]
+    assert [part.name for part in referenced_files(tmp_path / "a.obj")] == ["m.mtl", "b.png", "skin of car.png"]
     (tmp_path / "a.gltf").write_text('{"buffers": [{"uri": "a%20b.bin"}], "images": [{"uri": "sub/c.png"}]}')
-    assert [part.name for part in pulled_in(tmp_path / "a.gltf")] == ["a b.bin", "c.png"]
+    assert [part.name for part in referenced_files(tmp_path / "a.gltf")] == ["a b.bin", "c.png"]
     (tmp_path / "a.ply").write_bytes(b"ply\ncomment TextureFile c.png\nend_header\ncomment TextureFile b.png\n")
-    assert [part.name for part in pulled_in(tmp_path / "a.ply")] == ["c.png"]
+    assert [part.name for part in referenced_files(tmp_path / "a.ply")] == ["c.png"]
 
 
 def test_a_name_that_no_file_can_have_is_none(tmp_path: Path) -> None:
     (tmp_path / "a.obj").write_bytes(b"mtllib " + b"x" * 5000 + b"\nmtllib \0\n")
-    assert pulled_in(tmp_path / "a.obj") == []
+    assert referenced_files(tmp_path / "a.obj") == []
 
 
 def test_digests_tell_parts_of_one_name_apart(tmp_path: Path) -> None:
@@ -77,5 +77,5 @@ def test_digests_tell_parts_of_one_name_apart(tmp_path: Path) -> None:
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "t.bin").write_text(folder)
     (tmp_path / "m.gltf").write_text('{"buffers": [{"uri": "a/t.bin"}, {"uri": "b/t.bin"}]}')
-    assert list(digests(tmp_path / "m.gltf", "mesh")) == ["mesh", "mesh: a/t.bin", "mesh: b/t.bin"]
-    assert len(set(digests(tmp_path / "m.gltf", "mesh").values())) == 3
+    assert list(mesh_digests(tmp_path / "m.gltf", "mesh")) == ["mesh", "mesh: a/t.bin", "mesh: b/t.bin"]
+    assert len(set(mesh_digests(tmp_path / "m.gltf", "mesh").values())) == 3

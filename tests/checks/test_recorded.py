@@ -7,17 +7,17 @@ from pathlib import Path
 
 import pytest
 
-import pipeline
-from pipeline.checks import recorded
+import egvs
+from egvs.scoring import occupancy
 from tests.checks.test_checking import box, sites, statics
 
 
 def warnings(folder: Path, out: Path, *settings: str) -> dict[str, list[str]]:
     """The warnings of a run, by stage."""
-    record = pipeline.run(pipeline.load(folder, settings), out)
+    record = egvs.run(egvs.load(folder, settings), out)
     read = json.loads((out / "run.json").read_text())["stages"]
     told = {
-        name: [w["place"] + ": " + w["found"] for w in read[name]["summary"].get("warnings", [])]
+        name: [w["where"] + ": " + w["problem"] for w in read[name]["summary"].get("warnings", [])]
         for name in record.stages
     }
     return {name: lines for name, lines in told.items() if lines}
@@ -25,18 +25,22 @@ def warnings(folder: Path, out: Path, *settings: str) -> dict[str, list[str]]:
 
 def test_two_vehicles_in_a_mean_frame_are_enough(mini: Path, tmp_path: Path) -> None:
     """Two cars pass each other along the whole region, but in the first and last frames one of them is outside."""
-    assert list(recorded.in_region(2.0, tmp_path / "is not read")) == []
+    assert list(occupancy.warn_empty_region(2.0, tmp_path / "is not read")) == []
     assert warnings(mini, tmp_path / "out") == {}
     few = warnings(mini, tmp_path / "few", "roi.center_m=[30,0,2.5]", "roi.size_m=[20,20,5]")
     assert len(few["tpog"]) == 1
-    assert few["tpog"][0].endswith(" vehicles are in it in a mean frame: the ranking rests on hardly any traffic")
+    assert few["tpog"][0].endswith(
+        " vehicles are in the region on average: the ranking is based on very little traffic"
+    )
 
 
 def test_a_region_that_no_vehicle_enters(mini: Path, tmp_path: Path) -> None:
     sites(mini, "a,10,52,3")
     told = warnings(mini, tmp_path / "out", "roi.center_m=[20,60,2.5]")
     assert told == {
-        "tpog": ["roi: no vehicle is ever in it, all are between (-1, -2) and (41, 3): the sites cannot be ranked"],
+        "tpog": [
+            "roi: no vehicle ever enters the region, all are between (-1, -2) and (41, 3): the sites cannot be ranked"
+        ],
         "score": [
             "scenario.toml: roi: egvs is 0 at every site, so none is best: no traffic comes and goes in the region"
         ],
@@ -49,7 +53,9 @@ def test_vehicles_that_drive_through_a_wall_are_told_with_the_place(mini: Path, 
     lines = warnings(mini, tmp_path / "out")["tpog"]
     assert len(lines) == 1
     share, _, rest = (
-        lines[0].removeprefix("statics: ").partition("% of what vehicles occupy lies in solids, most often at (")
+        lines[0]
+        .removeprefix("statics: ")
+        .partition("% of the volume that vehicles occupy is inside solids, most often at (")
     )
     assert 2 < float(share) < 4  # about 2 of 38 m of one car of two
     x, y, z = (float(value) for value in rest.partition(")")[0].split(", "))
@@ -66,4 +72,4 @@ def test_a_site_where_recorded_vehicles_drive(mini: Path, tmp_path: Path, row: s
     told = warnings(mini, tmp_path / "out")
     assert list(told) == (["score"] if is_found else [])
     if is_found:
-        assert told["score"][0].startswith("site in: vehicles are where it stands, at (20, -2), in ")
+        assert told["score"][0].startswith("site in: vehicles drive through its position (20, -2) in ")

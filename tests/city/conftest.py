@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.city.model import City, load
+from egvs.city.model import City, load_city
 from tests.conftest import SCENARIO, SITES, collection, write_mini
 
 FRAMES = 60
@@ -83,4 +83,4 @@ def write_junction(folder: Path, name: str, east_m: float) -> None:
 @pytest.fixture
 def city(tmp_path: Path) -> City:
     """The small city, read."""
-    return load(write_city(tmp_path / "town"))
+    return load_city(write_city(tmp_path / "town"))

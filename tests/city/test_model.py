@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.artefacts import schemas
-from pipeline.city import model
-from pipeline.core.errors import InputError
+from egvs.artefacts import parquet
+from egvs.city import model
+from egvs.core.errors import InputError
 
 ROW = "j1,junction of A and B,10.5,-3,50.1,9.2,true"
 HEAD = "junction,title,x_m,y_m,lat_deg,lon_deg,signalised"
@@ -31,7 +31,7 @@ def write_city(folder: Path, *rows: str, toml: str = 'seed = 3\n[traffic]\nnetwo
 def test_a_city_is_read_by_its_folder_or_its_file(tmp_path: Path) -> None:
     folder = write_city(tmp_path / "town", ROW, 'j2,"B, C",0,0,-1,180,FALSE')
     for path in (folder, folder / "city.toml"):
-        city = model.load(path)
+        city = model.load_city(path)
         assert (city.name, city.seed, city.folder, city.traffic.frames) == ("town", 3, folder, 5000)
         assert [j.id for j in city.junctions] == ["j1", "j2"]
         assert city.junctions[0] == model.CityJunction("j1", "junction of A and B", 10.5, -3.0, 50.1, 9.2, True)
@@ -41,11 +41,11 @@ def test_a_city_is_read_by_its_folder_or_its_file(tmp_path: Path) -> None:
 
 
 def test_a_table_that_is_written_is_read_again(tmp_path: Path) -> None:
-    junctions = model.load(write_city(tmp_path, ROW, 'j2,"B, ""C""",0.1,0,-1,180,false')).junctions
+    junctions = model.load_city(write_city(tmp_path, ROW, 'j2,"B, ""C""",0.1,0,-1,180,false')).junctions
     text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(model.table(junctions))
+    csv.writer(text, lineterminator="\n").writerows(model.table_rows(junctions))
     (tmp_path / "junctions.csv").write_text(text.getvalue(), encoding="utf-8")
-    assert model.load(tmp_path).junctions == junctions
+    assert model.load_city(tmp_path).junctions == junctions
 
 
 @pytest.mark.parametrize(
@@ -64,7 +64,7 @@ def test_a_table_that_is_written_is_read_again(tmp_path: Path) -> None:
 )
 def test_a_wrong_row_is_named(tmp_path: Path, rows: list[str], told: str) -> None:
     with pytest.raises(InputError) as caught:
-        model.load(write_city(tmp_path, *rows))
+        model.load_city(write_city(tmp_path, *rows))
     assert told in str(caught.value)
 
 
@@ -81,30 +81,30 @@ def test_a_wrong_row_is_named(tmp_path: Path, rows: list[str], told: str) -> Non
 )
 def test_a_wrong_key_is_named(tmp_path: Path, toml: str, told: str) -> None:
     with pytest.raises(InputError) as caught:
-        model.load(write_city(tmp_path, ROW, toml=toml))
+        model.load_city(write_city(tmp_path, ROW, toml=toml))
     assert told in str(caught.value)
 
 
 def test_a_file_that_is_missing_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no city\.toml there; a folder that egvs city new made"):
-        model.load(tmp_path)
+        model.load_city(tmp_path)
     folder = write_city(tmp_path / "town", ROW)
     (folder / "junctions" / "j1" / "scenario.toml").unlink()
     with pytest.raises(InputError, match=r"scenario\.toml: no such file; a scenario there, or no row j1 in"):
-        model.load(folder)
+        model.load_city(folder)
     with pytest.raises(InputError, match=r"--junction j9: no such junction .*; one of j1"):
-        model.load(write_city(tmp_path / "town", ROW)).junction("j9")
+        model.load_city(write_city(tmp_path / "town", ROW)).junction("j9")
     (folder / "junctions.csv").write_text("junction;title\n", encoding="utf-8")
     with pytest.raises(InputError, match="has the columns junction;title; the columns junction, title, x_m"):
-        model.load(folder)
+        model.load_city(folder)
     (folder / "junctions.csv").write_bytes(b"\xff\xfe")
     with pytest.raises(InputError, match=r"junctions\.csv: cannot be read as CSV"):
-        model.load(folder)
+        model.load_city(folder)
     (folder / "junctions.csv").unlink()
     with pytest.raises(InputError, match=r"junctions\.csv: no such file; a table with the columns"):
-        model.load(folder)
+        model.load_city(folder)
 
 
 def test_editor_schema_is_not_stale() -> None:
-    kept = schemas.folder() / "city_file.schema.json"
-    assert kept.read_text(encoding="utf-8") == model.json_schema(), "run: make schema"
+    kept = parquet.schema_folder() / "city_file.schema.json"
+    assert kept.read_text(encoding="utf-8") == model.city_json_schema(), "run: make schema"

@@ -12,16 +12,15 @@ from pathlib import Path
 import pytest
 from shapely.geometry import box, shape
 
-import pipeline
-from pipeline.artefacts import tables
-from pipeline.city import model, new
-from pipeline.city import traffic as city_traffic
-from pipeline.core.errors import InputError
-from pipeline.formats import osm as osm_reader
-from pipeline.importers import junctions, openstreetmap, street_network
-from pipeline.stages import traffic
-from pipeline.traffic import network
-from pipeline.world import world_frame
+import egvs
+from egvs.artefacts import parquet
+from egvs.city import creation, model, traffic_split
+from egvs.core.errors import InputError
+from egvs.formats import osm
+from egvs.importers import junctions, openstreetmap, osm_network
+from egvs.stages import traffic
+from egvs.traffic import network
+from egvs.world import geolocation
 from tests.stages import run_stage
 
 pytestmark = pytest.mark.system
@@ -79,16 +78,16 @@ def extract(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def made(extract: Path) -> new.NewCity:
-    return new.new(extract.parent / "town", extract)
+def made(extract: Path) -> creation.NewCity:
+    return creation.create_city(extract.parent / "town", extract)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_a_city_has_every_junction_with_signals(made: new.NewCity, extract: Path) -> None:
-    city = model.load(made.folder)
+def test_a_city_has_every_junction_with_signals(made: creation.NewCity, extract: Path) -> None:
+    city = model.load_city(made.folder)
     assert [j.title for j in city.junctions] == [f"signalised junction of {n} Road and Main" for n in "AB"]
     assert [j.id for j in city.junctions] == ["j01", "j02"] and all(j.signalised for j in city.junctions)
     for junction, name in zip(city.junctions, "AB", strict=True):
@@ -100,11 +99,11 @@ def test_a_city_has_every_junction_with_signals(made: new.NewCity, extract: Path
 
 
 @pytest.mark.slow
-def test_a_junction_has_the_region_and_the_poles_that_it_has_alone(made: new.NewCity, extract: Path) -> None:
-    for its in model.load(made.folder).junctions:
+def test_a_junction_has_the_region_and_the_poles_that_it_has_alone(made: creation.NewCity, extract: Path) -> None:
+    for its in model.load_city(made.folder).junctions:
         folder = made.folder.parent / f"alone-{its.id}"
-        openstreetmap.new(folder, extract, (its.lat_deg, its.lon_deg), surroundings_m=None)
-        ours, alone = pipeline.load(made.folder / "junctions" / its.id), pipeline.load(folder)
+        openstreetmap.create_scenario(folder, extract, (its.lat_deg, its.lon_deg), surroundings_m=None)
+        ours, alone = egvs.load(made.folder / "junctions" / its.id), egvs.load(folder)
         assert (ours.roi, ours.sites, ours.score) == (alone.roi, alone.sites, alone.score)
         assert (made.folder / "junctions" / its.id / "sites.csv").read_bytes() == (folder / "sites.csv").read_bytes()
         near, every = (
@@ -117,32 +116,34 @@ def test_a_junction_has_the_region_and_the_poles_that_it_has_alone(made: new.New
         away_m = {name: region.distance(shape(feature["geometry"])) for name, feature in every.items()}
         assert {name for name in every if away_m[name] < 200} <= near.keys()  # the reach of a VLP-32C
         assert {name for name in every if away_m[name] > 300}.isdisjoint(near) and len(near) < len(every)
-        mine, networks = world_frame.of(ours).frame, world_frame.of(alone).frame
+        mine, networks = geolocation.scenario_georeference(ours).frame, geolocation.scenario_georeference(alone).frame
         assert mine is not None and networks is not None
         spot = [[its.x_m, its.y_m]]
         assert mine.to_degrees(spot) == pytest.approx(networks.to_degrees(spot), abs=1e-9)
 
 
 def test_near_streets_give_the_same_kerbs_as_all(extract: Path) -> None:
-    read = osm_reader.read(extract)
-    _, streets = street_network.network(read, extract, street_network.flags(read, lefthand=False, walk=True))
+    read = osm.read_osm(extract)
+    _, streets = osm_network.build_network(read, extract, osm_network.netconvert_flags(read, lefthand=False, walk=True))
     for junction in streets.junctions:
-        roi = junctions.region_round(junction)
+        roi = junctions.region_around(junction)
         near = streets.near(roi.area.buffer(60.0, join_style="mitre"))
         assert len(near.areas) < len(streets.areas)
-        assert junctions.kerb_places(near, junction, roi, []) == junctions.kerb_places(streets, junction, roi, [])
+        assert junctions.kerbside_poles(near, junction, roi, []) == junctions.kerbside_poles(streets, junction, roi, [])
 
 
 def test_a_part_of_a_network_has_its_streets_as_they_are(extract: Path, tmp_path: Path) -> None:
-    read = osm_reader.read(extract)
-    text, streets = street_network.network(read, extract, street_network.flags(read, lefthand=False, walk=True))
-    pieces, whole = street_network.Pieces(text), streets.network
+    read = osm.read_osm(extract)
+    text, streets = osm_network.build_network(
+        read, extract, osm_network.netconvert_flags(read, lefthand=False, walk=True)
+    )
+    pieces, whole = osm_network.NetworkExcerpts(text), streets.network
     (tmp_path / "whole.net.xml").write_text(text)
     for junction in (junction for junction in streets.junctions if junction.arms >= 3):
-        window = junctions.region_round(junction).area.buffer(80.0, join_style="mitre")
+        window = junctions.region_around(junction).area.buffer(80.0, join_style="mitre")
         path = tmp_path / "part.net.xml"
         path.write_text(pieces.near(streets.near(window)))
-        part = network.read(path)
+        part = network.read_net_xml(path)
         assert part.location == whole.location
         ours, all_edges = {e.id: e for e in part.all_edges}, {e.id: e for e in whole.all_edges}
         assert len(ours) < len(all_edges)
@@ -158,15 +159,15 @@ def test_a_part_of_a_network_has_its_streets_as_they_are(extract: Path, tmp_path
         assert mine == {c for c in every if c[0] in ours and c[1] in ours}
 
 
-def test_the_same_map_gives_the_same_bytes(made: new.NewCity, extract: Path, tmp_path: Path) -> None:
-    again = new.new(tmp_path / "town", extract)
+def test_the_same_map_gives_the_same_bytes(made: creation.NewCity, extract: Path, tmp_path: Path) -> None:
+    again = creation.create_city(tmp_path / "town", extract)
     assert contents(again.folder) == contents(made.folder)
 
 
 def test_a_junction_without_a_free_place_is_left_out_and_told(extract: Path, tmp_path: Path) -> None:
-    city = new.new(tmp_path / "town", extract, which="all")
+    city = creation.create_city(tmp_path / "town", extract, which="all")
     assert [its.junction.names[0] for its in city.junctions] == ["A Road", "B Road"]
-    assert len(city.left_out[new.NO_PLACE]) == 1
+    assert len(city.left_out[creation.NO_FREE_KERB]) == 1
 
 
 @pytest.mark.slow
@@ -174,17 +175,17 @@ def test_a_table_names_the_junctions(extract: Path, tmp_path: Path) -> None:
     table = tmp_path / "wanted.csv"
     (lat, lon), (b_lat, b_lon) = degrees(-195, 5), degrees(0, 0)
     table.write_text(f"junction,lat_deg,lon_deg\nbridge,{b_lat},{b_lon}\ntower,{lat},{lon}\n")
-    city = new.new(tmp_path / "town", extract, which=str(table))
-    read = model.load(city.folder)
+    city = creation.create_city(tmp_path / "town", extract, which=str(table))
+    read = model.load_city(city.folder)
     assert [(j.id, j.title) for j in read.junctions] == [
         ("bridge", "signalised junction of B Road and Main"), ("tower", "signalised junction of A Road and Main"),
     ]  # fmt: skip
-    again = new.new(tmp_path / "again", extract, which=str(city.folder / "junctions.csv"))
-    assert model.load(again.folder).junctions == read.junctions
+    again = creation.create_city(tmp_path / "again", extract, which=str(city.folder / "junctions.csv"))
+    assert model.load_city(again.folder).junctions == read.junctions
 
 
 def test_a_circle_bounds_streets_and_junctions(extract: Path, tmp_path: Path) -> None:
-    city = new.new(tmp_path / "town", extract, around=degrees(-200, 0), radius_m=250.0)
+    city = creation.create_city(tmp_path / "town", extract, around=degrees(-200, 0), radius_m=250.0)
     assert [its.junction.names[0] for its in city.junctions] == ["A Road"]
     assert len(city.left_out["too near to the rim"]) == 1
     assert city.streets.lane_length_m < 2 * (500 + 300 + 300) + 50
@@ -205,33 +206,33 @@ def test_a_wrong_row_of_a_table_is_named(extract: Path, tmp_path: Path, rows: st
     table = tmp_path / "wanted.csv"
     table.write_text(f"junction,lat_deg,lon_deg\n{rows}\n")
     with pytest.raises(InputError) as caught:
-        new.new(tmp_path / "town", extract, which=str(table))
+        creation.create_city(tmp_path / "town", extract, which=str(table))
     assert told in str(caught.value)
     assert not (tmp_path / "town").exists()
 
 
 @pytest.mark.slow
-def test_wrong_input_is_one_message_and_leaves_nothing(extract: Path, tmp_path: Path, egvs) -> None:
+def test_wrong_input_is_one_message_and_leaves_nothing(extract: Path, tmp_path: Path, run_egvs) -> None:
     out = tmp_path / "town"
     for options, told in (
         (["--radius", "2km"], "--radius: 2000 m round no place; --around LAT,LON as well"),
-        (["--around", "50.0,10.0", "--radius", "2 miles"], "--radius: '2 miles'; a length above 0, for example 1500m"),
-        (["--around", "51.0,10.0"], "--around: 51,10 lies outside the extract; latitude"),
-        (["--around", "here"], "--around: 'here'; LAT,LON in degrees"),
+        (["--around", "50.0,10.0", "--radius", "2 miles"], "--radius: expected a length above 0, got '2 miles'"),
+        (["--around", "51.0,10.0"], "--around: 51,10 is outside the extract"),
+        (["--around", "here"], "--around: expected LAT,LON in degrees, got 'here'"),
         (["--junctions", "signalized"], "signalized: no such file; a table with the columns junction, lat_deg"),
         (["--around", "50.0,10.0", "--radius", "90"], "too near to the rim"),
     ):
-        code, _, said = egvs("city", "new", out, "--osm", extract, *options)
+        code, _, said = run_egvs("city", "new", out, "--osm", extract, *options)
         assert code == 2 and told in said, (options, said)
         assert not out.exists()
     out.mkdir()
     (out / "mine").touch()
-    code, _, said = egvs("city", "new", out, "--osm", extract)
-    assert code == 2 and "is not empty" in said
+    code, _, said = run_egvs("city", "new", out, "--osm", extract)
+    assert code == 2 and "not empty" in said
 
 
-def test_from_a_map_to_a_junctions_scores(extract: Path, tmp_path: Path, egvs) -> None:
-    code, printed, said = egvs("city", "new", tmp_path / "town", "--osm", extract, "--walk")
+def test_from_a_map_to_a_junctions_scores(extract: Path, tmp_path: Path, run_egvs) -> None:
+    code, printed, said = run_egvs("city", "new", tmp_path / "town", "--osm", extract, "--walk")
     assert code == 0, said
     assert "j02" in printed and "next: egvs city traffic" in printed
     file = tmp_path / "town" / "city.toml"
@@ -244,28 +245,28 @@ def test_from_a_map_to_a_junctions_scores(extract: Path, tmp_path: Path, egvs) -
         assert old in text
         text = text.replace(old, now)
     file.write_text(text + "\n[effects.pedestrians_bicycles]\npedestrians_per_h = 2000\n")
-    code, printed, said = egvs("city", "traffic", tmp_path / "town")
+    code, printed, said = run_egvs("city", "traffic", tmp_path / "town")
     assert code == 0, said
     assert "frames: 40" in printed
     before = contents(tmp_path / "town" / "traffic")
     assert {"j01.parquet", "j02.parquet", "traffic.json", "sumo/run.sumocfg"} <= before.keys()
-    code, printed, _ = egvs("city", "traffic", tmp_path / "town")
+    code, printed, _ = run_egvs("city", "traffic", tmp_path / "town")
     assert code == 0 and "nothing to do" in printed
     assert contents(tmp_path / "town" / "traffic") == before
     folder = tmp_path / "town" / "junctions" / "j01"
-    code, _, said = egvs("check", folder)
+    code, _, said = run_egvs("check", folder)
     assert code == 0, said
-    summary = run_stage(traffic, pipeline.load(folder), tmp_path / "run")
+    summary = run_stage(traffic, egvs.load(folder), tmp_path / "run")
     assert summary["frames"] == 40
-    boxes = pipeline.read_trajectories(tmp_path / "run" / "trajectories.parquet")
+    boxes = egvs.read_trajectories(tmp_path / "run" / "trajectories.parquet")
     assert {"pedestrian", "passenger"} <= set(boxes["kind"].to_pylist())
     overrides = ["sites.heights_m=[4.5]", "sites.pitch_deg=['aim']", "sites.sensor='VLP-16'", "roi.voxel_m=1"]
-    pipeline.run(pipeline.load(folder, overrides), tmp_path / "run", jobs=1)
-    spots, _ = tables.read(tmp_path / "run" / "blindspots.parquet", "blindspots")
+    egvs.run(egvs.load(folder, overrides), tmp_path / "run", jobs=1)
+    spots, _ = parquet.read_artefact(tmp_path / "run" / "blindspots.parquet", "blindspots")
     assert "lane" in spots["by"].to_pylist()
     assert "A Road" in (tmp_path / "run" / "report.html").read_text()
-    city = model.load(tmp_path / "town")
-    (tmp_path / "town" / "traffic" / city_traffic.SEAL).unlink()
-    assert city_traffic.make(city).anew  # SUMO runs again: the same bytes
+    city = model.load_city(tmp_path / "town")
+    (tmp_path / "town" / "traffic" / traffic_split.SEAL_FILE).unlink()
+    assert traffic_split.make_city_traffic(city).is_new  # SUMO runs again: the same bytes
     again = contents(tmp_path / "town" / "traffic")
     assert all(again[name] == before[name] for name in before if name.endswith(".parquet"))

@@ -22,7 +22,7 @@ except BaseException:
 
 VERB = """
 import sys
-from pipeline.cli import app
+from egvs.cli import app
 
 @app.app.command()
 def odd():

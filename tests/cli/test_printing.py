@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import pytest
 
-from pipeline.cli.tables import print_effects
-from pipeline.cli.terminal import console, table
-from pipeline.studies.effect_overview import Call
+from egvs.cli.console import Column, console, make_table
+from egvs.cli.run_tables import print_effects
+from egvs.studies.effect_study import EffectStatus
 
 
 def test_brackets_and_colons_are_no_styles(capsys: pytest.CaptureFixture[str]) -> None:
     why = "rated_range_m under [sensors.small], or under [effects.range_limit]"
-    print_effects([Call("range_limit", "score", "detect", "off", why, "")])
+    print_effects([EffectStatus("range_limit", "score", "detect", "off", why, "")])
     words = " ".join(capsys.readouterr().out.split())
     assert "[sensors.small]" in words
     assert "[effects.range_limit]" in words
-    rows = table(["[bold]"], left=())
-    rows.add_row("pole:car:[red]")
-    console(100).print(rows)
+    console(100).print(make_table([Column("[bold]", str)], ["pole:car:[red]"]))
     assert capsys.readouterr().out.split() == ["[bold]", "pole:car:[red]"]
 
 
@@ -26,9 +24,9 @@ def test_a_bar_takes_no_name_for_markup() -> None:
 
     from rich.console import Console
 
-    from pipeline.cli.progress import Screen
+    from egvs.cli.console import ProgressDisplay
 
-    screen, shown = Screen("scan"), StringIO()
+    screen, shown = ProgressDisplay("scan"), StringIO()
     screen._has_bar = True  # as on a terminal
     screen.progress("sensor [/x] [red]S1 :car:", 1, 2)
     Console(file=shown, width=100).print(screen._bar.get_renderable())

@@ -8,18 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import pipeline
-from pipeline.formats.point_clouds import read_points
+import egvs
+from egvs.formats.point_clouds import read_points
 
 Call = Callable[..., tuple[int, str, str]]
 POSITION_M = {"pole_a": (10, 12, 3), "pole_b": (30.5, -12, 3)}
 
 
 @pytest.fixture
-def out(mini: Path, egvs: Call, tmp_path: Path) -> Path:
+def out(mini: Path, run_egvs: Call, tmp_path: Path) -> Path:
     """A folder with the static world only."""
     folder = tmp_path / "out"
-    assert egvs("statics", mini, "--out", folder)[0] == 0
+    assert run_egvs("statics", mini, "--out", folder)[0] == 0
     return folder
 
 
@@ -28,19 +28,19 @@ def clouds(out: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("format_", ["ply", "pcd"])
-def test_the_cloud_is_what_the_scan_returned(mini: Path, egvs: Call, out: Path, format_: str) -> None:
-    assert egvs("scan", mini, "--out", out, "--points", "pole_b", "--cloud", format_)[0] == 0
+def test_the_cloud_is_what_the_scan_returned(mini: Path, run_egvs: Call, out: Path, format_: str) -> None:
+    assert run_egvs("scan", mini, "--out", out, "--points", "pole_b", "--cloud", format_)[0] == 0
     assert list(clouds(out)) == [f"scan_pole_b.{format_}"]
     points_m, dropped = read_points(out / f"scan_pole_b.{format_}", "here")
-    rows = [row for row in pipeline.read_scans(out / "scans.parquet").to_pylist() if row["site"] == "pole_b"]
+    rows = [row for row in egvs.read_scans(out / "scans.parquet").to_pylist() if row["site"] == "pole_b"]
     returns = np.array([[row["dx_m"], row["dy_m"], row["dz_m"]] for row in rows if row["returned"]])
     assert dropped == 0
     assert 100 < len(returns) < len(rows)
     assert np.array_equal(points_m, returns + POSITION_M["pole_b"])
 
 
-def test_ply_is_the_default_and_sites_may_be_several(mini: Path, egvs: Call, out: Path) -> None:
-    assert egvs("scan", mini, "--out", out, "--points", "pole_b", "--points", "pole_a")[0] == 0
+def test_ply_is_the_default_and_sites_may_be_several(mini: Path, run_egvs: Call, out: Path) -> None:
+    assert run_egvs("scan", mini, "--out", out, "--points", "pole_b", "--points", "pole_a")[0] == 0
     assert list(clouds(out)) == ["scan_pole_a.ply", "scan_pole_b.ply"]
     for site, position in POSITION_M.items():
         points, _ = read_points(out / f"scan_{site}.ply", "here")
@@ -48,33 +48,33 @@ def test_ply_is_the_default_and_sites_may_be_several(mini: Path, egvs: Call, out
 
 
 @pytest.mark.parametrize("format_", ["ply", "pcd"])
-def test_scans_that_are_not_kept_have_the_same_clouds(mini: Path, egvs: Call, out: Path, format_: str) -> None:
+def test_scans_that_are_not_kept_have_the_same_clouds(mini: Path, run_egvs: Call, out: Path, format_: str) -> None:
     arguments = ("scan", mini, "--out", out, "--points", "pole_a", "--cloud", format_)
-    assert egvs(*arguments)[0] == 0
+    assert run_egvs(*arguments)[0] == 0
     kept = clouds(out)
     assert (out / "scans.parquet").exists()
-    assert egvs(*arguments, "--set", "scan.keep=false")[0] == 0
+    assert run_egvs(*arguments, "--set", "scan.keep=false")[0] == 0
     assert not (out / "scans.parquet").exists()
     assert clouds(out) == kept
 
 
-def test_a_cloud_that_was_written_can_be_the_measured_scan(mini: Path, egvs: Call, out: Path) -> None:
+def test_a_cloud_that_was_written_can_be_the_measured_scan(mini: Path, run_egvs: Call, out: Path) -> None:
     """What is read back from the cloud ends where the cast beams ended."""
-    assert egvs("scan", mini, "--out", out, "--points", "pole_a", "--cloud", "pcd")[0] == 0
-    cast = [row for row in pipeline.read_scans(out / "scans.parquet").to_pylist() if row["site"] == "pole_a"]
+    assert run_egvs("scan", mini, "--out", out, "--points", "pole_a", "--cloud", "pcd")[0] == 0
+    cast = [row for row in egvs.read_scans(out / "scans.parquet").to_pylist() if row["site"] == "pole_a"]
     (mini / "measured.pcd").write_bytes((out / "scan_pole_a.pcd").read_bytes())
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m,points\npole_a,10,12,3,measured.pcd\n")
-    assert egvs("scan", mini, "--out", out)[0] == 0
+    assert run_egvs("scan", mini, "--out", out)[0] == 0
     ends = [[[row[f"d{axis}_m"] for axis in "xyz"] for row in rows if row["returned"]]
-            for rows in (cast, pipeline.read_scans(out / "scans.parquet").to_pylist())]  # fmt: skip
+            for rows in (cast, egvs.read_scans(out / "scans.parquet").to_pylist())]  # fmt: skip
     assert np.array(ends[1]) == pytest.approx(np.array(ends[0]), abs=1e-12)
 
 
-def test_other_formats_and_other_sites_are_refused_by_name(mini: Path, egvs: Call, out: Path) -> None:
-    code, _, err = egvs("scan", mini, "--out", out, "--points", "pole_a", "--cloud", "las")
+def test_other_formats_and_other_sites_are_refused_by_name(mini: Path, run_egvs: Call, out: Path) -> None:
+    code, _, err = run_egvs("scan", mini, "--out", out, "--points", "pole_a", "--cloud", "las")
     assert code == 2
     assert "--cloud" in err and "'las'" in err and "ply or pcd" in err
-    code, _, err = egvs("scan", mini, "--out", out, "--points", "pole_c")
+    code, _, err = run_egvs("scan", mini, "--out", out, "--points", "pole_c")
     assert code == 2
     assert "--points pole_c" in err and "pole_a, pole_b" in err
     assert clouds(out) == {}

@@ -7,49 +7,49 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.core import files
-from pipeline.core.errors import InputError
+from egvs.core import files
+from egvs.core.errors import InputError
 
 
 def test_room_is_made_and_nothing_else(tmp_path: Path) -> None:
-    files.make_room(tmp_path / "a" / "b" / "model.onnx")
+    files.ensure_writable_folder(tmp_path / "a" / "b" / "model.onnx")
     assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == ["a", "a/b"]
     (tmp_path / "mine").write_text("kept")
-    files.make_room(tmp_path / "mine")
+    files.ensure_writable_folder(tmp_path / "mine")
     assert (tmp_path / "mine").read_text() == "kept"
 
 
 def test_room_is_seen_and_nothing_made(tmp_path: Path) -> None:
-    files.see_room(tmp_path / "a" / "b" / "map.gpkg")
+    files.check_writable(tmp_path / "a" / "b" / "map.gpkg")
     assert not list(tmp_path.iterdir())
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match=r"file/b/m\.gpkg: cannot be written \(.+\); a file in a folder of yours"):
-        files.see_room(tmp_path / "file" / "b" / "m.gpkg")
-    with pytest.raises(InputError, match=r"is a folder; a file"):
-        files.see_room(tmp_path)
+    with pytest.raises(InputError, match=r"file/b/m\.gpkg: cannot be written \(.+\)\. Choose a folder"):
+        files.check_writable(tmp_path / "file" / "b" / "m.gpkg")
+    with pytest.raises(InputError, match=r"expected a file, got a folder"):
+        files.check_writable(tmp_path)
 
 
 def test_where_there_is_no_room_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match=r"file/m\.onnx: cannot be written \(.+\); a file in a folder of yours"):
-        files.make_room(tmp_path / "file" / "m.onnx")
+    with pytest.raises(InputError, match=r"file/m\.onnx: cannot be written \(.+\)\. Choose a folder"):
+        files.ensure_writable_folder(tmp_path / "file" / "m.onnx")
     (tmp_path / "folder").mkdir()
-    with pytest.raises(InputError, match=r"folder: is a folder; a file"):
-        files.make_room(tmp_path / "folder")
+    with pytest.raises(InputError, match=r"folder: expected a file, got a folder"):
+        files.ensure_writable_folder(tmp_path / "folder")
 
     def refused(**_: object) -> None:
         raise PermissionError(errno.EACCES, "Permission denied")
 
     monkeypatch.setattr(files.tempfile, "TemporaryFile", refused)  # whoever runs this may write everywhere
     with pytest.raises(InputError, match=r"m\.onnx: cannot be written \(Permission denied\)"):
-        files.make_room(tmp_path / "m.onnx")
+        files.ensure_writable_folder(tmp_path / "m.onnx")
 
 
 def test_a_full_disk_is_told_with_the_file_that_is_written(tmp_path: Path) -> None:
-    with pytest.raises(OSError, match="left on device") as caught, files.aside(tmp_path / "a"):
+    with pytest.raises(OSError, match="left on device") as caught, files.atomic_write(tmp_path / "a"):
         raise OSError(errno.ENOSPC, "No space left on device")
     assert caught.value.filename == str(tmp_path / "a")
-    with pytest.raises(OSError, match="other") as caught, files.aside(tmp_path / "a"):
+    with pytest.raises(OSError, match="other") as caught, files.atomic_write(tmp_path / "a"):
         raise OSError(errno.EIO, "another error")  # may be of what is read
     assert caught.value.filename is None
     assert not list(tmp_path.iterdir())
@@ -62,8 +62,8 @@ def test_folders_for_work_of_killed_programs_are_removed(tmp_path: Path, monkeyp
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     killed = """
 import os, signal
-from pipeline.core import files
-with files.scratch() as folder:
+from egvs.core import files
+with files.temporary_folder() as folder:
     (folder / "sub").mkdir()
     os.kill(os.getpid(), signal.SIGKILL)
 """
@@ -72,14 +72,14 @@ with files.scratch() as folder:
     (tmp_path / "egvs-work-link").symlink_to(tmp_path / "elsewhere")
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    files._clear.cache_clear()
-    with files.scratch() as mine:
+    files._remove_stale_folders.cache_clear()
+    with files.temporary_folder() as mine:
         assert mine.is_dir() and not left.exists()
-        files._clear.cache_clear()
-        with files.scratch() as other:
+        files._remove_stale_folders.cache_clear()
+        with files.temporary_folder() as other:
             assert mine.is_dir() and other.is_dir(), "one that is held stays"
     assert {path.name for path in tmp_path.iterdir()} == {"egvs-work-link", "elsewhere"}
-    files._clear.cache_clear()
+    files._remove_stale_folders.cache_clear()
 
 
 def test_where_nothing_can_be_locked_there_are_folders_for_work_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,6 +87,6 @@ def test_where_nothing_can_be_locked_there_are_folders_for_work_all_the_same(mon
         raise OSError(errno.ENOLCK, "No locks available")
 
     monkeypatch.setattr(files.fcntl, "flock", unknown)
-    with files.scratch() as folder:
+    with files.temporary_folder() as folder:
         assert folder.is_dir()
     assert not folder.exists()

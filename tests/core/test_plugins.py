@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.core import plugins
-from pipeline.core.errors import InputError, MissingBackendError, MissingExtraError
+from egvs.core import plugins
+from egvs.core.errors import InputError, MissingBackendError, MissingExtraError
 
 GROUP = "egvs.test_group"
 
@@ -38,31 +38,31 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def forget() -> None:
-    plugins.load.cache_clear()
-    plugins._declared.cache_clear()
+    plugins.load_plugin.cache_clear()
+    plugins._entry_points_by_name.cache_clear()
 
 
 def test_names_are_sorted_and_nothing_is_imported(site: Path) -> None:
     install(site, "two", "b = plug_b:PART\na = plug_a", {"plug_a": "raise RuntimeError", "plug_b": "PART = [7]"})
-    assert plugins.names(GROUP) == ["a", "b"]
+    assert plugins.plugin_names(GROUP) == ["a", "b"]
     assert "plug_a" not in sys.modules and "plug_b" not in sys.modules
-    assert plugins.load(GROUP, "b") == [7]
-    assert plugins.load(GROUP, "b") is plugins.load(GROUP, "b")
+    assert plugins.load_plugin(GROUP, "b") == [7]
+    assert plugins.load_plugin(GROUP, "b") is plugins.load_plugin(GROUP, "b")
 
 
 def test_of_two_packages_this_programs_own_comes_first_then_the_first_by_name(site: Path) -> None:
     install(site, "zebra", "a = plug_z:PART\nb = plug_z:PART", {"plug_z": "PART = 'zebra'"})
     install(site, "antelope", "a = plug_c:PART\nb = plug_c:PART", {"plug_c": "PART = 'antelope'"})
     install(site, "egvs", "a = plug_e:PART", {"plug_e": "PART = 'own'"})
-    assert (plugins.load(GROUP, "a"), plugins.load(GROUP, "b")) == ("own", "antelope")
+    assert (plugins.load_plugin(GROUP, "a"), plugins.load_plugin(GROUP, "b")) == ("own", "antelope")
 
 
 def test_an_unknown_name_is_said_with_those_that_are_known(site: Path) -> None:
     install(site, "one", "a = plug_a", {})
-    with pytest.raises(InputError, match=r"^egvs\.test_group: knows no 'c'; one of a$"):
-        plugins.load(GROUP, "c")
-    with pytest.raises(InputError, match="one of none"):
-        plugins.load("egvs.nobody", "c")
+    with pytest.raises(InputError, match=r"^egvs\.test_group: knows no 'c'\. Choose one of a\.$"):
+        plugins.load_plugin(GROUP, "c")
+    with pytest.raises(InputError, match="Choose one of none"):
+        plugins.load_plugin("egvs.nobody", "c")
 
 
 @pytest.mark.parametrize(
@@ -81,44 +81,44 @@ def test_one_that_cannot_be_loaded_names_its_package(site: Path, entry: str, sou
     install(site, "somebody-elses", f"a = {entry}", {"plug_a": source})
     place = rf"\(entry point '{entry}' of the package somebody-elses\)"
     with pytest.raises(MissingBackendError, match=rf"^'a' of egvs\.test_group cannot be loaded: {problem}.*{place}"):
-        plugins.load(GROUP, "a")
+        plugins.load_plugin(GROUP, "a")
 
 
 def test_an_interrupt_while_loading_is_no_fault_of_the_plug_in(site: Path) -> None:
     install(site, "somebody-elses", "a = plug_a", {"plug_a": "raise KeyboardInterrupt"})
     with pytest.raises(KeyboardInterrupt):
-        plugins.load(GROUP, "a")
+        plugins.load_plugin(GROUP, "a")
 
 
 @pytest.mark.parametrize(
     ("group", "entry", "lacks"),
     [
-        ("egvs.effects", "collections:OrderedDict", "NAME, SOURCE, STAGE, KIND, Model.of; right is a subclass"),
-        ("egvs.effects", "plug_a:TABLE", "NAME, SOURCE, STAGE, KIND, Model.of; right is a subclass"),
-        ("egvs.effects", "plug_a", "NAME, SOURCE, STAGE, KIND, Model.of; right is a subclass"),
-        ("egvs.effects", "pipeline.effects.base:Detect", "NAME, SOURCE, Model.of; right is a subclass"),
-        ("egvs.point_clouds", "plug_a", "read; right is a module or an object with a function read"),
+        ("egvs.effects", "collections:OrderedDict", "NAME, SOURCE, STAGE, KIND, Model.of; expected a subclass"),
+        ("egvs.effects", "plug_a:TABLE", "NAME, SOURCE, STAGE, KIND, Model.of; expected a subclass"),
+        ("egvs.effects", "plug_a", "NAME, SOURCE, STAGE, KIND, Model.of; expected a subclass"),
+        ("egvs.effects", "egvs.effects.base:Detect", "NAME, SOURCE, Model.of; expected a subclass"),
+        ("egvs.point_clouds", "plug_a", "read; expected a module or an object with a function read"),
     ],
 )
 def test_an_object_of_another_kind_is_refused(site: Path, group: str, entry: str, lacks: str) -> None:
     install(site, "somebody-elses", f"zz = {entry}", {"plug_a": "TABLE = {}"}, group)
     message = rf"cannot be loaded: it has no {lacks}.* \(entry point '{entry}' of the package somebody-elses\)"
     with pytest.raises(MissingBackendError, match=message):
-        plugins.load(group, "zz")
+        plugins.load_plugin(group, "zz")
 
 
 def test_a_value_that_names_no_module_is_refused(site: Path) -> None:
     install(site, "somebody-elses", "a = !!no module", {})
     with pytest.raises(MissingBackendError, match=r"names no module.*'!!no module' of the package somebody-elses"):
-        plugins.module_of(GROUP, "a")
+        plugins.plugin_module(GROUP, "a")
 
 
 def test_packages_without_a_name_are_sorted_too(site: Path) -> None:
     for package in ("one", "two"):
         install(site, package, f"{package} = plug_{package}", {})
     (site / "two-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\n", encoding="utf-8")
-    assert plugins.names(GROUP) == ["one", "two"]
-    assert (plugins.package_of(GROUP, "one"), plugins.package_of(GROUP, "two")) == ("one", "?")
+    assert plugins.plugin_names(GROUP) == ["one", "two"]
+    assert (plugins.plugin_package(GROUP, "one"), plugins.plugin_package(GROUP, "two")) == ("one", "?")
 
 
 @pytest.mark.parametrize(
@@ -134,11 +134,11 @@ def test_what_needs_an_extra_is_refused_by_what_to_install(
     for name in there:
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(MissingExtraError, match=message) as refused:
-        plugins.require("it", "some", "json", *there)
+        plugins.require_libraries("it", "some", "json", *there)
     assert refused.value.exit_code == 2
 
 
 def test_what_is_installed_is_not_imported_to_see_that(site: Path) -> None:
     (site / "plug_there.py").write_text("raise SystemExit", encoding="utf-8")
-    plugins.require("it", "some", "plug_there")
+    plugins.require_libraries("it", "some", "plug_there")
     assert "plug_there" not in sys.modules

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-import pipeline
+import egvs
 from tests import processes
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "extending.md"
@@ -47,14 +47,14 @@ def wide(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
 
 
-def egvs(*arguments: object, beside: Path) -> tuple[int, str]:
+def run_egvs(*arguments: object, beside: Path) -> tuple[int, str]:
     """The command line in a process of its own that sees the folder ``beside``: exit code, and all that it prints."""
-    done = processes.egvs(*arguments, beside=beside)
+    done = processes.run_egvs(*arguments, beside=beside)
     return done.returncode, done.stdout + done.stderr
 
 
 def scores(folder: Path) -> list[float]:
-    return list(pipeline.read_scores(folder / "scores.parquet").column("egvs").to_pylist())
+    return list(egvs.read_scores(folder / "scores.parquet").column("egvs").to_pylist())
 
 
 @pytest.mark.parametrize("heading", ["An effect", "A format of point clouds", "A score"])
@@ -70,7 +70,7 @@ def test_an_effect_of_another_package_acts(mini: Path, tmp_path: Path) -> None:
     beside = install(package("An effect"), tmp_path / "installed")
 
     def run(out: str, *settings: str) -> list[float]:
-        code, text = egvs("run", mini, "--out", tmp_path / out, *settings, beside=beside)
+        code, text = run_egvs("run", mini, "--out", tmp_path / out, *settings, beside=beside)
         assert code == 0, text
         return scores(tmp_path / out)
 
@@ -83,11 +83,13 @@ def test_an_effect_of_another_package_acts(mini: Path, tmp_path: Path) -> None:
 @pytest.mark.system
 def test_an_effect_of_another_package_is_listed_and_checked(mini: Path, tmp_path: Path) -> None:
     beside = install(package("An effect"), tmp_path / "installed")
-    code, text = egvs("effects", beside=beside)
+    code, text = run_egvs("effects", beside=beside)
     assert code == 0 and "blind_zone" in text and "the sensor's datasheet" in text
-    code, text = egvs("run", mini, "--out", tmp_path / "out", "--set", "effects.blind_zone.nearest=1", beside=beside)
+    code, text = run_egvs(
+        "run", mini, "--out", tmp_path / "out", "--set", "effects.blind_zone.nearest=1", beside=beside
+    )
     assert code == 2 and "effects.blind_zone" in text and "nearest_m" in text, text
-    code, text = egvs(
+    code, text = run_egvs(
         "run", mini, "--out", tmp_path / "out", "--set", "effects.blind_zone.nearest_m=1", beside=tmp_path
     )
     assert code == 2 and "unknown effect" in text, text
@@ -103,14 +105,14 @@ def test_a_format_of_another_package_is_read(mini: Path, tmp_path: Path) -> None
 
     def run(cloud: str) -> list[float]:
         (mini / "sites.csv").write_text(f"site,x_m,y_m,z_m,points\npole_a,10,12,3,{cloud}\n")
-        code, text = egvs("run", mini, "--out", tmp_path / cloud, beside=beside)
+        code, text = run_egvs("run", mini, "--out", tmp_path / cloud, beside=beside)
         assert code == 0, text
         return scores(tmp_path / cloud)
 
     assert run("scan.xyz") == run("scan.csv")
     (mini / "scan.xyz").write_text("1 2\n")
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m,points\npole_a,10,12,3,scan.xyz\n")
-    code, text = egvs("run", mini, "--out", tmp_path / "wrong", beside=beside)
+    code, text = run_egvs("run", mini, "--out", tmp_path / "wrong", beside=beside)
     assert code == 2 and "has 2 numbers a line; three: x, y and z" in text, text
 
 
@@ -119,7 +121,7 @@ def test_a_format_of_another_package_is_written(tmp_path: Path) -> None:
     beside = install(package("A format of point clouds"), tmp_path / "installed")
     code = """
 import sys, numpy as np, pathlib
-from pipeline.formats.point_clouds import read_points, write_points
+from egvs.formats.point_clouds import read_points, write_points
 points = np.array([[1 / 3, -2e5, 1e-17], [0.1, 2.0, 3.0]])
 path = pathlib.Path(sys.argv[1])
 write_points(path, points)
@@ -134,7 +136,7 @@ assert dropped == 0 and read.tobytes() == points.tobytes()
 @pytest.mark.system
 def test_a_score_of_another_package_is_listed(tmp_path: Path) -> None:
     beside = install(package("A score"), tmp_path / "installed")
-    code, text = egvs("scores", beside=beside)
+    code, text = run_egvs("scores", beside=beside)
     assert code == 0 and "near_points" in text and "within_m 20, 50" in text and "package egvs-near-points" in text, (
         text
     )
@@ -145,15 +147,15 @@ def test_a_detector_of_another_package_detects(tmp_path: Path) -> None:
     beside = install(package("A detector"), tmp_path / "installed")
     code = """
 import numpy as np
-from pipeline.core.grid import Roi
-from pipeline.sensing.sensors import CATALOGUE
-from pipeline.sensing.sites import Pose
-from pipeline.validation.detectors import registry
-from pipeline.validation.sweeps import SiteView, Sweep
-assert "middle" in registry.names(), registry.names()
+from egvs.core.grid import Roi
+from egvs.sensors.sensor import CATALOGUE
+from egvs.sensors.sites import Pose
+from egvs.validation.detectors import base
+from egvs.validation.sweeps import SiteView, Sweep
+assert "middle" in base.detector_names(), base.detector_names()
 sensor = CATALOGUE["VLP-32C"]
 view = SiteView("s", Pose(1.0, 2.0, 3.0), sensor, np.full(sensor.beams, 50.0))
-ready = registry.make("middle").at(view, Roi((0.0, 0.0, 0.0), (9.0, 9.0, 9.0)))
+ready = base.make_detector("middle").at(view, Roi((0.0, 0.0, 0.0), (9.0, 9.0, 9.0)))
 beam = np.arange(3, dtype=np.uint32)
 far = np.array([10.0, 10.0, 50.0])  # the last is background
 points = np.column_stack([sensor.directions()[beam] * far[:, None], np.ones(3)]).astype(np.float32)

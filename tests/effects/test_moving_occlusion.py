@@ -13,22 +13,22 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
+from benchmarks import occlusion as benchmark
 from scipy.spatial.transform import Rotation
 from scipy.special import cosdg, sindg
 
-import pipeline
-from benchmarks import occlusion as benchmark
-from pipeline.artefacts import tables
-from pipeline.core import files
-from pipeline.core.errors import InputError
-from pipeline.core.grid import Grid, Roi
-from pipeline.effects.score import moving_occlusion as effect
-from pipeline.effects.score.rain import Rain
-from pipeline.scenario.effects import MovingOcclusionParameters, RainParameters
-from pipeline.scoring.visibility import UNIT, Beams, Visibility
-from pipeline.sensing import crossings
-from pipeline.sensing.sites import Pose
-from pipeline.stages import score
+import egvs
+from egvs.artefacts import parquet
+from egvs.core import files
+from egvs.core.errors import InputError
+from egvs.core.grid import Grid, Roi
+from egvs.effects import moving_occlusion
+from egvs.effects.rain import Rain
+from egvs.scenario.effects_config import MovingOcclusionParameters, RainParameters
+from egvs.scoring.visibility import UNIT, Beams, HitCounter
+from egvs.sensors import voxel_crossings
+from egvs.sensors.sites import Pose
+from egvs.stages import score
 from tests.stages import inputs_of, run_stage
 
 ON = "effects.moving_occlusion.method=frames"
@@ -101,23 +101,23 @@ def twin_blocked(
 # Small scenes
 
 
-def occlusion(out: Path, **parameters: Any) -> effect.MovingOcclusion:
+def occlusion(out: Path, **parameters: Any) -> moving_occlusion.MovingOcclusion:
     """The effect, prepared from a finished run."""
-    tpog = pipeline.read_tpog(out / "tpog.parquet")
-    made = effect.MovingOcclusion(MovingOcclusionParameters.of(parameters))
+    tpog = egvs.read_tpog(out / "tpog.parquet")
+    made = moving_occlusion.MovingOcclusion(MovingOcclusionParameters.of(parameters))
     return made.prepare(None, tpog, out / "trajectories.parquet")  # type: ignore[arg-type]
 
 
 class Replayed:
     """A replay, asked about crossings of any sensor."""
 
-    def __init__(self, boxes: effect.Replay) -> None:
+    def __init__(self, boxes: moving_occlusion.Replay) -> None:
         self.boxes = boxes
 
-    def share(self, found: crossings.Crossings) -> np.ndarray:
-        return self.boxes.seen_from(found.sensor_m, found.grid).share(found)
+    def share(self, found: voxel_crossings.Crossings) -> np.ndarray:
+        return self.boxes.facing(found.sensor_m, found.grid).share(found)
 
-    def blocked(self, found: crossings.Crossings) -> np.ndarray:
+    def blocked(self, found: voxel_crossings.Crossings) -> np.ndarray:
         return np.rint((1 - self.share(found)) * self.boxes.frames).astype(np.int64)
 
 
@@ -126,12 +126,12 @@ def replay(frames: dict[int, list[list[float]]], count: int, grid: Grid = GRID) 
     frame = np.array([f for f, boxes in frames.items() for _ in boxes], dtype=np.int64)
     values = np.array([box for boxes in frames.values() for box in boxes], dtype=np.float64).reshape(-1, 8)
     values[:, :3] -= grid.origin_m
-    return Replayed(effect.Replay.of(count, frame, values))
+    return Replayed(moving_occlusion.Replay.from_boxes(count, frame, values))
 
 
-def listed(where: tuple[float, float, float], ends: Any, grid: Grid = GRID) -> crossings.Crossings:
+def listed(where: tuple[float, float, float], ends: Any, grid: Grid = GRID) -> voxel_crossings.Crossings:
     """The crossings of fewer beams than one chunk holds."""
-    (found,) = crossings.listed(where, np.asarray(ends, dtype=np.float64), grid)
+    (found,) = voxel_crossings.list_crossings(where, np.asarray(ends, dtype=np.float64), grid)
     return found
 
 
@@ -141,7 +141,7 @@ def car(
     return [x, y, size[2] / 2, yaw, pitch, *size]
 
 
-def random_scene(seed: int) -> tuple[np.ndarray, crossings.Crossings, dict[int, np.ndarray]]:
+def random_scene(seed: int) -> tuple[np.ndarray, voxel_crossings.Crossings, dict[int, np.ndarray]]:
     """A sensor in, above or beside random boxes, and rays of every kind with made-up crossings."""
     draw = np.random.default_rng(seed)
     frames = {}
@@ -162,7 +162,7 @@ def random_scene(seed: int) -> tuple[np.ndarray, crossings.Crossings, dict[int, 
     enter = np.concatenate([np.sort(draw.uniform(0, 25, n)) for n in counts])
     return (
         o,
-        crossings.Crossings(o, WIDE, slice(0, 300), first, ends, np.zeros(len(enter), np.int64), enter, enter),
+        voxel_crossings.Crossings(o, WIDE, slice(0, 300), first, ends, np.zeros(len(enter), np.int64), enter, enter),
         frames,
     )
 
@@ -170,34 +170,34 @@ def random_scene(seed: int) -> tuple[np.ndarray, crossings.Crossings, dict[int, 
 def replay_of(frames: dict[int, np.ndarray], count: int = 12) -> Replayed:
     """A replay from boxes in the grid's frame."""
     frame = np.repeat(list(frames), [len(b) for b in frames.values()]).astype(np.int64)
-    return Replayed(effect.Replay.of(count, frame, np.vstack([np.empty((0, 8)), *frames.values()])))
+    return Replayed(moving_occlusion.Replay.from_boxes(count, frame, np.vstack([np.empty((0, 8)), *frames.values()])))
 
 
 @pytest.fixture
 def ran(mini: Path, tmp_path: Path) -> tuple[Path, Path]:
     """A scenario folder and the folder of its finished, plain run."""
     out = tmp_path / "out"
-    pipeline.run(pipeline.load(mini), out)
+    egvs.run(egvs.load(mini), out)
     return mini, out
 
 
 def scores(folder: Path, out: Path, *overrides: str, jobs: int | None = None) -> list[float]:
-    run_stage(score, pipeline.load(folder, overrides), out, jobs=jobs)
-    return tables.read(out / "scores.parquet", "scores")[0].column("egvs").to_pylist()
+    run_stage(score, egvs.load(folder, overrides), out, jobs=jobs)
+    return parquet.read_artefact(out / "scores.parquet", "scores")[0].column("egvs").to_pylist()
 
 
 def with_trajectories(out: Path, table: pa.Table, groups: int = 1) -> None:
     """Put other boxes in the place of those recorded, in ``groups`` row groups of whole frames."""
-    about = tables.read_metadata(out / "trajectories.parquet", "trajectories")
+    about = parquet.read_metadata(out / "trajectories.parquet", "trajectories")
     cuts = np.searchsorted(table.column("frame").to_numpy(), np.linspace(0, about["frames"], groups + 1))
-    with tables.writer(out / "trajectories.parquet", "trajectories") as file:
+    with parquet.artefact_writer(out / "trajectories.parquet", "trajectories") as file:
         for low, high in pairwise(cuts):
             file.write({name: table.column(name).slice(low, high - low).to_pylist() for name in table.column_names})
         file.describe(about)
 
 
 def trajectories(out: Path) -> pa.Table:
-    return tables.read(out / "trajectories.parquet", "trajectories")[0]
+    return parquet.read_artefact(out / "trajectories.parquet", "trajectories")[0]
 
 
 def recorded(out: Path, grid: Grid) -> dict[int, np.ndarray]:
@@ -246,7 +246,7 @@ def test_where_a_beam_ends_at_the_very_range_of_a_voxel_that_voxel_counts() -> N
     stop = -(2 - SHRINK) + 10  # as the slab gives it
     enter = np.array([stop, np.nextafter(stop, 20)])
     ends, none = np.array([[20.0, 0, 0]]), np.zeros(2, np.int64)
-    beam = crossings.Crossings(
+    beam = voxel_crossings.Crossings(
         np.array([0.0, 5.25, 1.0]), GRID, slice(0, 1), np.array([0, 2]), ends, none, enter, enter
     )
     assert replay({0: [car(10, 0.25)]}, 1).share(beam).tolist() == [1.0, 0.0]
@@ -312,7 +312,7 @@ def test_columns_of_channels_give_the_twins_numbers(seed: int, tilt: float, step
     first = 8 * np.arange(len(ends) + 1)
     enter = np.sort(draw.uniform(0, 25, (len(ends), 8)), axis=1).ravel()
     none = np.zeros(len(enter), dtype=np.int64)
-    rays = crossings.Crossings(o, WIDE, slice(0, len(ends)), first, ends, none, enter, enter)
+    rays = voxel_crossings.Crossings(o, WIDE, slice(0, len(ends)), first, ends, none, enter, enter)
     expected = twin_blocked(o, ends, first, enter, frames)
     assert replay_of(frames, 40).blocked(rays).tolist() == expected.tolist()
     assert len(set(expected.tolist())) > 3
@@ -323,21 +323,21 @@ def test_beams_of_any_weight_add_as_many_hits_as_their_listed_crossings(
     ran: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, out = ran
-    scene = pipeline.build_scene(pipeline.load(folder, [ON, ALL]))
+    scene = egvs.build_scene(egvs.load(folder, [ON, ALL]))
     draw = np.random.default_rng(5)
     ends = np.column_stack([draw.uniform(-12, 28, 400), draw.uniform(-22, 20, 400), draw.uniform(-3, 1, 400)])
     ends[:5], weight = [0.0, 0.0, 0.0], draw.uniform(0, 1, 400)
     ends[5:9] = [[0, 0, -3], [9, 0, -2.9], [0, 9, -2.9], [-0.0, -9, -2.9]]
     beams = Beams(Pose(10, -9, 3), scene.sensor("small"), ends, weight)
-    visibility = Visibility(scene, pipeline.read_tpog(out / "tpog.parquet"), out / "trajectories.parquet")
+    visibility = HitCounter(scene, egvs.read_tpog(out / "tpog.parquet"), out / "trajectories.parquet")
     walked = visibility.borrowed_hits(beams).copy()
-    monkeypatch.setattr(effect, "_ROOM", 1)  # a few beams at a time
+    monkeypatch.setattr(moving_occlusion, "_BUFFER_SIZE", 1)  # a few beams at a time
     assert walked.tolist() == visibility.borrowed_hits(beams).tolist()
-    monkeypatch.setattr(effect.MovingOcclusion, "falls", lambda *_: None)
+    monkeypatch.setattr(moving_occlusion.MovingOcclusion, "falls", lambda *_: None)
     assert walked.tolist() == visibility.borrowed_hits(beams).tolist()
-    plain = Visibility(
-        pipeline.build_scene(pipeline.load(folder, ["effects.dropout.share=1e-9"])),
-        pipeline.read_tpog(out / "tpog.parquet"),
+    plain = HitCounter(
+        egvs.build_scene(egvs.load(folder, ["effects.dropout.share=1e-9"])),
+        egvs.read_tpog(out / "tpog.parquet"),
     )
     assert 0 < walked.sum() < 0.995 * plain.borrowed_hits(beams).sum()
 
@@ -345,13 +345,13 @@ def test_beams_of_any_weight_add_as_many_hits_as_their_listed_crossings(
 def test_a_whole_run_gives_the_twins_hits(ran: tuple[Path, Path]) -> None:
     folder, out = ran
     settings = ("roi.voxel_m=1", "sensors.small.azimuth_step_deg=4", 'score.keep_visibility="all"', ON, ALL)
-    scenario = pipeline.load(folder, settings)
-    pipeline.run(scenario, out)
+    scenario = egvs.load(folder, settings)
+    egvs.run(scenario, out)
     grid = scenario.roi.grid
     frames = recorded(out, grid)
-    scans = tables.read(out / "scans.parquet", "scans")[0]
+    scans = parquet.read_artefact(out / "scans.parquet", "scans")[0]
     hidden = 0
-    for about in tables.read_metadata(out / "scans.parquet", "scans")["sites"]:
+    for about in parquet.read_metadata(out / "scans.parquet", "scans")["sites"]:
         mine = scans.filter(pa.compute.equal(scans.column("site"), about["site"]))
         ends = np.column_stack([mine.column(name).to_numpy() for name in ("dx_m", "dy_m", "dz_m")])
         o = np.array([about["x_m"], about["y_m"], about["z_m"]]) - grid.origin_m
@@ -362,7 +362,7 @@ def test_a_whole_run_gives_the_twins_hits(ran: tuple[Path, Path]) -> None:
         np.add.at(
             whole, np.concatenate([cells for cells, _ in lists]), np.rint((40 - blocked) / 40 * UNIT).astype(np.int64)
         )
-        hits = pipeline.read_visibility(out / "visibility.parquet", about["site"])
+        hits = egvs.read_visibility(out / "visibility.parquet", about["site"])
         assert (hits.ravel() * UNIT).tolist() == whole.tolist()
         hidden += int(blocked.sum())
     assert hidden > 1000
@@ -370,9 +370,9 @@ def test_a_whole_run_gives_the_twins_hits(ran: tuple[Path, Path]) -> None:
 
 def test_independent_is_the_product_over_the_voxels_before(ran: tuple[Path, Path]) -> None:
     folder, out = ran
-    scenario = pipeline.load(folder, ["roi.voxel_m=1"])
-    pipeline.run(scenario, out)
-    counts, grid = pipeline.read_tpog(out / "tpog.parquet").counts.ravel(), scenario.roi.grid
+    scenario = egvs.load(folder, ["roi.voxel_m=1"])
+    egvs.run(scenario, out)
+    counts, grid = egvs.read_tpog(out / "tpog.parquet").counts.ravel(), scenario.roi.grid
     made = occlusion(out, method="independent")
     draw, where = np.random.default_rng(3), (10.0, 12.0, 3.0)
     ends = np.column_stack([draw.uniform(-12, 28, 60), draw.uniform(-22, -11, 60), np.full(60, -2.9)])
@@ -393,7 +393,7 @@ def test_independent_is_the_product_over_the_voxels_before(ran: tuple[Path, Path
 
 def test_without_vehicles_in_reach_the_scores_are_the_plain_ones(ran: tuple[Path, Path]) -> None:
     folder, out = ran
-    plain = tables.read(out / "scores.parquet", "scores")[0]
+    plain = parquet.read_artefact(out / "scores.parquet", "scores")[0]
     boxes = trajectories(out)
     assert scores(folder, out, ON) < plain.column("egvs").to_pylist()
     away = boxes.set_column(boxes.column_names.index("y_m"), "y_m", pa.compute.add(boxes.column("y_m"), 500.0))
@@ -404,14 +404,14 @@ def test_without_vehicles_in_reach_the_scores_are_the_plain_ones(ran: tuple[Path
 
 
 def test_independent_without_occupancy_changes_nothing() -> None:
-    free = effect.Independent(10, np.zeros(np.prod(GRID.shape), dtype=np.uint32))
+    free = moving_occlusion.IndependentVoxels(10, np.zeros(np.prod(GRID.shape), dtype=np.uint32))
     assert (free.share(listed((-1, 0.3, 3), [[20, 1, -2], [3, 3, -3]])) == 1).all()
 
 
 def test_what_is_always_occupied_hides_everything_behind_it() -> None:
     counts = np.zeros(GRID.shape, dtype=np.uint32)
     counts[16] = 10
-    share = effect.Independent(10, counts.ravel()).share(listed((0, 0.25, 1), [[20, 0, 0]]))
+    share = moving_occlusion.IndependentVoxels(10, counts.ravel()).share(listed((0, 0.25, 1), [[20, 0, 0]]))
     assert share.tolist() == [1.0] * 17 + [0.0] * 23
 
 
@@ -447,15 +447,15 @@ def test_all_frames_are_the_mean_of_each_and_their_order_does_not_matter() -> No
 @pytest.mark.slow
 def test_it_multiplies_with_rain(ran: tuple[Path, Path]) -> None:
     folder, out = ran
-    scenario = pipeline.load(folder, [ON, ALL, "effects.rain.rate_mm_h=30"])
+    scenario = egvs.load(folder, [ON, ALL, "effects.rain.rate_mm_h=30"])
     pose, ends = Pose(1, -9, 3), np.array([[20.0, 9.0, -2.5]])
     found = listed(pose.position_m, ends, scenario.roi.grid)
-    occluded = occlusion(out, frames="all").seen_from(found.sensor_m, found.grid).share(found)
+    occluded = occlusion(out, frames="all").for_sensor(found.sensor_m, found.grid).share(found)
     centres_m = (np.column_stack(np.unravel_index(found.cells, found.grid.shape)) + 0.5) * found.grid.voxel_m
     range_m = np.sqrt(((centres_m - found.sensor_m) ** 2).sum(axis=1))
     rain = Rain(RainParameters(rate_mm_h=30)).detect(range_m, None)  # type: ignore[arg-type]
-    scene = pipeline.build_scene(scenario)
-    visibility = Visibility(scene, pipeline.read_tpog(out / "tpog.parquet"), out / "trajectories.parquet")
+    scene = egvs.build_scene(scenario)
+    visibility = HitCounter(scene, egvs.read_tpog(out / "tpog.parquet"), out / "trajectories.parquet")
     hits = visibility.borrowed_hits(Beams(pose, scene.sensor("small"), ends))
     assert np.abs(hits[found.cells] - rain * np.rint(occluded * UNIT)).max() <= 1
     assert occluded.min() < 1 > rain.max()
@@ -477,7 +477,7 @@ def test_threads_change_no_byte(ran: tuple[Path, Path], switch: str) -> None:
     digests = set()
     for jobs in (1, 2, 3):
         scores(folder, out, switch, jobs=jobs)
-        digests.add(files.sha256_of(out / "scores.parquet"))
+        digests.add(files.hash_file(out / "scores.parquet"))
     assert len(digests) == 1
 
 
@@ -500,12 +500,14 @@ def test_only_row_groups_with_replayed_frames_are_read(ran: tuple[Path, Path], m
     whole = occlusion(out, frames=1).ready
     with_trajectories(out, trajectories(out), groups=40)
     read: list[int] = []
-    true = tables.read_group
-    monkeypatch.setattr(tables, "read_group", lambda file, group, *more: read.append(group) or true(file, group, *more))
+    true = parquet.read_row_group
+    monkeypatch.setattr(
+        parquet, "read_row_group", lambda file, group, *more: read.append(group) or true(file, group, *more)
+    )
     read.clear()
     parts = occlusion(out, frames=1).ready
     assert read[-1] == 20 and read.count(20) == 1
-    assert isinstance(whole, effect.Replay) and isinstance(parts, effect.Replay)
+    assert isinstance(whole, moving_occlusion.Replay) and isinstance(parts, moving_occlusion.Replay)
     assert whole.values.tolist() == parts.values.tolist() and len(parts.values) == 2
 
 
@@ -544,11 +546,11 @@ def test_without_kept_scans_the_scores_are_the_same(ran: tuple[Path, Path]) -> N
 
 def test_scores_depend_on_the_trajectories_only_when_they_are_replayed(ran: tuple[Path, Path]) -> None:
     folder, out = ran
-    named = {"trajectories.parquet": files.sha256_of(out / "trajectories.parquet")}
-    plain = inputs_of(score, pipeline.load(folder), out).files
-    assert inputs_of(score, pipeline.load(folder, [ON]), out).files == plain | named
-    assert inputs_of(score, pipeline.load(folder, [INDEPENDENT]), out).files == plain
-    assert inputs_of(score, pipeline.load(folder, ["effects.rain.rate_mm_h=3"]), out).files == plain
+    named = {"trajectories.parquet": files.hash_file(out / "trajectories.parquet")}
+    plain = inputs_of(score, egvs.load(folder), out).files
+    assert inputs_of(score, egvs.load(folder, [ON]), out).files == plain | named
+    assert inputs_of(score, egvs.load(folder, [INDEPENDENT]), out).files == plain
+    assert inputs_of(score, egvs.load(folder, ["effects.rain.rate_mm_h=3"]), out).files == plain
 
 
 def test_all_and_zero_are_one_setting(mini: Path, tmp_path: Path) -> None:
@@ -570,9 +572,11 @@ def test_all_and_zero_are_one_setting(mini: Path, tmp_path: Path) -> None:
         ),
     ],
 )
-def test_bad_parameters_are_refused(egvs: Any, mini: Path, tmp_path: Path, settings: list[str], message: str) -> None:
+def test_bad_parameters_are_refused(
+    run_egvs: Any, mini: Path, tmp_path: Path, settings: list[str], message: str
+) -> None:
     overrides = [word for setting in settings for word in ("--set", f"effects.moving_occlusion.{setting}")]
-    code, _, err = egvs("run", mini, "--out", tmp_path / "out", *overrides)
+    code, _, err = run_egvs("run", mini, "--out", tmp_path / "out", *overrides)
     assert code == 2
     assert message in " ".join(err.split())
 
@@ -595,7 +599,7 @@ def test_bad_trajectories_are_refused(ran: tuple[Path, Path]) -> None:
 
 def test_it_shares_only_when_prepared() -> None:
     with pytest.raises(RuntimeError, match="prepare"):
-        effect.MovingOcclusion(MovingOcclusionParameters()).share(listed((0, 0, 1), [[20, 0, 0]]))
+        moving_occlusion.MovingOcclusion(MovingOcclusionParameters()).share(listed((0, 0, 1), [[20, 0, 0]]))
 
 
 # The comparison
@@ -604,7 +608,7 @@ def test_it_shares_only_when_prepared() -> None:
 def test_the_error_of_independent_is_reported(ran: tuple[Path, Path]) -> None:
     folder, out = ran
     plain, framed, independent = scores(folder, out), scores(folder, out, ON), scores(folder, out, INDEPENDENT)
-    found = benchmark.compare(pipeline.load(folder, [ON]), out)
+    found = benchmark.compare(egvs.load(folder, [ON]), out)
     rows = found["rows"]
     assert [row["site"] for row in rows] == ["pole_a", "pole_b"]
     assert [row["plain"] for row in rows] == plain

@@ -14,32 +14,30 @@ import numpy as np
 import pytest
 import shapely
 
-import pipeline
-from pipeline.artefacts import tables
-from pipeline.artefacts.readers import Tpog
-from pipeline.core import files
-from pipeline.core.grid import Grid, Roi
-from pipeline.effects.scan.divergence import Divergence
-from pipeline.effects.scan.divergence import nodes as cone_nodes
-from pipeline.effects.scan.foliage import Foliage
-from pipeline.effects.scan.mount_sway import MountSway, tilted
-from pipeline.effects.scan.mount_sway import nodes as sway_nodes
-from pipeline.effects.score.rain import Rain
-from pipeline.scenario.effects import DivergenceParameters, FoliageParameters, MountSwayParameters, RainParameters
-from pipeline.scoring.scorer import Scorer
-from pipeline.sensing import sites
-from pipeline.sensing.scanner import Scanner
-from pipeline.sensing.sensors import Sensor, rotation
-from pipeline.sensing.sites import Pose
-from pipeline.stages import scan, statics
-from pipeline.stages.base import Workspace
-from pipeline.stages.shared.scans import scans
-from pipeline.stages.shared.scene import scene_of
-from pipeline.world import casting as raycast
-from pipeline.world import static_world
-from pipeline.world.casting import Caster, EmptyScan
-from pipeline.world.footprints import Footprint
-from pipeline.world.mesh import World, read_ply
+import egvs
+from egvs.artefacts import parquet
+from egvs.artefacts.tpog import Tpog
+from egvs.core import files
+from egvs.core.grid import Grid, Roi
+from egvs.effects.divergence import Divergence
+from egvs.effects.divergence import beam_nodes as cone_nodes
+from egvs.effects.foliage import Foliage
+from egvs.effects.mount_sway import MountSway, rotate_directions
+from egvs.effects.mount_sway import tilt_nodes as sway_nodes
+from egvs.effects.rain import Rain
+from egvs.scenario.effects_config import DivergenceParameters, FoliageParameters, MountSwayParameters, RainParameters
+from egvs.scoring.scorer import Scorer
+from egvs.sensors import sites
+from egvs.sensors.scanner import Scanner
+from egvs.sensors.sensor import Sensor, rotation_world_sensor
+from egvs.sensors.sites import Pose
+from egvs.stages import scan, statics
+from egvs.stages.inputs import get_scene, open_folder
+from egvs.stages.site_scoring import empty_scans
+from egvs.world import ray_casting, static_world
+from egvs.world.footprints import Footprint
+from egvs.world.mesh import World, read_ply
+from egvs.world.ray_casting import Caster, EmptyScan
 from tests.conftest import collection, feature
 from tests.stages import run_stage
 
@@ -87,8 +85,8 @@ TREES = (
 )
 
 
-def scanned(folder: Path, out: Path, *sets: str, jobs: int = 1) -> tuple[pipeline.Scenario, Path]:
-    scenario = pipeline.load(folder, sets)
+def scanned(folder: Path, out: Path, *sets: str, jobs: int = 1) -> tuple[egvs.Scenario, Path]:
+    scenario = egvs.load(folder, sets)
     run_stage(statics, scenario, out)
     run_stage(scan, scenario, out, jobs=jobs)
     return scenario, out
@@ -98,9 +96,9 @@ def hits(folder: Path, out: Path, *sets: str) -> dict[str, np.ndarray]:
     """Hits in each voxel, by site."""
     scenario, out = scanned(folder, out, *sets)
     grid = Grid.over(scenario.roi.box, scenario.roi.voxel_m)
-    work, empty = Workspace(scenario, out), Tpog(grid, 1, np.zeros(grid.shape, dtype=np.int64))
-    scorer = Scorer(scene_of(work), empty)
-    return {scan.site.name: scorer.hits(scan.beams) for scan in scans(work)}
+    work, empty = open_folder(scenario, out), Tpog(grid, 1, np.zeros(grid.shape, dtype=np.int64))
+    scorer = Scorer(get_scene(work), empty)
+    return {scan.site.name: scorer.hits(scan.beams) for scan in empty_scans(work)}
 
 
 def along(found: dict[str, np.ndarray]) -> np.ndarray:
@@ -110,7 +108,7 @@ def along(found: dict[str, np.ndarray]) -> np.ndarray:
 
 def sums(file: Path) -> list[float]:
     """The weights of each beam, added up."""
-    table, _ = tables.read(file, "scans")
+    table, _ = parquet.read_artefact(file, "scans")
     total: dict[tuple[str, int], float] = defaultdict(float)
     for name, beam, weight in zip(*(table.column(c).to_pylist() for c in ("site", "beam", "weight")), strict=True):
         total[name, beam] += weight
@@ -148,7 +146,7 @@ def test_sub_beams_lie_in_the_sensors_own_azimuth_and_elevation() -> None:
     assert parent.tolist() == [i for i in range(8) for _ in range(7)]
     np.testing.assert_array_equal(rays[::7], sensor.directions(*pose))
     np.testing.assert_allclose((rays**2).sum(axis=1), 1, atol=1e-15)
-    inside = rays @ rotation(*pose)  # back into the sensor's frame
+    inside = rays @ rotation_world_sensor(*pose)  # back into the sensor's frame
     elevation = np.arcsin(inside[:, 2]).reshape(8, 7)
     azimuth = np.arctan2(inside[:, 1], inside[:, 0]).reshape(8, 7)
     aside = np.angle(np.exp(1j * (azimuth - azimuth[:, :1]))) * math.cos(math.radians(10))
@@ -202,16 +200,18 @@ def test_tilts_have_the_moments_of_the_gaussian(samples: int, degree: int) -> No
 
 def test_a_tilt_turns_about_the_worlds_axes() -> None:
     ahead, left, up = np.eye(3)[:, None]
-    assert tilted(left, 90, 0)[0] == pytest.approx(up[0])  # about x: y goes up
-    assert tilted(up, 0, 90)[0] == pytest.approx(ahead[0])  # about y: z goes to x
-    assert tilted(np.array([[0.6, 0.8, 0.0]]), 0.6, 0.8)[0] == pytest.approx([0.6, 0.8, 0.0])  # the axis stays
+    assert rotate_directions(left, 90, 0)[0] == pytest.approx(up[0])  # about x: y goes up
+    assert rotate_directions(up, 0, 90)[0] == pytest.approx(ahead[0])  # about y: z goes to x
+    assert rotate_directions(np.array([[0.6, 0.8, 0.0]]), 0.6, 0.8)[0] == pytest.approx(
+        [0.6, 0.8, 0.0]
+    )  # the axis stays
     rng = np.random.default_rng(3)
     some = rng.normal(size=(50, 3))
     some /= np.linalg.norm(some, axis=1)[:, None]
-    turned = tilted(tilted(some, 3, -4), -3, 4)
+    turned = rotate_directions(rotate_directions(some, 3, -4), -3, 4)
     np.testing.assert_allclose(turned, some, atol=1e-15)
     np.testing.assert_allclose(
-        np.einsum("ij,ij->i", tilted(some, 3, -4), some).min(), math.cos(math.radians(5)), atol=0.02
+        np.einsum("ij,ij->i", rotate_directions(some, 3, -4), some).min(), math.cos(math.radians(5)), atol=0.02
     )
 
 
@@ -240,7 +240,7 @@ def test_leaves_let_through_what_beer_and_lambert_say(mini: Path, tmp_path: Path
     found = along(hits(folder, tmp_path / "a", f"{FOLIAGE}0.5", "effects.foliage.step_m=0.5"))
     x = 0.5 * np.arange(80)
     np.testing.assert_allclose(found, np.exp(-0.25 * np.clip(x - 10, 0, 4)), atol=2**-32)
-    table, about = tables.read(tmp_path / "a" / "scans.parquet", "scans")
+    table, about = parquet.read_artefact(tmp_path / "a" / "scans.parquet", "scans")
     assert table.column("weight").to_pylist()[-1] == pytest.approx(math.exp(-1), abs=1e-9)
     assert table.column("returned").to_pylist() == [True] * 8 + [False]
     assert (about["sites"][0]["beams_in_roi"], about["sites"][0]["returns"]) == (1, 1)
@@ -289,7 +289,9 @@ def test_the_densest_leaves_give_the_plain_scan(mini: Path, tmp_path: Path) -> N
     folder = place(mini, *TREES)
     _, plain = scanned(folder, tmp_path / "plain")
     _, dense = scanned(folder, tmp_path / "dense", f"{FOLIAGE}{OPAQUE}")
-    (before, about), (after, about_after) = (tables.read(out / "scans.parquet", "scans") for out in (plain, dense))
+    (before, about), (after, about_after) = (
+        parquet.read_artefact(out / "scans.parquet", "scans") for out in (plain, dense)
+    )
     for name in ("site", "beam", "returned"):
         assert before.column(name) == after.column(name)
     for name in ("dx_m", "dy_m", "dz_m"):
@@ -418,14 +420,14 @@ EACH = {"divergence": [f"{DIVERGENCE}7"], "mount_sway": [f"{SWAY}0.5"], "foliage
 
 
 def scores_of(out: Path) -> list[Any]:
-    table, _ = tables.read(out / "scores.parquet", "scores")
+    table, _ = parquet.read_artefact(out / "scores.parquet", "scores")
     return table.to_pylist()
 
 
 @pytest.fixture
 def plain(mini: Path, tmp_path: Path) -> Path:
     place(mini, *TREES)
-    pipeline.run(pipeline.load(mini), tmp_path / "plain", jobs=1)
+    egvs.run(egvs.load(mini), tmp_path / "plain", jobs=1)
     return tmp_path / "plain"
 
 
@@ -434,10 +436,10 @@ def test_the_switch_acts_and_weights_and_metadata_are_as_declared(
     mini: Path, plain: Path, tmp_path: Path, name: str
 ) -> None:
     out = tmp_path / "out"
-    pipeline.run(pipeline.load(mini, EACH[name]), out, jobs=1)
+    egvs.run(egvs.load(mini, EACH[name]), out, jobs=1)
     before, after = ([row["egvs"] for row in scores_of(folder)] for folder in (plain, out))
     assert all(a != b for a, b in zip(before, after, strict=True))
-    table, about = tables.read(out / "scans.parquet", "scans")
+    table, about = parquet.read_artefact(out / "scans.parquet", "scans")
     assert table.column_names == ["site", "beam", "dx_m", "dy_m", "dz_m", "returned", "weight"]
     weights = table.column("weight").to_numpy()
     assert weights.min() >= 0 and weights.max() <= 1
@@ -447,7 +449,7 @@ def test_the_switch_acts_and_weights_and_metadata_are_as_declared(
         beams = mine.column("beam").to_numpy().astype(np.int64)
         assert (np.diff(beams) >= 0).all() and site["beams_in_roi"] == len(np.unique(beams))
         assert site["returns"] == len(np.unique(beams[mine.column("returned").to_numpy()]))
-    assert tables.read(plain / "scans.parquet", "scans")[0].column_names == [
+    assert parquet.read_artefact(plain / "scans.parquet", "scans")[0].column_names == [
         "site",
         "beam",
         "dx_m",
@@ -464,11 +466,11 @@ def test_any_number_of_threads_gives_the_same_bytes_and_unkept_scans_the_same_sc
 ) -> None:
     out = [plain.rename(tmp_path / str(jobs)) if jobs == 1 else tmp_path / str(jobs) for jobs in (1, 2, 3)]
     for jobs, folder in enumerate(out, start=1):
-        pipeline.run(pipeline.load(mini, EACH[name]), folder, jobs=jobs)
+        egvs.run(egvs.load(mini, EACH[name]), folder, jobs=jobs)
     for file in ("scans.parquet", "scores.parquet"):
-        assert len({files.sha256_of(folder / file) for folder in out}) == 1
+        assert len({files.hash_file(folder / file) for folder in out}) == 1
     kept = scores_of(out[0])
-    pipeline.run(pipeline.load(mini, [*EACH[name], "scan.keep=false"]), out[0], jobs=2)
+    egvs.run(egvs.load(mini, [*EACH[name], "scan.keep=false"]), out[0], jobs=2)
     assert not (out[0] / "scans.parquet").exists()
     assert scores_of(out[0]) == kept
 
@@ -494,8 +496,8 @@ def test_an_effect_that_can_change_nothing_is_skipped_and_leaves_no_trace(
     sets, standing, why = IDLE[case]
     place(mini, *standing, sites="pole_a,10,12,3\npole_b,30.5,14,3\n" if case.startswith("bare") else None)
     keeps = f"scan.keep={keep}"
-    pipeline.run(pipeline.load(mini, [keeps]), tmp_path / "plain", jobs=1)
-    record = pipeline.run(pipeline.load(mini, [keeps, *sets]), tmp_path / "named", jobs=1)
+    egvs.run(egvs.load(mini, [keeps]), tmp_path / "plain", jobs=1)
+    record = egvs.run(egvs.load(mini, [keeps, *sets]), tmp_path / "named", jobs=1)
     said = record.stages["scan"].summary
     if case.startswith("bare"):
         assert "skipped" not in said  # beams of pole_b pass it
@@ -503,7 +505,7 @@ def test_an_effect_that_can_change_nothing_is_skipped_and_leaves_no_trace(
     assert said["skipped"] == [f"{sets[0].split('.')[1]}: {why}"]
     for name in ("statics.ply", "scans.parquet", "tpog.parquet", "scores.parquet"):
         if keep == "true" or name != "scans.parquet":
-            assert files.sha256_of(tmp_path / "plain" / name) == files.sha256_of(tmp_path / "named" / name), name
+            assert files.hash_file(tmp_path / "plain" / name) == files.hash_file(tmp_path / "named" / name), name
 
 
 @pytest.mark.parametrize("case", [case for case in IDLE if not case.startswith("bare")])
@@ -525,12 +527,14 @@ def test_measured_scans_are_taken_as_they_are(mini: Path, tmp_path: Path) -> Non
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m,points\nseen,10,12,3,cloud.csv\ncast,30.5,-12,3,\n")
     (mini / "cloud.csv").write_text("x_m,y_m,z_m\n20,0,0\n20,1,0.5\n")
     _, out = scanned(mini, tmp_path / "out", *(s for sets in EACH.values() for s in sets))
-    table, about = tables.read(out / "scans.parquet", "scans")
+    table, about = parquet.read_artefact(out / "scans.parquet", "scans")
     assert table.column("weight").to_pylist()[:2] == [1.0, 1.0]
     assert about["sites"][0]["beams_in_roi"] == 2
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m,points\nseen,10,12,3,cloud.csv\n")
-    scene = pipeline.build_scene(pipeline.load(mini, [s for sets in EACH.values() for s in sets]))
-    assert {effect.why for effect in scene.idle} == {"all scans are measured"} and Scanner(scene).columns == ()
+    scene = egvs.build_scene(egvs.load(mini, [s for sets in EACH.values() for s in sets]))
+    assert {effect.why for effect in scene.inactive_effects} == {"all scans are measured"} and Scanner(
+        scene
+    ).columns == ()
 
 
 @pytest.mark.parametrize(
@@ -544,13 +548,13 @@ def test_from_within_the_region_no_weight_is_lost(mini: Path, tmp_path: Path, se
 def test_divergence_and_sway_compose(mini: Path, tmp_path: Path) -> None:
     """Every sub-beam of the cone once for each pose, with the product of the weights."""
     scenario, out = scanned(one_beam(mini), tmp_path / "out", f"{DIVERGENCE}7", f"{SWAY}0.1")
-    table, _ = tables.read(out / "scans.parquet", "scans")
+    table, _ = parquet.read_artefact(out / "scans.parquet", "scans")
     assert table.num_rows == 28
     assert sums(out / "scans.parquet") == pytest.approx([1.0], abs=1e-14)
     products = np.outer(cone_nodes(7)[1], sway_nodes(4)[1]).ravel()
     np.testing.assert_allclose(table.column("weight").to_numpy(), products, rtol=1e-15)
     ends = np.column_stack([table.column(c).to_numpy() for c in ("dx_m", "dy_m", "dz_m")]) / 100
-    pose, sensor = sites.of(scenario)[0].pose, Sensor("s", (0.0,), (0.0,), 4, 100.0, "")
+    pose, sensor = sites.candidate_sites(scenario)[0].pose, Sensor("s", (0.0,), (0.0,), 4, 100.0, "")
     cone, _, _ = Divergence(DivergenceParameters()).expand(np.array([[1.0, 0.0, 0.0]]), sensor, pose)
     both, _, _ = MountSway(MountSwayParameters(tilt_deg=0.1)).expand(cone, sensor, pose)
     np.testing.assert_allclose(ends, both, rtol=1e-15, atol=1e-15)
@@ -602,9 +606,9 @@ BAD = {
 
 @pytest.mark.parametrize("change", BAD)
 def test_bad_parameters_are_refused(
-    mini: Path, tmp_path: Path, egvs: Callable[..., tuple[int, str, str]], change: str
+    mini: Path, tmp_path: Path, run_egvs: Callable[..., tuple[int, str, str]], change: str
 ) -> None:
-    code, _, err = egvs("scan", mini, "--out", tmp_path / "out", "--set", change)
+    code, _, err = run_egvs("scan", mini, "--out", tmp_path / "out", "--set", change)
     assert code == 2 and "Traceback" not in err
     assert BAD[change] in " ".join(err.split()).replace(" ", " ")
 
@@ -627,14 +631,16 @@ def test_what_no_beam_can_meet_is_left_out_and_the_bytes_stay(
     _, culled = scanned(mini, tmp_path / "a")
     held = []
     monkeypatch.setattr(
-        raycast, "reachable", lambda shapes, *_: held.append(len(shapes)) or np.ones(len(shapes), dtype=np.bool_)
+        ray_casting,
+        "reachable_shapes",
+        lambda shapes, *_: held.append(len(shapes)) or np.ones(len(shapes), dtype=np.bool_),
     )
     _, whole = scanned(mini, tmp_path / "b")
-    assert files.sha256_of(culled / "scans.parquet") == files.sha256_of(whole / "scans.parquet")
+    assert files.hash_file(culled / "scans.parquet") == files.hash_file(whole / "scans.parquet")
     monkeypatch.undo()
     world, _ = read_ply(whole / "statics.ply")
     sites = np.array([[10, 12, 3], [30.5, 16, 7.0]])
-    kept = raycast.reachable(world.triangles_m, pipeline.load(mini).roi.box, sites, 100.0)
+    kept = ray_casting.reachable_shapes(world.triangles_m, egvs.load(mini).roi.box, sites, 100.0)
     assert 0.05 * held[0] < kept.sum() < 0.5 * held[0]
 
 
@@ -648,19 +654,19 @@ def test_reachable_and_between_never_leave_out_what_a_beam_meets() -> None:
         met = start + far * (through - start)
         shapes = met[:, None] + rng.normal(0, 0.5, (200, 3, 3))
         shapes[:, 0] = met
-        assert raycast.reachable(shapes, roi, sites, float(np.linalg.norm(met - start, axis=1).max())).all()
-        assert raycast.between(shapes[far[:, 0] <= 1], roi, sites).all()
+        assert ray_casting.reachable_shapes(shapes, roi, sites, float(np.linalg.norm(met - start, axis=1).max())).all()
+        assert ray_casting.shapes_between(shapes[far[:, 0] <= 1], roi, sites).all()
 
 
 def test_without_static_geometry_in_reach_no_tree_is_built(
     mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(raycast, "Tree", lambda triangles: pytest.fail("a tree was built"))
+    monkeypatch.setattr(ray_casting, "TriangleTree", lambda triangles: pytest.fail("a tree was built"))
     for number, standing in enumerate(((), (prism(5, 60, 9, 70, 0, 9, "building"),))):
         _, out = scanned(
             place(mini, *standing, sites="pole_a,10,12,3\n"), tmp_path / str(number), "statics.ground=false"
         )
-        table, _ = tables.read(out / "scans.parquet", "scans")
+        table, _ = parquet.read_artefact(out / "scans.parquet", "scans")
         assert table.num_rows > 0 and not any(table.column("returned").to_pylist())
 
 
@@ -670,7 +676,7 @@ def test_a_caster_that_knows_no_sites_holds_everything() -> None:
 
 
 def test_idle_looks_at_simulated_sites_only(mini: Path) -> None:
-    scene = pipeline.build_scene(pipeline.load(place(mini, *TREES)))
+    scene = egvs.build_scene(egvs.load(place(mini, *TREES)))
     assert Foliage(FoliageParameters()).why_idle(scene) is None
     assert Divergence(DivergenceParameters()).why_idle(scene) is None
     assert MountSway(MountSwayParameters(tilt_deg=1)).why_idle(scene) is None

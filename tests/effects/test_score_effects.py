@@ -15,27 +15,27 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import pipeline
-from pipeline.artefacts import tables
-from pipeline.artefacts.readers import read_tpog
-from pipeline.core.errors import InputError
-from pipeline.effects import registry
-from pipeline.effects.base import Detect, Effect
-from pipeline.runs import workflow
-from pipeline.scenario.sensors import SensorModel
-from pipeline.scoring import visibility
-from pipeline.scoring.scorer import Scorer
-from pipeline.sensing import sensors, sites
-from pipeline.sensing.scene import Scene
-from pipeline.stages import scan, score, statics, tpog, traffic
-from pipeline.stages.base import Workspace
-from pipeline.stages.shared.scans import scans
-from pipeline.stages.shared.scene import scene_of
+import egvs
+from egvs.artefacts import parquet
+from egvs.artefacts.tpog import read_tpog
+from egvs.core.errors import InputError
+from egvs.effects import registry
+from egvs.effects.base import Detect, Effect
+from egvs.runs import run
+from egvs.scenario.sensor_config import SensorConfig
+from egvs.scoring import visibility
+from egvs.scoring.scorer import Scorer
+from egvs.sensors import sensor, sites
+from egvs.sensors.scene import Scene
+from egvs.sensors.sensor import CATALOGUE, Sensor
+from egvs.stages import scan, score, statics, tpog, traffic
+from egvs.stages.inputs import get_scene, open_folder
+from egvs.stages.site_scoring import empty_scans
 from tests import processes
 from tests.conftest import BUILDING, SCENARIO, SITES, collection, fcd, feature
 from tests.stages import run_stage
 
-SENSOR = sensors.Sensor("test", (0.0,), (0.0,), 1, 100.0, "this test", rated_range_m=40.0)
+SENSOR = sensor.Sensor("test", (0.0,), (0.0,), 1, 100.0, "this test", rated_range_m=40.0)
 RANGES_M = np.linspace(0.01, 200.0, 400)
 
 # What switches each effect on so that it acts.
@@ -90,7 +90,7 @@ def write(folder: Path, scenario: str, sites_csv: str) -> Path:
 def stages(folder: Path, out: Path) -> tuple[Path, Path]:
     """Run all but the report in ``out``."""
     out.mkdir()
-    scenario = pipeline.load(folder)
+    scenario = egvs.load(folder)
     for stage in (statics, scan, traffic, tpog, score):
         run_stage(stage, scenario, out)
     return folder, out
@@ -118,18 +118,18 @@ def one_beam(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def scored(done: tuple[Path, Path], settings: list[str], jobs: int | None = None) -> tuple[dict[str, list], bytes]:
     """Columns of scores.parquet under these settings, and its bytes; the module's artefacts stay as they are."""
     folder, out = done
-    run_stage(score, pipeline.load(folder, settings), out, jobs=jobs)
-    table, _ = tables.read(out / "scores.parquet", "scores")
+    run_stage(score, egvs.load(folder, settings), out, jobs=jobs)
+    table, _ = parquet.read_artefact(out / "scores.parquet", "scores")
     return table.to_pydict(), (out / "scores.parquet").read_bytes()
 
 
 def hits(done: tuple[Path, Path], settings: list[str]) -> np.ndarray:
     """Hits of the first site in each voxel, (nx, ny, nz)."""
     folder, out = done
-    scenario = pipeline.load(folder, settings)
-    work = Workspace(scenario, out)
-    first = next(iter(scans(work)))
-    return Scorer(scene_of(work), read_tpog(out / "tpog.parquet")).hits(first.beams)
+    scenario = egvs.load(folder, settings)
+    work = open_folder(scenario, out)
+    first = next(iter(empty_scans(work)))
+    return Scorer(get_scene(work), read_tpog(out / "tpog.parquet")).hits(first.beams)
 
 
 def along(one_beam: tuple[Path, Path], *settings: str) -> np.ndarray:
@@ -140,12 +140,12 @@ def along(one_beam: tuple[Path, Path], *settings: str) -> np.ndarray:
 
 
 def made(name: str, **parameters: object) -> Effect:
-    return registry.make(name, registry.effect_class(name).Model.of(parameters))
+    return registry.make_effect(name, registry.find_effect_class(name).Model.of(parameters))
 
 
 def scene(done: tuple[Path, Path], *settings: str) -> Scene:
-    scenario = pipeline.load(done[0], settings)
-    return Scene(scenario, None, sites.of(scenario))  # type: ignore[arg-type]
+    scenario = egvs.load(done[0], settings)
+    return Scene(scenario, None, sites.candidate_sites(scenario))  # type: ignore[arg-type]
 
 
 # The switch, the limit, the monotonic truth
@@ -200,7 +200,7 @@ seen = st.floats(1, 1e5)
 def test_thicker_fog_takes_more_at_every_range(
     one: float, other: float, model: str, wavelength_nm: float, contrast: float
 ) -> None:
-    sensor = sensors.Sensor("test", (0.0,), (0.0,), 1, 100.0, "this test", wavelength_nm=wavelength_nm)
+    sensor = Sensor("test", (0.0,), (0.0,), 1, 100.0, "this test", wavelength_nm=wavelength_nm)
     thick, thin = (
         made("fog", visibility_m=v, model=model, contrast=contrast).detect(RANGES_M, sensor)
         for v in sorted((one, other))
@@ -297,7 +297,7 @@ def test_effects_multiply(one_beam: tuple[Path, Path]) -> None:
 def test_a_voxel_keeps_what_is_detected_at_the_range_of_its_centre(done: tuple[Path, Path], name: str) -> None:
     """Every voxel's plain hits, times the effect asked at that voxel; to 2**-33 of each, and what rounding adds."""
     here = scene(done, *ON[name])
-    (only,), sensor = registry.named(here.scenario, "score"), here.sensor(here.sites[0].sensor)
+    (only,), sensor = registry.scenario_effects(here.scenario, "score"), here.sensor(here.sites[0].sensor)
     assert isinstance(only, Detect)
     grid = here.scenario.roi.grid
     centres_m = (np.stack(np.meshgrid(*map(np.arange, grid.shape), indexing="ij"), axis=-1) + 0.5) * grid.voxel_m
@@ -369,7 +369,7 @@ def test_the_same_fog_by_either_contrast() -> None:
 
 def test_the_default_softness_is_that_of_a_datasheet() -> None:
     """Ouster OS1: 10 % targets 50 % at 55 m and 90 % at 45 m."""
-    os1 = sensors.CATALOGUE["OS1-128"]
+    os1 = sensor.CATALOGUE["OS1-128"]
     at_45, at_55 = made("range_limit").detect(np.array([45.0, 55.0]), os1)
     assert at_55 == pytest.approx(0.5, abs=1e-12)
     assert at_45 == pytest.approx(0.9, abs=0.015)
@@ -383,11 +383,11 @@ def test_next_to_the_sensor_everything_is_noticed() -> None:
 
 
 def test_every_sensor_of_the_catalogue_is_rated_within_its_range() -> None:
-    for sensor in sensors.CATALOGUE.values():
-        assert sensor.rated_range_m is not None, f"{sensor.name} needs one for range_limit"
-        assert 0 < sensor.rated_range_m <= sensor.range_m
-        assert 0 < sensor.rated_reflectivity <= 1
-        assert 800 < sensor.wavelength_nm < 1600
+    for entry in CATALOGUE.values():
+        assert entry.rated_range_m is not None, f"{entry.name} needs one for range_limit"
+        assert 0 < entry.rated_range_m <= entry.range_m
+        assert 0 < entry.rated_reflectivity <= 1
+        assert 800 < entry.wavelength_nm < 1600
 
 
 def test_a_sensor_of_ones_own_may_be_rated(done: tuple[Path, Path]) -> None:
@@ -396,9 +396,9 @@ def test_a_sensor_of_ones_own_may_be_rated(done: tuple[Path, Path]) -> None:
         "sensors.small.rated_reflectivity=0.4",
         "sensors.small.wavelength_nm=1550",
     ]
-    found = sensors.resolve("small", pipeline.load(done[0], rated).sensors, "here")
+    found = sensor.resolve_sensor("small", egvs.load(done[0], rated).sensors, "here")
     assert (found.rated_range_m, found.rated_reflectivity, found.wavelength_nm) == (30.0, 0.4, 1550.0)
-    assert found.divergence_mrad == sensors.Sensor.divergence_mrad
+    assert found.divergence_mrad == sensor.Sensor.divergence_mrad
     by_sensor, by_effect = (
         scored(done, settings)[0]
         for settings in (
@@ -416,7 +416,7 @@ def test_a_wavelength_reaches_the_fog(done: tuple[Path, Path]) -> None:
 
 
 def test_what_a_sensor_does_not_say_leaves_no_trace() -> None:
-    model = SensorModel(elevations_deg=(0,), azimuth_step_deg=1, range_m=5)
+    model = SensorConfig(elevations_deg=(0,), azimuth_step_deg=1, range_m=5)
     assert set(model.model_dump(mode="json")) == {
         "elevations_deg",
         "channels",
@@ -426,14 +426,14 @@ def test_what_a_sensor_does_not_say_leaves_no_trace() -> None:
     }
     said = model.model_copy(update={"rated_range_m": 3.0})
     assert said.model_dump(mode="json")["rated_range_m"] == 3.0
-    assert SensorModel.model_validate(said.model_dump(mode="json")) == said
+    assert SensorConfig.model_validate(said.model_dump(mode="json")) == said
 
 
-def test_a_sensor_that_is_not_rated_is_told(mini: Path, tmp_path: Path, egvs) -> None:
-    code, _, said = egvs("run", mini, "--out", tmp_path / "out", "--set", "effects.range_limit.reflectivity=0.2")
+def test_a_sensor_that_is_not_rated_is_told(mini: Path, tmp_path: Path, run_egvs) -> None:
+    code, _, said = run_egvs("run", mini, "--out", tmp_path / "out", "--set", "effects.range_limit.reflectivity=0.2")
     assert code == 2
     assert (
-        "sensor small: no rated_range_m; rated_range_m under [sensors.small], or under [effects.range_limit]"
+        "sensor small: rated_range_m is missing. Add it to [sensors.small], or to [effects.range_limit]."
         in " ".join(said.split())
     )
     assert not (tmp_path / "out" / "scores.parquet").exists()
@@ -455,7 +455,7 @@ def test_idle_says_why(done: tuple[Path, Path]) -> None:
     }.items():
         assert made(name, **parameters).why_idle(here) is None
     assert made("range_limit", softness=0, rated_range_m=30).why_idle(here) is None
-    with pytest.raises(InputError, match="sensor small: no rated_range_m"):
+    with pytest.raises(InputError, match="sensor small: rated_range_m is missing"):
         made("range_limit", softness=0).why_idle(here)
 
 
@@ -469,7 +469,7 @@ def test_a_limit_is_not_idle_for_a_measured_scan(done: tuple[Path, Path]) -> Non
 
 @pytest.mark.parametrize("name", ON)
 def test_every_effect_names_its_source(name: str) -> None:
-    kind = registry.effect_class(name)
+    kind = registry.find_effect_class(name)
     assert (kind.NAME, issubclass(kind, Detect)) == (name, True)
     assert len(kind.SOURCE) > 20
     assert all(field.description for field in kind.Model.model_fields.values())
@@ -502,8 +502,8 @@ BAD = {
 
 
 @pytest.mark.parametrize(("setting", "message"), BAD.values(), ids=BAD.keys())
-def test_bad_parameters_are_refused(mini: Path, tmp_path: Path, egvs, setting: str, message: str) -> None:
-    code, printed, said = egvs("run", mini, "--out", tmp_path / "out", "--set", f"effects.{setting}")
+def test_bad_parameters_are_refused(mini: Path, tmp_path: Path, run_egvs, setting: str, message: str) -> None:
+    code, printed, said = run_egvs("run", mini, "--out", tmp_path / "out", "--set", f"effects.{setting}")
     assert (code, printed) == (2, "")
     assert message in " ".join(said.split())
     assert not (tmp_path / "out" / "scores.parquet").exists()
@@ -515,7 +515,7 @@ def test_bad_parameters_are_refused(mini: Path, tmp_path: Path, egvs, setting: s
 )
 def test_bad_optics_are_refused(mini: Path, key: str) -> None:
     with pytest.raises(InputError, match=rf"sensors\.small\.{key.split('=')[0]}"):
-        pipeline.load(mini, [f"sensors.small.{key}"])
+        egvs.load(mini, [f"sensors.small.{key}"])
 
 
 # The run
@@ -525,8 +525,8 @@ def test_bad_optics_are_refused(mini: Path, key: str) -> None:
 def test_only_the_score_runs_again(mini: Path, tmp_path: Path) -> None:
     def states(*settings: str) -> dict[str, str]:
         seen: dict[str, str] = {}
-        workflow.run(
-            pipeline.load(mini, settings),
+        run.run(
+            egvs.load(mini, settings),
             tmp_path / "out",
             listener=lambda stage, state, _: seen.__setitem__(stage, state),
         )
@@ -547,16 +547,19 @@ def test_bytes_do_not_depend_on_threads(done: tuple[Path, Path], settings: list[
     assert len({scored(done, settings, jobs)[1] for jobs in (1, 2, 3)}) == 1
 
 
-MODULES = ("pipeline.effects.scan", "pipeline.effects.score", "pipeline.effects.traffic")
+MODULES = tuple(f"egvs.effects.{name}" for name in (
+    "divergence", "foliage", "mount_sway", "dropout", "fog", "moving_occlusion", "rain", "range_limit", "articulated",
+    "pedestrians_bicycles", "slope",
+))  # fmt: skip
 IMPORTED = """
 import sys
 import warnings
 warnings.simplefilter("error")
-import pipeline
-from pipeline.stages import score
+import egvs
+from egvs.stages import score
 from tests.stages import run_stage
-pipeline.load({folder!r}, {settings!r})
-run_stage(score, pipeline.load({folder!r}, {settings!r}), __import__("pathlib").Path({out!r}), jobs=1)
+egvs.load({folder!r}, {settings!r})
+run_stage(score, egvs.load({folder!r}, {settings!r}), __import__("pathlib").Path({out!r}), jobs=1)
 print(sorted(name for name in sys.modules if name.startswith({MODULES})))
 """
 
@@ -565,7 +568,7 @@ print(sorted(name for name in sys.modules if name.startswith({MODULES})))
 @pytest.mark.system
 @pytest.mark.parametrize(
     ("settings", "expected"),
-    [([], []), (ON["rain"], ["pipeline.effects.score", "pipeline.effects.score.rain"])],
+    [([], []), (ON["rain"], ["egvs.effects.rain"])],
     ids=["plain", "rain"],
 )
 def test_what_is_not_named_is_not_imported(
@@ -583,8 +586,8 @@ def test_what_is_not_named_is_not_imported(
 def test_a_whole_plain_run_imports_no_effect(mini: Path, tmp_path: Path) -> None:
     program = f"""
 import sys
-import pipeline
-pipeline.run(pipeline.load({str(mini)!r}), {str(tmp_path / "out")!r}, jobs=1)
+import egvs
+egvs.run(egvs.load({str(mini)!r}), {str(tmp_path / "out")!r}, jobs=1)
 print([name for name in sys.modules if name.startswith({MODULES})])
 """
     run = processes.python(program)
@@ -595,8 +598,8 @@ def test_more_beams_than_whole_numbers_hold_are_refused(
     mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Weighted hits are added up in units of 2**-32, so 2**31 crossings in one class of voxels would leave 64 bits."""
-    scenario = pipeline.load(mini, ON["rain"])
-    beams = sensors.resolve("small", scenario.sensors, "").beams
-    monkeypatch.setattr(visibility, "MOST_CROSSINGS", beams)
-    with pytest.raises(InputError, match=r"site pole_a: .* beams with effects; fewer than"):
-        pipeline.run(scenario, tmp_path / "out")
+    scenario = egvs.load(mini, ON["rain"])
+    beams = sensor.resolve_sensor("small", scenario.sensors, "").beams
+    monkeypatch.setattr(visibility, "MAX_CROSSINGS", beams)
+    with pytest.raises(InputError, match=r"site pole_a: expected fewer than .* beams with effects, got"):
+        egvs.run(scenario, tmp_path / "out")

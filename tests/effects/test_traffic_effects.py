@@ -17,27 +17,26 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.artefacts import tables
-from pipeline.artefacts.recorded_boxes import COLUMNS, FrameBoxes
-from pipeline.core.errors import InputError
-from pipeline.core.grid import Grid, Roi
-from pipeline.effects import scene_resolving
-from pipeline.effects.registry import effect_class
-from pipeline.effects.traffic import articulated, pedestrians_bicycles, slope
-from pipeline.effects.traffic.articulated import Articulated
-from pipeline.effects.traffic.slope import Slope
-from pipeline.scenario.effects import ArticulatedParameters, SlopeParameters
-from pipeline.scenario.loading import from_values, load
-from pipeline.scoring import occupancy
-from pipeline.sensing import sites
-from pipeline.sensing.scanner import Scanner
-from pipeline.sensing.scene import Scene
-from pipeline.stages import statics, traffic
-from pipeline.traffic import boxes, fcd, network, sumo, trajectories
-from pipeline.traffic.boxes import Size
-from pipeline.traffic.frames import FrameGroup
-from pipeline.world import terrain
-from pipeline.world.mesh import read_ply
+from egvs.artefacts import parquet
+from egvs.artefacts.traffic_frames import PITCHED_BOX_COLUMNS, FrameBoxes
+from egvs.core.errors import InputError
+from egvs.core.grid import Grid, Roi
+from egvs.effects import articulated, pedestrians_bicycles, slope
+from egvs.effects.articulated import Articulated
+from egvs.effects.registry import find_effect_class
+from egvs.effects.slope import Slope
+from egvs.scenario.effects_config import ArticulatedParameters, SlopeParameters
+from egvs.scenario.loading import load, scenario_from_dict
+from egvs.scoring import occupancy
+from egvs.sensors import sites
+from egvs.sensors.scanner import Scanner
+from egvs.sensors.scene import Scene
+from egvs.stages import inputs, statics, traffic
+from egvs.traffic import fcd, network, sumo, trajectories, vehicle_boxes
+from egvs.traffic.fcd import FrameGroup
+from egvs.traffic.vehicle_boxes import VehicleSize
+from egvs.world import terrain
+from egvs.world.mesh import read_ply
 from tests import processes
 from tests.stages import inputs_of, run_stage
 
@@ -68,7 +67,7 @@ def scenario(folder, effects=None, **keys):
         "traffic": {"frame_period_s": 0.25, **keys},
         "effects": effects or {},
     }
-    return from_values(values, folder, str(folder / "scenario.toml"))
+    return scenario_from_dict(values, folder, str(folder / "scenario.toml"))
 
 
 def build_road(folder, top, lanes=LANES):
@@ -82,7 +81,7 @@ def build_road(folder, top, lanes=LANES):
     )
     (folder / "e.edg.xml").write_text(f"<edges>{edges}</edges>")
     flags = ["--walkingareas", "--no-turnarounds", "--offset.disable-normalization"]
-    sumo.run("netconvert", ["-n", "n.nod.xml", "-e", "e.edg.xml", *flags, "-o", "road.net.xml"], folder)
+    sumo.run_program("netconvert", ["-n", "n.nod.xml", "-e", "e.edg.xml", *flags, "-o", "road.net.xml"], folder)
     return folder
 
 
@@ -97,7 +96,7 @@ def hill(tmp_path_factory):
 
 
 def rows(out):
-    table, _ = tables.read(out / "trajectories.parquet", "trajectories")
+    table, _ = parquet.read_artefact(out / "trajectories.parquet", "trajectories")
     return {name: np.array(table[name].to_pylist()) for name in table.column_names}
 
 
@@ -138,18 +137,19 @@ def test_an_effect_that_cannot_act_gives_the_bytes_of_the_plain_scene_and_says_s
     assert made == plain[0]
     name = next(iter(effects))
     assert re.fullmatch(rf"{name}: named, but .*: skipped, the result is the same", result["notes"][-1])
-    reason = effect_class(name)(scene.effects.named[name]).why_idle(Scene(scene, None, ()))
+    reason = find_effect_class(name)(scene.effects.named[name]).why_idle(Scene(scene, None, ()))
     assert reason and reason in result["notes"][-1]
     assert inputs_of(traffic, scene, tmp_path) == inputs_of(traffic, scenario(flat, **SMALL), tmp_path)
 
 
 def test_a_flat_network_imports_no_effect(flat, tmp_path):
+    values = scenario(flat, **(SMALL | {"frames": 8})).model_dump(mode="json")
     code = f"""
-import sys; from pathlib import Path; from pipeline.stages import statics, traffic; from tests.stages import run_stage
-from pipeline.scenario.loading import from_values
-scene = from_values({scenario(flat, **(SMALL | {"frames": 8})).model_dump(mode="json")!r}, Path({str(flat)!r}), "place")
+import sys; from pathlib import Path; from egvs.stages import statics, traffic; from tests.stages import run_stage
+from egvs.scenario.loading import scenario_from_dict
+scene = scenario_from_dict({values!r}, Path({str(flat)!r}), "place")
 run_stage(traffic, scene, Path({str(tmp_path)!r})); run_stage(statics, scene, Path({str(tmp_path)!r}))
-print([m for m in sys.modules if m.startswith("pipeline.effects.traffic")])"""
+print([m for m in sys.modules if m in ("egvs.effects.slope", "egvs.effects.articulated")])"""
     done = processes.python(code)
     assert (done.returncode, done.stdout.strip()) == (0, "[]"), done.stderr
 
@@ -195,8 +195,11 @@ def test_one_uphill_lane_from_zero_is_relief(tmp_path):
         '<nodes><node id="a" x="0" y="0" z="0"/><node id="b" x="100" y="0" z="4"/></nodes>'
     )
     (tmp_path / "e.edg.xml").write_text('<edges><edge id="ab" from="a" to="b"/></edges>')
-    sumo.run("netconvert", ["-n", "n.nod.xml", "-e", "e.edg.xml", "-o", "road.net.xml"], tmp_path)
-    assert network.may_have_heights(tmp_path / "road.net.xml") and network.read(tmp_path / "road.net.xml").has_heights
+    sumo.run_program("netconvert", ["-n", "n.nod.xml", "-e", "e.edg.xml", "-o", "road.net.xml"], tmp_path)
+    assert (
+        network.may_have_heights(tmp_path / "road.net.xml")
+        and network.read_net_xml(tmp_path / "road.net.xml").has_heights
+    )
     assert acts(scenario(tmp_path, **SMALL))[0]
 
 
@@ -205,7 +208,7 @@ def height_m(x):
 
 
 def test_the_surface_is_the_road_and_goes_on_level_beside_it(hill):
-    ground = terrain.ground(network.read(hill / "road.net.xml"))
+    ground = terrain.triangulate_ground(network.read_net_xml(hill / "road.net.xml"))
     x = np.linspace(5, 595, 400)
     for y in (-6.0, 0.0, 3.0, 6.0):
         off = np.abs(ground.height_m(x, np.full(400, y)) - height_m(x))
@@ -230,7 +233,7 @@ def test_on_the_grade_the_pitch_is_its_angle_and_the_centre_half_a_height_above_
 
 
 def test_over_the_ends_of_the_grade_both_ends_of_every_box_are_on_the_road(climbed, hill):
-    r, ground = climbed[1], terrain.ground(network.read(hill / "road.net.xml"))
+    r, ground = climbed[1], terrain.triangulate_ground(network.read_net_xml(hill / "road.net.xml"))
     wheels = r["kind"] != "pedestrian"
     for side in (1, -1):
         reach = side * r["length_m"] / 2
@@ -261,7 +264,7 @@ def test_footprints_stand_on_the_hill_and_sites_below_it_are_refused(hill, tmp_p
     ]
     (tmp_path / "s.geojson").write_text(f'{{"features": {features}}}'.replace("'", '"'))
     values = scenario(tmp_path, **SMALL).model_dump(mode="json") | {"statics": {"footprints": ["s.geojson"]}}
-    scene = from_values(values, tmp_path, "place")
+    scene = scenario_from_dict(values, tmp_path, "place")
     result = run_stage(statics, scene, tmp_path / "out")
     assert result["notes"] == ["slope: on, the ground follows the network's roads"]
     assert "surface" in inputs_of(statics, scene, tmp_path).files
@@ -274,22 +277,22 @@ def test_footprints_stand_on_the_hill_and_sites_below_it_are_refused(hill, tmp_p
     }
     assert tops["h"] == pytest.approx(6 + 5, abs=0.2) and spans["h"] == pytest.approx(5 + 10 * GRADE, abs=0.2)
     assert tops["p"] == pytest.approx(10 + 5, abs=0.1) and spans["p"] == pytest.approx(3)
-    Scanner(scene_resolving.resolve(scene, world)).check(sites.of(scene))
+    Scanner(inputs.resolve_scene(scene, world)).check(sites.candidate_sites(scene))
     low = values | {"sites": {"grid": {"low_m": [300, 10], "high_m": [300, 10], "spacing_m": 1, "heights_m": [5]}}}
     with pytest.raises(InputError, match=r"z_m = 5 is not above the ground \(z = (6|5\.9\d*)\)"):
-        below = scene_resolving.resolve(from_values(low, tmp_path, "place"), world)
+        below = inputs.resolve_scene(scenario_from_dict(low, tmp_path, "place"), world)
         Scanner(below).check(below.sites)
 
 
 def test_a_bridge_keeps_sumos_own_slope(climbed, hill):
     """A box well above the surface stands on something else."""
-    table = fcd.SCHEMA.empty_table().from_pylist(
+    table = fcd.FCD_SCHEMA.empty_table().from_pylist(
         [{"time_ms": 0, "id": "v", "type": "car", "x": 300, "y": 2, "z": 20, "angle": 90, "slope": 1.0, "speed": 1}],
-        schema=fcd.SCHEMA,
+        schema=fcd.FCD_SCHEMA,
     )
     group = FrameGroup(0, 1, np.zeros(1, np.int64), table)
-    found = boxes.from_bumpers(group, {"car": Size(4, 2, 1.5, "passenger")}, 1.0, "place")
-    seated = slope.Seating(terrain.ground(network.read(hill / "road.net.xml"))).change(found)
+    found = vehicle_boxes.boxes_from_bumpers(group, {"car": VehicleSize(4, 2, 1.5, "passenger")}, 1.0, "place")
+    seated = slope.SurfaceFitter(terrain.triangulate_ground(network.read_net_xml(hill / "road.net.xml"))).change(found)
     assert (seated.z_m, seated.pitch_rad) == (found.z_m, found.pitch_rad)
 
 
@@ -414,7 +417,7 @@ def test_longer_axles_cut_less_and_three_parts_follow_one_another(tmp_path):
 
 def test_a_long_bus_gets_parts_by_itself_and_a_short_one_does_not():
     sizes = {
-        name: Size(length, 2.5, 3, vclass)
+        name: VehicleSize(length, 2.5, 3, vclass)
         for name, vclass, length in (
             ("a", "bus", 18.75),
             ("b", "bus", 12),
@@ -529,7 +532,7 @@ def test_people_walk_on_sidewalks_facing_their_way_half_a_length_behind_their_fr
         "--precision",
         "8",
     ]
-    sumo.run("sumo", ["-c", "run.sumocfg", *flags], moved)
+    sumo.run_program("sumo", ["-c", "run.sumocfg", *flags], moved)
     text = (moved / "again.xml").read_text()
     step = re.search(r'<timestep time="90\.0+">(.*?)</timestep>', text, re.S)
     front = {
@@ -550,7 +553,7 @@ def test_people_walk_on_sidewalks_facing_their_way_half_a_length_behind_their_fr
 def test_a_bicycle_stops_on_its_lane_whatever_its_length(length_m: float, before_m: float) -> None:
     """SUMO refuses a stop that ends beyond the lane's end (175.53 of 175.526 m) or is shorter than 0.1 m."""
     end_m = max(length_m - before_m, length_m / 2)
-    stop = pedestrians_bicycles._stop(("lane", length_m), end_m - 12.0, end_m, 1.0)
+    stop = pedestrians_bicycles._stop(pedestrians_bicycles._BicycleLane("lane", length_m), end_m - 12.0, end_m, 1.0)
     first, last = (float(re.search(f'{key}="([^"]*)"', stop)[1]) for key in ("startPos", "endPos"))
     assert 0 <= first <= last - 0.1 + 1e-9
     assert last <= length_m
@@ -572,9 +575,9 @@ def test_people_never_lower_a_voxels_count(climbed):
     for kinds in ([], ["bicycle"], ["bicycle", "pedestrian"]):
         r = climbed[1]
         kept = ~np.isin(r["kind"], ["bicycle", "pedestrian"]) | np.isin(r["kind"], kinds)
-        values = np.column_stack([r[name][kept] for name in COLUMNS])
+        values = np.column_stack([r[name][kept] for name in PITCHED_BOX_COLUMNS])
         values[:, :3] = grid.to_grid_m(values[:, :3])
-        counts.append(occupancy.count(FrameBoxes(r["frame"][kept].astype(np.int64), values), grid, 240))
+        counts.append(occupancy.count_occupancy(FrameBoxes(r["frame"][kept].astype(np.int64), values), grid, 240))
     assert all(np.all(more >= less) and more.sum() > less.sum() for less, more in itertools.pairwise(counts))
 
 
@@ -595,9 +598,9 @@ def test_same_seed_same_bytes_and_the_same_over_traci(hill, climbed, tmp_path, p
     scene = scenario(hill, {"articulated": {}, **CROWD}, **SMALL)
     assert bytes_of(scene, tmp_path / "again")[1] == (climbed[2] / "trajectories.parquet").read_bytes()
     port, quiet = getFreeSocketPort(), subprocess.DEVNULL
-    command = [str(sumo.binary("sumo")), "-c", "run.sumocfg", "--remote-port", str(port)]
+    command = [str(sumo.sumo_binary("sumo")), "-c", "run.sumocfg", "--remote-port", str(port)]
     with subprocess.Popen(
-        command, cwd=tmp_path / "again" / "sumo", env=sumo.environment(), stdout=quiet, stderr=quiet
+        command, cwd=tmp_path / "again" / "sumo", env=sumo.sumo_environment(), stdout=quiet, stderr=quiet
     ) as process:
         try:
             run_stage(traffic, scene, tmp_path / "polled", traci=("localhost", port))
@@ -644,16 +647,20 @@ def parts(kind, **lists):
 
 
 BAD = {
-    "no sidewalks": (PLAIN_LANES, crowd(pedestrians_per_h=9), r"no sidewalks.*--sidewalks\.guess --crossings\.guess"),
+    "no sidewalks": (
+        PLAIN_LANES,
+        crowd(pedestrians_per_h=9),
+        r"no connected sidewalks.*--sidewalks\.guess --crossings\.guess",
+    ),
     "no bicycle lanes": (PLAIN_LANES, crowd(bicycles_per_h=9), r"no lane that bicycles may use.*--bikelanes\.guess"),
-    "an unknown kind": (LANES, parts("tram", parts_m=[5, 5]), r"no kind of vehicle 'tram'; one of bendy, car"),
+    "an unknown kind": (LANES, parts("tram", parts_m=[5, 5]), r"no vehicle type 'tram'. Use one of bendy, car"),
     "too long parts": (
         LANES,
         parts("bendy", parts_m=[10, 9]),
-        r"bendy\.parts_m: adds up to 19 m of the kind's 18\.75 m",
+        r"bendy\.parts_m: .*at most the type's 18\.75 m, got 19 m",
     ),
-    "one short part": (LANES, parts("bendy", parts_m=[10]), r"adds up to 10 m .*; as much"),
-    "a hinge behind": (LANES, parts("bendy", parts_m=[9, 9], hinges_m=[19]), r"hinges_m: 19 m; less than"),
+    "one short part": (LANES, parts("bendy", parts_m=[10]), r"exactly the type's .*, got 10 m"),
+    "a hinge behind": (LANES, parts("bendy", parts_m=[9, 9], hinges_m=[19]), r"hinges_m: .*18\.75 m, got 19 m"),
 }
 
 
@@ -677,14 +684,14 @@ WRONG = {
     "a wrong word": ("effects.articulated.kind=1", r"articulated\.kind: unknown key; did you mean kinds\?"),
     "people beside a finished file": (
         "effects.pedestrians_bicycles.bicycles_per_h=9",
-        r"finished FCD file, so nobody can be",
+        r"cannot be added to a finished FCD file",
     ),
 }
 
 
 @pytest.mark.parametrize(("override", "message"), WRONG.values(), ids=WRONG.keys())
-def test_bad_parameters_are_refused(mini, egvs, tmp_path, override, message):
-    code, _, said = egvs("traffic", mini, "--out", tmp_path / "out", "--set", override)
+def test_bad_parameters_are_refused(mini, run_egvs, tmp_path, override, message):
+    code, _, said = run_egvs("traffic", mini, "--out", tmp_path / "out", "--set", override)
     assert code == 2 and re.search(message, " ".join(said.split())), said
 
 
@@ -707,7 +714,7 @@ def test_the_hill_networks_sources_give_the_committed_network(tmp_path):
     names = {"-n": "network.nod.xml", "-e": "network.edg.xml", "-x": "network.con.xml", "-i": "network.tll.xml"}
     flags = ["--walkingareas", "--offset.disable-normalization", "--no-turnarounds"]
     flags += ["--junctions.internal-link-detail", "10", "--precision", "3", "-o", "made.net.xml"]
-    sumo.run("netconvert", [*(word for pair in names.items() for word in pair), *flags], tmp_path)
+    sumo.run_program("netconvert", [*(word for pair in names.items() for word in pair), *flags], tmp_path)
     made = [
         re.sub(r"<!--.*?-->", "", text, flags=re.S).split()
         for text in ((tmp_path / "made.net.xml").read_text(), (HILL / "network.net.xml").read_text())

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from pipeline.explore.page import Page
+from egvs.explore.page import Page
 
 
 @contextmanager

@@ -19,15 +19,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.explore.kept import KEPT
-from pipeline.explore.opening import open_session
-from pipeline.explore.view import Camera
-from pipeline.sensing.sites import Pose
+from egvs.explore.page import GIZMO_M, Page
+from egvs.explore.settings import open_session
+from egvs.explore.view_state import SAVED_SITES, Camera
+from egvs.sensors.sites import Pose
 from tests.conftest import write_mini
 
 viser = pytest.importorskip("viser", reason="the page needs viser: pip install 'egvs[explore]'")
 
-from pipeline.explore.page import GIZMO_M, Page  # noqa: E402 - needs viser
 from tests.explore.serving import serving  # noqa: E402
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -185,12 +184,12 @@ def test_a_lost_connection_comes_back_with_what_changed(tab: Any, page: Page) ->
 
 def test_a_users_file_is_not_written_over_before_he_says_so(tab: Any, page: Page) -> None:
     folder = page.session.scenario.folder
-    (folder / KEPT).write_text("mine")
+    (folder / SAVED_SITES).write_text("mine")
     tab.get_by_role("button", name="Keep this pose").click()
     tab.get_by_text("was not written by egvs explore").wait_for(timeout=READY_MS)
     tab.get_by_role("button", name="Keep in kept_sites-2.csv").click()
     tab.get_by_text("kept as pole_a-1").wait_for(timeout=READY_MS)
-    assert (folder / KEPT).read_text() == "mine"
+    assert (folder / SAVED_SITES).read_text() == "mine"
     assert (folder / "kept_sites-2.csv").read_text().splitlines()[1].startswith("pole_a-1,10.0,12.0,3.0")
 
 

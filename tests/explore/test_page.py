@@ -17,16 +17,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-import pipeline
-from pipeline.core.errors import InputError
-from pipeline.explore import wording
-from pipeline.explore.drawing import shapes
-from pipeline.explore.opening import open_session
-from pipeline.explore.playback import Playback
-from pipeline.explore.session import Session
-from pipeline.explore.settings import Settings, Variants
-from pipeline.explore.view import LAYERS
-from pipeline.sensing.sites import Pose
+import egvs
+from egvs.core.errors import InputError
+from egvs.explore import controls, drawing
+from egvs.explore.page import HOST, Page
+from egvs.explore.session import Playback, Session
+from egvs.explore.settings import SessionFactory, Settings, open_session
+from egvs.explore.view_state import LAYERS
+from egvs.sensors.sites import Pose
 from tests.conftest import write_mini
 
 viser = pytest.importorskip("viser", reason="the page needs viser: pip install 'egvs[explore]'")
@@ -34,7 +32,6 @@ viser = pytest.importorskip("viser", reason="the page needs viser: pip install '
 import websockets  # noqa: E402 - comes with viser
 from websockets.sync.client import connect  # noqa: E402
 
-from pipeline.explore.page import HOST, Page  # noqa: E402
 from tests.explore.serving import serving  # noqa: E402
 
 
@@ -92,8 +89,8 @@ def test_a_world_that_is_drawn_coarser_says_so(
 ) -> None:
     said, add = [], viser.GuiApi.add_markdown
     monkeypatch.setattr(viser.GuiApi, "add_markdown", lambda gui, text: (said.append(text), add(gui, text))[1])
-    for most in (shapes.MOST_TRIANGLES, 6):
-        monkeypatch.setattr(shapes.solids, "__defaults__", (most,))
+    for most in (drawing.MAX_TRIANGLES, 6):
+        monkeypatch.setattr(drawing.solid_meshes, "__defaults__", (most,))
         with serving(Page(session, tmp_path / str(most))):
             pass
     (told,) = [text for text in said if "triangles" in text]
@@ -107,7 +104,7 @@ def test_what_rests_is_what_was_wanted_last(page: Page, session: Session) -> Non
     settled(page, "pole_a", poses[-1])
     expected = session.rate("pole_a", poses[-1])
     assert page.rating == expected
-    assert f"## {expected.scores['egvs']:,.1f}" in page.controls.told.content
+    assert f"## {expected.scores['egvs']:,.1f}" in page.controls.status.content
 
 
 def test_controls_and_gizmo_follow(page: Page) -> None:
@@ -132,8 +129,8 @@ def test_in_the_dark_the_world_is_dark(page: Page) -> None:
 
 def test_where_none_can_stand_no_score_is_left(page: Page) -> None:
     settled(page, "pole_a", Pose(16, 6, 3))
-    assert page.controls.told.content.startswith("## no score")
-    assert "stands inside house" in page.controls.told.content
+    assert page.controls.status.content.startswith("## no score")
+    assert "is inside house" in page.controls.status.content
     assert page._label.text == "pole_a: cannot stand"
 
 
@@ -172,7 +169,7 @@ def test_layers_show_what_their_names_say(page: Page, session: Session, layer: s
         for name, bit in zip(("pole_a", "pole_b"), alone, strict=True):
             assert f"{name} alone sees {bit:,.1f} bit" in page.controls._legend.content
     if layer == "blindspots":
-        assert f"{session.blindspots(site).whole.share:.1%} seen" in page.controls._legend.content
+        assert f"{session.blindspots(site).overall.share:.1%} seen" in page.controls._legend.content
 
 
 @pytest.mark.slow
@@ -194,7 +191,7 @@ def test_settings_are_those_of_a_run_with_them(page: Page, session: Session, tmp
     with_them = Settings(2.0, "points_on_target", frozenset({"moving_occlusion"}))
     page.ask(settings=with_them)
     assert page.rest(60)
-    expected = Variants(session, tmp_path / "other").session(with_them)
+    expected = SessionFactory(session, tmp_path / "other").session(with_them)
     assert page.session is not session
     assert page.rating == expected.rate("pole_a", pose)
     assert {name: its.scores for name, its in page.session.candidates.items()} == {
@@ -202,10 +199,10 @@ def test_settings_are_those_of_a_run_with_them(page: Page, session: Session, tmp
     }
     assert (page.controls.gamma.value, page.controls.score.value) == (2.0, "points_on_target")
     assert page.controls.effects["moving_occlusion"].value
-    assert wording.ranking(expected.ranked, "points_on_target") == page.controls._ranking.content
+    assert controls.ranking_table(expected.ranked, "points_on_target") == page.controls._ranking.content
     page.ask(settings=replace(with_them, gamma=-1.0))
     assert page.rest(60)
-    assert "input should be greater than or equal to 0" in page.controls.told.content
+    assert "input should be greater than or equal to 0" in page.controls.status.content
     assert page.view.settings == with_them
     page.ask(settings=Settings.of(session.scenario))
     assert page.rest(60)
@@ -262,7 +259,7 @@ def test_a_link_shows_what_it_says(page: Page, session: Session) -> None:
     assert (page.view.site.pose, page.view.layer) == (Pose(10.5, 12, 4), "seen")
     assert opener.open(f"{page.address}&site=nobody").url == f"{page._origin}/"
     assert page.rest(30)
-    assert "nobody" in page.controls.told.content
+    assert "nobody" in page.controls.status.content
     assert page.view.site.pose == Pose(10.5, 12, 4)
 
 
@@ -280,13 +277,13 @@ def test_who_is_gone_holds_nothing_any_more(page: Page) -> None:
 
 @pytest.mark.slow
 def test_a_plan_moves_with_its_sensors(mini: Path, tmp_path: Path) -> None:
-    placed = pipeline.place(pipeline.load(mini, ["placement.count=1"]), tmp_path / "run")
+    placed = egvs.place(egvs.load(mini, ["placement.count=1"]), tmp_path / "run")
     served = Page(open_session(mini, (), tmp_path / "run"), tmp_path / "scratch")
     try:
         site = served.rating.site
         assert (
             f"**plan** pole\\_b: together {placed.joint:,.1f}; best for one more: pole\\_a"
-            in served.controls.told.content
+            in served.controls.status.content
         )
         assert served._server.scene.get_handle_by_name("/plan/label0") is None  # it is chosen
         assert served._server.scene.get_handle_by_name("/plan/label1").text == "pole_a: best for one more"

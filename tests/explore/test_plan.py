@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import pipeline
-from pipeline.explore.opening import open_session
-from pipeline.explore.session import Session
-from pipeline.sensing.sites import Site
+import egvs
+from egvs.explore.session import Session
+from egvs.explore.settings import open_session
+from egvs.sensors.sites import Site
 
 SITES = "site,x_m,y_m,z_m\na,10,12,3\nb,30.5,-12,3\nc,2,-12,4\nd,38,12,4\n"
 
@@ -27,7 +27,7 @@ def joint_egvs(session: Session, *sites: Site) -> float:
 def planned(mini: Path, tmp_path: Path) -> tuple[Session, float]:
     """A session over a run that holds a plan of two, and the joint score that `egvs place` wrote."""
     (mini / "sites.csv").write_text(SITES)
-    placed = pipeline.place(pipeline.load(mini, ["placement.count=2"]), tmp_path / "run")
+    placed = egvs.place(egvs.load(mini, ["placement.count=2"]), tmp_path / "run")
     return open_session(mini, (), tmp_path / "run"), placed.joint
 
 
@@ -69,15 +69,15 @@ def test_the_best_for_one_more_gains_most(planned: tuple[Session, float]) -> Non
 
 def test_a_refined_plan_stands_where_it_was_moved_to(mini: Path, tmp_path: Path) -> None:
     (mini / "sites.csv").write_text(SITES)
-    scenario = pipeline.load(mini, ["placement.count=2", "placement.refine.evaluations=20"])
-    placed = pipeline.place(scenario, tmp_path / "run", refine=True)
+    scenario = egvs.load(mini, ["placement.count=2", "placement.refine.evaluations=20"])
+    placed = egvs.place(scenario, tmp_path / "run", refine=True)
     plan = open_session(mini, (), tmp_path / "run").plan
     assert plan is not None
-    assert [site.pose for site in plan.sites.values()] == [pick.site.pose for pick in placed.picks]
+    assert [site.pose for site in plan.sites.values()] == [pick.site.pose for pick in placed.sensors]
     assert plan.joint == placed.joint
 
 
 def test_a_plan_of_other_settings_is_none(mini: Path, tmp_path: Path) -> None:
     assert open_session(mini, (), tmp_path / "bare").plan is None
-    pipeline.place(pipeline.load(mini, ["placement.count=1"]), tmp_path / "run")
+    egvs.place(egvs.load(mini, ["placement.count=1"]), tmp_path / "run")
     assert open_session(mini, ["roi.voxel_m=1.0"], tmp_path / "run").plan is None

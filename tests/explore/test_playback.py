@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.artefacts.readers import read_trajectories
-from pipeline.explore import playback
-from pipeline.explore.opening import open_session
-from pipeline.explore.playback import Playback
-from pipeline.explore.session import Session
-from pipeline.scoring.targets.scores import SEEN_WELL_POINTS
+from egvs.artefacts.traffic_frames import read_trajectories
+from egvs.explore import session as session_module
+from egvs.explore.session import Playback, Session
+from egvs.explore.settings import open_session
+from egvs.scoring.targets import SEEN_WELL_POINTS
 from tests.conftest import write_mini
 
 
@@ -25,7 +24,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
 
 
 def test_vehicles_are_those_of_the_record(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(playback, "AT_ONCE", 7)
+    monkeypatch.setattr(session_module, "FRAMES_PER_CHUNK", 7)
     played = Playback(session)
     rows = read_trajectories(session.work.path("trajectories.parquet")).to_pylist()
     assert played.frames == 40
@@ -51,7 +50,7 @@ def test_returns_of_a_vehicle_lie_on_it(session: Session) -> None:
             half = box[3:6] / 2.0 + noise_m
             assert (np.abs(np.column_stack([along, across, away[:, 2]])) <= half).all()
             of_vehicles += len(away)
-            assert moment.is_seen[index] == (len(away) >= SEEN_WELL_POINTS)
+            assert moment.is_visible[index] == (len(away) >= SEEN_WELL_POINTS)
         assert len(played.kinds(moment.frame)) == len(moment.frame.boxes)
     assert of_vehicles > 500
 
@@ -83,5 +82,5 @@ def test_where_no_sensor_can_stand_there_are_vehicles_alone(session: Session) ->
     inside = replace(site, pose=replace(site.pose, x_m=16.0, y_m=6.0))
     moment = played.moment(inside, 5)
     assert len(moment.frame.boxes) == 2
-    assert not moment.is_seen.any()
+    assert not moment.is_visible.any()
     assert len(moment.returns_m) == 0

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import pipeline
-from pipeline.artefacts import blindspots
-from pipeline.artefacts.readers import read_scores, read_scores_by_period
-from pipeline.core.errors import InputError
-from pipeline.explore.opening import open_session
-from pipeline.explore.session import Session
-from pipeline.sensing.sites import Pose
+import egvs
+from egvs.artefacts import readers
+from egvs.artefacts.readers import read_scores, read_scores_by_period
+from egvs.core.errors import InputError
+from egvs.explore.session import Session
+from egvs.explore.settings import open_session
+from egvs.sensors.sites import Pose
 from tests.conftest import feature, write_mini
 
 EVERY = "score.others=['expected_detections','points_on_target','seen_well','coverage','expected_visibility']"
@@ -32,7 +32,7 @@ def opened(tmp_path_factory: pytest.TempPathFactory) -> Session:
 def scored(folder: Path, *settings: str) -> dict[str, dict]:
     """What `egvs run` makes of a scenario, by site."""
     out = folder / "scored"
-    pipeline.run(pipeline.load(folder, list(settings)), out)
+    egvs.run(egvs.load(folder, list(settings)), out)
     return {row["site"]: row for row in read_scores(out / "scores.parquet").to_pylist()}
 
 
@@ -93,7 +93,7 @@ def test_a_sensor_of_which_an_effect_must_know_more_has_no_score(tmp_path: Path)
     there = session.candidates["pole_a"]
     assert session.rate("pole_a", there.site.pose).scores == there.scores
     unknown = session.rate("pole_a", there.site.pose, "other")
-    assert not unknown.stands
+    assert not unknown.is_feasible
     assert "rated_range_m" in str(unknown.findings[-1])
 
 
@@ -146,11 +146,15 @@ def test_a_moved_sensor_has_the_scores_of_each_period(mini: Path, tmp_path: Path
 
 
 def test_blind_spots_are_those_of_the_artefact(opened: Session, tmp_path: Path) -> None:
-    for expected in blindspots.read(opened.work.path("blindspots.parquet")):
+    for expected in readers.read_blindspots(opened.work.path("blindspots.parquet")):
         found = opened.blindspots(opened.candidates[expected.site].site)
         assert np.array_equal(found.share_missed, expected.share_missed, equal_nan=True)
-        assert [replace(place, se=0.0) for place in found.places] == [replace(its, se=0.0) for its in expected.places]
-        assert np.array_equal([its.se for its in found.places], [its.se for its in expected.places], equal_nan=True)
+        assert [replace(place, se=0.0) for place in found.locations] == [
+            replace(its, se=0.0) for its in expected.locations
+        ]
+        assert np.array_equal(
+            [its.se for its in found.locations], [its.se for its in expected.locations], equal_nan=True
+        )
         assert (found.points, found.origin_m, found.cell_m) == (expected.points, expected.origin_m, expected.cell_m)
         assert found.in_words() == expected.in_words()
 
@@ -177,14 +181,14 @@ def test_the_rank_is_among_the_others(opened: Session) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"x_m": 16.0, "y_m": 6.0}, "(16, 6, 3) stands inside house (building); a free place"),
-        ({"z_m": -1.0}, "z_m = -1 is not above the ground (z = 0); a height above 0 m"),
-        ({"x_m": 500.0}, "stands 460.0 m from the region of interest; a place within the range of small, 100 m"),
+        ({"x_m": 16.0, "y_m": 6.0}, "(16, 6, 3) is inside house (building). Move it outside."),
+        ({"z_m": -1.0}, "z_m = -1 is not above the ground (z = 0). Use a height above 0 m."),
+        ({"x_m": 500.0}, "the site is 460.0 m from the region of interest. Move it within the range of small, 100 m."),
     ],
 )
 def test_where_none_can_stand_the_reason_is_told(opened: Session, change: dict[str, float], message: str) -> None:
     refused = opened.rate("pole_a", replace(Pose(10, 12, 3), **change))
-    assert not refused.stands
+    assert not refused.is_feasible
     assert (refused.rank, dict(refused.scores)) == (0, {})
     assert [str(finding) for finding in refused.findings] == [f"site pole_a: {message}"]
 
@@ -203,7 +207,7 @@ def test_a_measured_scan_cannot_be_moved(tmp_path: Path) -> None:
     there = session.candidates["pole_a"]
     assert session.rate("pole_a", there.site.pose).scores == there.scores
     moved = session.rate("pole_a", replace(there.site.pose, z_m=4.0))
-    assert not moved.stands
+    assert not moved.is_feasible
     assert "its empty scan was measured" in str(moved.findings[0])
 
 

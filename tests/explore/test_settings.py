@@ -6,12 +6,11 @@ from pathlib import Path
 
 import pytest
 
-import pipeline
-from pipeline.core.errors import InputError
-from pipeline.explore.opening import open_session
-from pipeline.explore.session import Session
-from pipeline.explore.settings import Settings, Variants, offered, trial_of
-from pipeline.runs import stages
+import egvs
+from egvs.core.errors import InputError
+from egvs.explore.session import Session
+from egvs.explore.settings import SessionFactory, Settings, offered_effects, open_session, trial_parameters
+from egvs.runs import stages
 from tests.explore.test_plan import SITES as FOUR_SITES
 from tests.explore.test_session import MOVED, scored, write_site
 
@@ -36,11 +35,11 @@ def session(mini: Path, tmp_path: Path) -> Session:
 @pytest.mark.parametrize("name", ANOTHER)
 def test_a_setting_is_what_a_run_with_it_gives(session: Session, mini: Path, tmp_path: Path, name: str) -> None:
     settings, overrides = ANOTHER[name]
-    before = {path.name: path.read_bytes() for path in session.work.folder.iterdir()}
-    tried = Variants(session, tmp_path / "scratch").session(settings)
+    before = {path.name: path.read_bytes() for path in session.work.folder.path.iterdir()}
+    tried = SessionFactory(session, tmp_path / "scratch").session(settings)
     candidates = {row: dict(tried.candidates[row].scores) for row in tried.candidates}
     moved = tried.rate("pole_a", MOVED)
-    assert {path.name: path.read_bytes() for path in session.work.folder.iterdir()} == before
+    assert {path.name: path.read_bytes() for path in session.work.folder.path.iterdir()} == before
     rows = scored(mini, *overrides)
     assert candidates == {site: {key: row[key] for key in candidates[site]} for site, row in rows.items()}
     assert all(its.rank == rows[site]["rank"] for site, its in tried.candidates.items())
@@ -54,7 +53,7 @@ def test_a_setting_is_what_a_run_with_it_gives(session: Session, mini: Path, tmp
 def test_an_effect_is_left_out_as_if_nobody_had_named_it(mini: Path, tmp_path: Path) -> None:
     rainy = open_session(mini, ["effects.rain.rate_mm_h=20"], tmp_path / "run")
     dry = Settings(None, "egvs", frozenset())
-    tried = Variants(rainy, tmp_path / "scratch").session(dry)
+    tried = SessionFactory(rainy, tmp_path / "scratch").session(dry)
     assert dict(tried.candidates["pole_a"].scores) == {
         key: scored(mini)["pole_a"][key] for key in ("egvs", "entropy_seen", "expected_detections")
     }
@@ -63,7 +62,7 @@ def test_an_effect_is_left_out_as_if_nobody_had_named_it(mini: Path, tmp_path: P
 
 
 def test_the_scenarios_own_settings_are_the_session_that_was_opened(session: Session, tmp_path: Path) -> None:
-    variants = Variants(session, tmp_path / "scratch")
+    variants = SessionFactory(session, tmp_path / "scratch")
     assert variants.session(Settings.of(session.scenario)) is session
     assert not (tmp_path / "scratch").exists()
     assert Settings.of(session.scenario).in_words(session.scenario) == ()
@@ -73,17 +72,19 @@ def test_what_a_setting_does_not_touch_is_taken_over(
     session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("EGVS_STORE", "")  # else it would come from there
-    made, make = [], stages.make
-    monkeypatch.setattr(stages, "make", lambda name, *args, **more: (made.append(name), make(name, *args, **more))[1])
-    Variants(session, tmp_path / "scratch").session(Settings(2.5, "egvs", frozenset()))
+    made, make = [], stages.run_stage
+    monkeypatch.setattr(
+        stages, "run_stage", lambda name, *args, **more: (made.append(name), make(name, *args, **more))[1]
+    )
+    SessionFactory(session, tmp_path / "scratch").session(Settings(2.5, "egvs", frozenset()))
     assert made == ["score"]
 
 
 def test_a_plan_is_worth_with_a_setting_what_egvs_place_says(mini: Path, tmp_path: Path) -> None:
     (mini / "sites.csv").write_text(FOUR_SITES)
-    pipeline.place(pipeline.load(mini, ["placement.count=2"]), tmp_path / "run")
+    egvs.place(egvs.load(mini, ["placement.count=2"]), tmp_path / "run")
     session = open_session(mini, (), tmp_path / "run")
-    tried = Variants(session, tmp_path / "scratch").session(Settings(1.0, "egvs", frozenset()))
+    tried = SessionFactory(session, tmp_path / "scratch").session(Settings(1.0, "egvs", frozenset()))
     assert session.plan is not None
     assert tried.plan is not None
     assert list(tried.plan.sites) == list(session.plan.sites)
@@ -94,7 +95,7 @@ def test_a_plan_is_worth_with_a_setting_what_egvs_place_says(mini: Path, tmp_pat
 
 
 def test_what_a_run_would_refuse_is_refused(session: Session, tmp_path: Path) -> None:
-    variants = Variants(session, tmp_path / "scratch")
+    variants = SessionFactory(session, tmp_path / "scratch")
     with pytest.raises(InputError, match=r"score\.gamma: -1\.0; input should be greater than or equal to 0"):
         variants.session(Settings(-1.0, "egvs", frozenset()))
     with pytest.raises(InputError, match="rated_range_m"):
@@ -103,7 +104,7 @@ def test_what_a_run_would_refuse_is_refused(session: Session, tmp_path: Path) ->
 
 
 def test_effects_that_the_scene_calls_for_are_offered(mini: Path, tmp_path: Path, session: Session) -> None:
-    assert set(offered(session)) == {"divergence", "moving_occlusion"}
-    assert trial_of("moving_occlusion") == {}
+    assert set(offered_effects(session)) == {"divergence", "moving_occlusion"}
+    assert trial_parameters("moving_occlusion") == {}
     rainy = open_session(mini, ["effects.rain.rate_mm_h=20"], tmp_path / "rainy")
-    assert set(offered(rainy)) == {"divergence", "moving_occlusion", "rain"}
+    assert set(offered_effects(rainy)) == {"divergence", "moving_occlusion", "rain"}

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.explore import page as pages
+from egvs.explore import page
 from tests.processes import EGVS
 
 
@@ -45,49 +45,55 @@ def test_it_serves_until_an_interrupt_and_leaves_nothing(mini: Path, tmp_path: P
     assert {path: path.read_bytes() for path in out.iterdir()} == before
 
 
-def test_the_address_is_printed_and_opened(egvs, mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_address_is_printed_and_opened(
+    run_egvs, mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     opened: list[str] = []
     monkeypatch.setattr(webbrowser, "open", opened.append)
-    monkeypatch.setattr(pages.Page, "run", lambda page: opened.append(page.address))
-    code, out, err = egvs("explore", mini, "--out", tmp_path / "run")
+    monkeypatch.setattr(page.Page, "run", lambda page: opened.append(page.address))
+    code, out, err = run_egvs("explore", mini, "--out", tmp_path / "run")
     assert (code, err.splitlines()[-1].partition(" ")[0]) == (0, "score")
     assert opened[0] == opened[1]
-    assert out.splitlines()[-1] == f"{opened[0]}  (Ctrl-C ends it)"
-    egvs("explore", tmp_path / "run", "--no-browser")
+    assert out.splitlines()[-1] == f"{opened[0]}  (press Ctrl-C to stop)"
+    run_egvs("explore", tmp_path / "run", "--no-browser")
     assert len(opened) == 3
 
 
-def test_it_begins_with_the_view_of_a_link(egvs, mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_begins_with_the_view_of_a_link(
+    run_egvs, mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     shown: list[tuple] = []
 
-    def run(page: pages.Page) -> None:
+    def run(page: page.Page) -> None:
         page._show(page._latest)
         shown.append((page.view.site.name, page.view.site.pose.z_m, page.view.layer))
 
-    monkeypatch.setattr(pages.Page, "run", run)
+    monkeypatch.setattr(page.Page, "run", run)
     explore = ("explore", mini, "--no-browser", "--out", tmp_path / "run", "--view")
-    assert egvs(*explore, "site=pole_a&pose=10,12,4.5,0,0,0&layer=seen")[0] == 0
+    assert run_egvs(*explore, "site=pole_a&pose=10,12,4.5,0,0,0&layer=seen")[0] == 0
     assert shown == [("pole_a", 4.5, "seen")]
-    code, _, err = egvs(*explore, "site=nobody")
+    code, _, err = run_egvs(*explore, "site=nobody")
     assert (code, err.splitlines()[-1]) == (2, "egvs: --view: site: 'nobody'; one of pole_a, pole_b")
 
 
-def test_without_the_extra_it_says_how_to_install_it(egvs, mini: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_extra_it_says_how_to_install_it(run_egvs, mini: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(mini.parent)
     monkeypatch.setitem(sys.modules, "viser", None)
-    code, out, err = egvs("explore", mini)
+    code, out, err = run_egvs("explore", mini)
     assert (code, out) == (2, "")
     assert err == "egvs: egvs explore needs viser, which is not installed: pip install 'egvs[explore]'\n"
     assert not Path("runs").exists()
 
 
-def test_a_port_that_is_taken_is_one_message_before_any_work(egvs, mini: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_port_that_is_taken_is_one_message_before_any_work(
+    run_egvs, mini: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(mini.parent)
     with socket.socket() as other:
-        other.bind((pages.HOST, 0))
+        other.bind((page.HOST, 0))
         other.listen()
         port = other.getsockname()[1]
-        code, out, err = egvs("explore", mini, "--port", port)
+        code, out, err = run_egvs("explore", mini, "--port", port)
     assert (code, out) == (2, "")
     assert err == f"egvs: --port: {port} is taken; another one, or 0 for any that is free\n"
     assert not Path("runs").exists()
@@ -102,10 +108,10 @@ def test_a_port_that_is_taken_is_one_message_before_any_work(egvs, mini: Path, m
     ],
 )
 def test_what_is_wrong_is_one_message(
-    egvs, mini: Path, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], message: str
+    run_egvs, mini: Path, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], message: str
 ) -> None:
     monkeypatch.chdir(mini.parent)
-    code, out, err = egvs("explore", *options)
+    code, out, err = run_egvs("explore", *options)
     assert (code, out) == (2, "")
     assert message in err
     assert "Traceback" not in err

@@ -8,12 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.errors import InputError
-from pipeline.explore.opening import open_session
-from pipeline.explore.session import Session
-from pipeline.explore.settings import Settings
-from pipeline.explore.view import LAYERS, Camera, View, of_text, text_of
-from pipeline.sensing.sites import Pose
+from egvs.core.errors import InputError
+from egvs.explore.session import Session
+from egvs.explore.settings import Settings, open_session
+from egvs.explore.view_state import LAYERS, Camera, View, decode_view, encode_view
+from egvs.sensors.sites import Pose
 from tests.conftest import write_mini
 from tests.explore.test_session import in_periods
 
@@ -43,17 +42,17 @@ def test_a_link_brings_it_all_back(
     site = replace(session.candidates["pole_a"].site, pose=pose, sensor="VLP-16")
     settings = Settings(gamma, "points_on_target", frozenset({"divergence"}))
     view = View(site, settings, "night", layer, ring, frame, "pole_b", is_dark)
-    assert of_text(text_of(view, opened), session, opened, "link") == (view, None)
+    assert decode_view(encode_view(view, opened), session, opened, "link") == (view, None)
 
 
 def test_what_was_opened_is_short(session: Session) -> None:
     opened = View.of(session)
-    text = text_of(opened, opened)
+    text = encode_view(opened, opened)
     assert text == "site=pole_b&pose=30.5,-12,3,0,0,0&sensor=small"
-    assert of_text(text, session, opened, "link") == (opened, None)
-    assert of_text("", session, opened, "link") == (opened, None)
+    assert decode_view(text, session, opened, "link") == (opened, None)
+    assert decode_view("", session, opened, "link") == (opened, None)
     camera = Camera((1.5, 2.0, 100.0), (20.0, 0.0, 0.25))
-    assert of_text(f"?{text_of(opened, opened, camera)}", session, opened, "link") == (opened, camera)
+    assert decode_view(f"?{encode_view(opened, opened, camera)}", session, opened, "link") == (opened, camera)
 
 
 @pytest.mark.parametrize(
@@ -79,4 +78,4 @@ def test_what_was_opened_is_short(session: Session) -> None:
 )
 def test_what_is_not_there_is_named(session: Session, text: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        of_text(text, session, View.of(session), "link")
+        decode_view(text, session, View.of(session), "link")

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline import load, place
-from pipeline.runs import workflow
+from egvs import load, place
+from egvs.runs import run
 from tests.conftest import collection, feature, write_mini
 
 EPSG, OFFSET_M = 25832, (-550000.0, -5630000.0)
@@ -21,7 +21,7 @@ def _made(folder: Path, text: str = "", sites: str | None = None) -> Path:
     file.write_text(file.read_text() + text)
     if sites is not None:
         (scenario / "sites.csv").write_text(sites)
-    workflow.run(load(scenario), folder / "run")
+    run.run(load(scenario), folder / "run")
     return folder / "run"
 
 
@@ -67,6 +67,6 @@ def on_roads(tmp_path_factory: pytest.TempPathFactory) -> Path:
     lamp = feature({"type": "Point", "coordinates": LAMP}, name="lamp", kind="pole", height_m=5, radius_m=0.1)
     (scenario / "statics.geojson").write_text(collection(house, lamp))
     loaded, out = load(scenario, ["placement.count=2"]), scenario.parent / "run"
-    workflow.run(loaded, out)
+    run.run(loaded, out)
     place(loaded, out)
     return out

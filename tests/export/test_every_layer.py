@@ -19,8 +19,8 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from pipeline.artefacts import tables
-from pipeline.export.exporting import FORMATS, export
+from egvs.artefacts import parquet
+from egvs.export.export import FORMATS, export_run
 from tests.export.conftest import HOUSE, LAMP, OFFSET_M
 from tests.export.readers import points_of_gpkg, points_of_wkb, utm32
 
@@ -50,7 +50,7 @@ Layers = dict[str, list[Thing]]
 
 
 def rows_of(run: Path, artefact: str) -> list[dict[str, Any]]:
-    table = tables.read(run / f"{artefact}.parquet", artefact)[0]
+    table = parquet.read_artefact(run / f"{artefact}.parquet", artefact)[0]
     return [{name: _plain(value) for name, value in row.items()} for row in table.to_pylist()]
 
 
@@ -192,7 +192,7 @@ def same(value: Any, wanted: Any) -> bool:
 )
 def test_every_layer_has_every_number_at_its_place(on_roads: Path, tmp_path: Path, to: str, crs: str) -> None:
     out = tmp_path / (f"run{FORMATS[to].suffix}" if FORMATS[to].is_one_file else "out")
-    export(on_roads, to, crs=crs, out=out)
+    export_run(on_roads, to, crs=crs, out=out)
     found, wanted = READERS[to](out), expected(on_roads)
     assert {name: len(its) for name, its in found.items()} == {name: len(its) for name, its in wanted.items()}
     for name, things in wanted.items():
@@ -225,7 +225,7 @@ def test_the_same_bytes_twice(on_roads: Path, tmp_path: Path, to: str) -> None:
     made = []
     for name in ("a", "b"):
         out = tmp_path / name
-        export(on_roads, to, out=out / f"run{FORMATS[to].suffix}" if FORMATS[to].is_one_file else out)
+        export_run(on_roads, to, out=out / f"run{FORMATS[to].suffix}" if FORMATS[to].is_one_file else out)
         made.append({path.name: path.read_bytes() for path in sorted(out.iterdir())})
     assert made[0] == made[1]
     assert len(made[0]) == {"gpkg": 1, "kml": 1, "geotiff": 12}.get(to, len(LAYERS))
@@ -234,6 +234,6 @@ def test_the_same_bytes_twice(on_roads: Path, tmp_path: Path, to: str) -> None:
 def test_geojson_in_a_system_of_its_own_names_it(on_roads: Path, tmp_path: Path) -> None:
     import pyogrio
 
-    export(on_roads, "geojson", crs="scenario", out=tmp_path)
+    export_run(on_roads, "geojson", crs="scenario", out=tmp_path)
     assert pyogrio.read_info(tmp_path / "plan.geojson")["crs"] == "EPSG:25832"
     assert json.loads((tmp_path / "plan.geojson").read_text())["name"] == "plan"

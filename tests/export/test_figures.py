@@ -11,21 +11,20 @@ from xml.etree import ElementTree as ET
 import pytest
 from PIL import Image
 
-from pipeline.artefacts.readers import read_scores
-from pipeline.core import plugins
-from pipeline.export.paper.figure import WHAT, draw
-from pipeline.export.paper.flat_svg import flat
-from pipeline.report.drawing.ranking_chart import Bar, chart
+from egvs.artefacts.readers import read_scores
+from egvs.core import plugins
+from egvs.export.figure import FIGURES, draw_figure, standalone_svg
+from egvs.report.svg_figures import Bar, bar_chart
 
 Call = Callable[..., tuple[int, str, str]]
 SVG = "{http://www.w3.org/2000/svg}"
 
 
 def drawn(run: Path, what: str, out: Path, **options: object) -> ET.Element:
-    return ET.parse(draw(run, what, kind="svg", out=out / f"{what}.svg", **options)).getroot()
+    return ET.parse(draw_figure(run, what, kind="svg", out=out / f"{what}.svg", **options)).getroot()
 
 
-@pytest.mark.parametrize("what", WHAT)
+@pytest.mark.parametrize("what", FIGURES)
 def test_a_figure_is_as_wide_as_asked_and_needs_no_style_sheet(local: Path, tmp_path: Path, what: str) -> None:
     root = drawn(local, what, tmp_path, width_mm=120.0)
     assert root.get("width") == "120mm"
@@ -53,19 +52,19 @@ def test_the_ranking_s_bars_are_as_long_as_the_scores(local: Path, tmp_path: Pat
 
 def test_letters_stand_over_their_halo() -> None:
     figure = '<svg class="plan" viewBox="0 0 100 50"><text class="label" x="1" y="2">a &amp; b</text></svg>'
-    halo, letters = ET.fromstring(flat(figure, 50.0)).findall(f"{SVG}text")
+    halo, letters = ET.fromstring(standalone_svg(figure, 50.0)).findall(f"{SVG}text")
     assert (halo.get("stroke"), halo.get("stroke-width")) == ("#ffffff", "3.5")
     assert (letters.get("stroke"), letters.get("fill"), letters.text) == (None, "#1d2430", "a & b")
 
 
 def test_a_more_specific_rule_wins() -> None:
     figure = '<svg class="plan" viewBox="0 0 9 9"><g class="site first"><circle class="q0"/></g></svg>'
-    circle = next(ET.fromstring(flat(figure, 50.0)).iter(f"{SVG}circle"))
+    circle = next(ET.fromstring(standalone_svg(figure, 50.0)).iter(f"{SVG}circle"))
     assert (circle.get("stroke-width"), circle.get("fill"), circle.get("stroke")) == ("2.6", "#fde725", "#1d2430")
 
 
 def test_a_bar_s_error_is_one_to_either_side() -> None:
-    text = chart([Bar("a", 0.5, 0.1, ""), Bar("b", 0.4, None, "")], "share", "", 316.0, 100.0)
+    text = bar_chart([Bar("a", 0.5, 0.1, ""), Bar("b", 0.4, None, "")], "share", "", 316.0, 100.0)
     # 23 left, 16 right: 277 units for 0.6
     assert 'd="M207.7 17.0H300.0' in text
     assert text.count('class="lead"') == 1
@@ -74,7 +73,7 @@ def test_a_bar_s_error_is_one_to_either_side() -> None:
 @pytest.mark.system  # loading cairo asks the system where it is
 def test_a_pdf_has_its_fonts_in_it(local: Path, tmp_path: Path) -> None:
     pytest.importorskip("cairosvg", reason="the extra egvs[figure] is not installed")
-    made = [draw(local, "seen", site="pole_a", out=tmp_path / name) for name in ("a.pdf", "b.pdf")]
+    made = [draw_figure(local, "seen", site="pole_a", out=tmp_path / name) for name in ("a.pdf", "b.pdf")]
     content = made[0].read_bytes()
     assert content == made[1].read_bytes()
     packed = re.findall(rb"stream\r?\n(.*?)endstream", content, flags=re.DOTALL)
@@ -91,15 +90,15 @@ def test_a_pdf_has_its_fonts_in_it(local: Path, tmp_path: Path) -> None:
 @pytest.mark.system
 def test_a_png_says_how_large_it_is(local: Path, tmp_path: Path) -> None:
     pytest.importorskip("cairosvg", reason="the extra egvs[figure] is not installed")
-    with Image.open(draw(local, "map", kind="png", width_mm=60.0, out=tmp_path / "map.png")) as image:
+    with Image.open(draw_figure(local, "map", kind="png", width_mm=60.0, out=tmp_path / "map.png")) as image:
         assert image.info["dpi"] == pytest.approx((600, 600), abs=0.1)
         assert image.width / 600 * 25.4 == pytest.approx(60.0, abs=0.1)
         assert image.convert("RGB").getpixel((2, 2)) == (255, 255, 255)
         assert len(image.convert("RGB").getcolors(image.width * image.height)) > 50
 
 
-def test_where_it_goes(local: Path, egvs: Call) -> None:
-    code, out, err = egvs("figure", local, "--what", "seen", "--site", "pole_b", "--format", "svg")
+def test_where_it_goes(local: Path, run_egvs: Call) -> None:
+    code, out, err = run_egvs("figure", local, "--what", "seen", "--site", "pole_b", "--format", "svg")
     path = local / "export" / "seen_pole_b.svg"
     assert (code, out, err) == (0, f"{path}\n", "")
     path.unlink()
@@ -107,13 +106,13 @@ def test_where_it_goes(local: Path, egvs: Call) -> None:
 
 
 def test_without_the_extra_svg_is_drawn_and_pdf_refused(
-    local: Path, tmp_path: Path, egvs: Call, monkeypatch: pytest.MonkeyPatch
+    local: Path, tmp_path: Path, run_egvs: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(plugins, "find_spec", lambda name: None)
-    code, _, err = egvs("figure", local, "--what", "ranking", "--out", tmp_path / "a.pdf")
+    code, _, err = run_egvs("figure", local, "--what", "ranking", "--out", tmp_path / "a.pdf")
     needs = "egvs: a figure as pdf needs cairosvg, which is not installed: pip install 'egvs[figure]'\n"
     assert (code, err) == (2, needs)
-    assert egvs("figure", local, "--what", "ranking", "--format", "svg", "--out", tmp_path / "a.svg")[0] == 0
+    assert run_egvs("figure", local, "--what", "ranking", "--format", "svg", "--out", tmp_path / "a.svg")[0] == 0
 
 
 @pytest.mark.parametrize(
@@ -121,16 +120,16 @@ def test_without_the_extra_svg_is_drawn_and_pdf_refused(
     [
         (("--what", "ruins"), "--what: 'ruins'; one of ranking, map, tpog, seen, missed"),
         (("--what", "map", "--format", "gif"), "--format: 'gif'; one of pdf, png, svg"),
-        (("--what", "map", "--size", "3mm"), "--size: '3mm'; a width of 50 to 1000 mm, for example 85mm"),
-        (("--what", "map", "--size", "wide"), "--size: 'wide'; a width of 50 to 1000 mm, for example 85mm"),
+        (("--what", "map", "--size", "3mm"), "--size: expected a width of 50 to 1000 mm, got '3mm'"),
+        (("--what", "map", "--size", "wide"), "--size: expected a width of 50 to 1000 mm, got 'wide'"),
         (("--what", "map", "--site", "pole_a"), "--site: with --what map; --what seen or missed"),
         (("--what", "seen", "--site", "x"), "--site: 'x' is no site of this run; one of pole_"),
         (("--what", "map", "--out", "a.png"), "--out: 'a.png'; a file that ends in .pdf for --format pdf"),
     ],
 )
-def test_what_cannot_be_drawn_is_one_message(local: Path, egvs: Call, options: tuple[str, ...], said: str) -> None:
+def test_what_cannot_be_drawn_is_one_message(local: Path, run_egvs: Call, options: tuple[str, ...], said: str) -> None:
     before = sorted(local.rglob("*"))
-    code, out, err = egvs("figure", local, *options)
+    code, out, err = run_egvs("figure", local, *options)
     assert (code, out) == (2, "")
     assert said in err
     assert err.count("\n") == 1

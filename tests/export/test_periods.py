@@ -5,9 +5,9 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-import pipeline
-from pipeline.artefacts.readers import read_scores, read_scores_by_period
-from pipeline.export.exporting import export
+import egvs
+from egvs.artefacts.readers import read_scores, read_scores_by_period
+from egvs.export.export import export_run
 from tests.scoring.test_periods import PERIODS
 
 
@@ -17,8 +17,8 @@ def test_a_site_has_the_scores_of_each_period(mini: Path, tmp_path: Path) -> Non
     periods = PERIODS.replace('"night"', '"SE"')
     file.write_text(file.read_text().replace("[[traffic.kinds]]", f"{periods}\n[[traffic.kinds]]", 1))
     run = tmp_path / "run"
-    pipeline.run(pipeline.load(mini), run)
-    export(run, "csv", out=tmp_path / "out")
+    egvs.run(egvs.load(mini), run)
+    export_run(run, "csv", out=tmp_path / "out")
     with (tmp_path / "out" / "sites.csv").open(encoding="utf-8-sig", newline="") as table:
         rows = {row["site"]: row for row in csv.DictReader(table)}
     scores = read_scores(run / "scores.parquet").to_pylist()

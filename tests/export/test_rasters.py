@@ -12,11 +12,11 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-import pipeline
-from pipeline.artefacts.blindspots import read as read_blindspots
-from pipeline.artefacts.readers import read_scores, read_tpog
-from pipeline.export.exporting import export
-from pipeline.scoring.egvs import binary_entropy
+import egvs
+from egvs.artefacts.readers import read_blindspots, read_scores
+from egvs.artefacts.tpog import read_tpog
+from egvs.export.export import export_run
+from egvs.scoring.egvs import binary_entropy
 from tests.export.conftest import OFFSET_M
 from tests.export.readers import utm32
 
@@ -36,7 +36,7 @@ def opened(path: Path) -> tuple[NDArray[np.float64], dict[int, object]]:
 
 
 def test_the_tpog_from_above_is_that_of_the_artefact(located: Path, tmp_path: Path) -> None:
-    export(located, "geotiff", out=tmp_path)
+    export_run(located, "geotiff", out=tmp_path)
     values, tags = opened(tmp_path / "tpog.tif")
     tpog = read_tpog(located / "tpog.parquet")
     assert float(tags[NODATA]) == -9999
@@ -52,7 +52,7 @@ def test_the_tpog_from_above_is_that_of_the_artefact(located: Path, tmp_path: Pa
 @pytest.mark.slow
 def test_seen_and_missed_add_up_to_the_entropy_and_to_the_score_s_share(located: Path, tmp_path: Path) -> None:
     name = "pole_a"
-    export(located, "geotiff", out=tmp_path, sites=[name])
+    export_run(located, "geotiff", out=tmp_path, sites=[name])
     (seen, _), (missed, _) = (opened(tmp_path / f"{word}_{name}.tif") for word in ("seen", "missed"))
     tpog = read_tpog(located / "tpog.parquet")
     whole = np.array([[sum(binary_entropy(int(c), 40) for c in column) for column in row] for row in tpog.counts])
@@ -67,7 +67,7 @@ def test_seen_and_missed_add_up_to_the_entropy_and_to_the_score_s_share(located:
 
 
 def test_vehicles_missed_are_those_of_the_blind_spots(located: Path, tmp_path: Path) -> None:
-    export(located, "geotiff", out=tmp_path, sites=["pole_a"])
+    export_run(located, "geotiff", out=tmp_path, sites=["pole_a"])
     values, tags = opened(tmp_path / "vehicles_missed_pole_a.tif")
     its = next(read_blindspots(located / "blindspots.parquet", {"pole_a"}))
     expected = np.flipud(np.nan_to_num(its.share_missed, nan=-9999).T)
@@ -76,7 +76,7 @@ def test_vehicles_missed_are_those_of_the_blind_spots(located: Path, tmp_path: P
 
 
 def test_the_picture_has_a_colour_table_and_no_data_is_0(located: Path, tmp_path: Path) -> None:
-    export(located, "geotiff", out=tmp_path)
+    export_run(located, "geotiff", out=tmp_path)
     values, _ = opened(tmp_path / "tpog.tif")
     with Image.open(tmp_path / "tpog_colours.tif") as image:
         steps, palette, tags = np.array(image), image.getpalette(), dict(image.tag_v2)
@@ -96,7 +96,7 @@ def test_the_picture_has_a_colour_table_and_no_data_is_0(located: Path, tmp_path
 
 
 def test_its_style_spans_the_values(located: Path, tmp_path: Path) -> None:
-    export(located, "geotiff", out=tmp_path)
+    export_run(located, "geotiff", out=tmp_path)
     values, _ = opened(tmp_path / "tpog.tif")
     items = list(ET.parse(tmp_path / "tpog.qml").getroot().iter("item"))
     assert float(items[-1].get("value")) == pytest.approx(values.max(), rel=1e-6)
@@ -106,7 +106,7 @@ def test_its_style_spans_the_values(located: Path, tmp_path: Path) -> None:
 def test_in_degrees_each_cell_has_the_value_of_its_place(located: Path, tmp_path: Path) -> None:
     """The middle of each cell, brought into the world frame by the projection's formulas, lies in the column of voxels
     whose value it has."""
-    export(located, "geotiff", crs="wgs84", out=tmp_path)
+    export_run(located, "geotiff", crs="wgs84", out=tmp_path)
     values, tags = opened(tmp_path / "tpog.tif")
     tpog = read_tpog(located / "tpog.parquet")
     west, north = tags[TIE][3:5]
@@ -128,26 +128,28 @@ def test_in_degrees_each_cell_has_the_value_of_its_place(located: Path, tmp_path
     assert checked > 300
 
 
-def test_what_was_not_kept_is_cast_from_what_the_scores_were_made_from(mini: Path, tmp_path: Path, egvs: Call) -> None:
+def test_what_was_not_kept_is_cast_from_what_the_scores_were_made_from(
+    mini: Path, tmp_path: Path, run_egvs: Call
+) -> None:
     """A site that hangs elsewhere by now would be shown with views that its score does not say."""
     run = tmp_path / "run"
-    pipeline.run(pipeline.load(mini, ["scan.keep=false"]), run)
-    code, told, _ = egvs("export", run, "--to", "geotiff", "--out", tmp_path / "a")
+    egvs.run(egvs.load(mini, ["scan.keep=false"]), run)
+    code, told, _ = run_egvs("export", run, "--to", "geotiff", "--out", tmp_path / "a")
     assert code == 0
     (mini / "sites.csv").write_text((mini / "sites.csv").read_text().replace("pole_a,10,", "pole_a,11,"))
     told = f"egvs: {run / 'run.json'}: sites.csv is not what scores were made from; egvs run makes them anew\n"
-    assert egvs("export", run, "--to", "geotiff", "--out", tmp_path / "b") == (2, "", told)
+    assert run_egvs("export", run, "--to", "geotiff", "--out", tmp_path / "b") == (2, "", told)
     assert not (tmp_path / "b").exists()
-    assert egvs("figure", run, "--what", "seen", "--format", "svg", "--out", tmp_path / "b.svg") == (2, "", told)
-    assert egvs("export", run, "--to", "csv", "--out", tmp_path / "b")[0] == 0
+    assert run_egvs("figure", run, "--what", "seen", "--format", "svg", "--out", tmp_path / "b.svg") == (2, "", told)
+    assert run_egvs("export", run, "--to", "csv", "--out", tmp_path / "b")[0] == 0
 
 
 def test_sites_of_nearly_the_same_name_have_files_of_their_own(mini: Path, tmp_path: Path) -> None:
     """Signs that no file can have, capitals, and what pictures are called."""
     names = ["a.b", "A_B", "a_b_colours"]
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m\n" + "".join(f"{n},{10 + i},12,3\n" for i, n in enumerate(names)))
-    pipeline.run(pipeline.load(mini), tmp_path / "run")
-    done = export(tmp_path / "run", "geotiff", out=tmp_path / "out", sites=names)
+    egvs.run(egvs.load(mini), tmp_path / "run")
+    done = export_run(tmp_path / "run", "geotiff", out=tmp_path / "out", sites=names)
     assert len({path.name.lower() for path in done.paths}) == len(done.paths) == 3 * (1 + 3 * len(names))
     with Image.open(tmp_path / "out" / "seen_a_b_colours.tif") as image:
         assert image.mode == "P"
@@ -155,7 +157,7 @@ def test_sites_of_nearly_the_same_name_have_files_of_their_own(mini: Path, tmp_p
 
 def test_the_same_bytes_twice(located: Path, tmp_path: Path) -> None:
     for name in ("a", "b"):
-        export(located, "geotiff", out=tmp_path / name)
+        export_run(located, "geotiff", out=tmp_path / name)
     files = sorted(path.name for path in (tmp_path / "a").iterdir())
     assert len(files) == 12
     assert all((tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes() for name in files)

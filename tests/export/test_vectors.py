@@ -14,15 +14,14 @@ from xml.etree import ElementTree as ET
 import pyarrow.parquet as pq
 import pytest
 
-from pipeline.artefacts.readers import read_scores
-from pipeline.core import files, plugins
-from pipeline.core.grid import Roi
-from pipeline.core.reading.seals import sealed
-from pipeline.export.exporting import FORMATS, export
-from pipeline.formats.crs import WorldFrame
-from pipeline.formats.georeference import Georeference
-from pipeline.world import world_frame
-from pipeline.world.footprints import read_geojson
+from egvs.artefacts.readers import read_scores
+from egvs.core import files, plugins
+from egvs.core.files import add_checksum
+from egvs.core.grid import Roi
+from egvs.export.export import FORMATS, export_run
+from egvs.formats.georeference import Georeference, WorldFrame
+from egvs.world import geolocation
+from egvs.world.footprints import read_geojson
 from tests.conftest import BUILDING
 from tests.export.conftest import EPSG, OFFSET_M
 from tests.export.readers import points_of_gpkg, points_of_wkb, utm32
@@ -52,7 +51,7 @@ def assert_at_sites(found: dict[str, tuple[float, float]]) -> None:
 
 
 def test_a_geopackage_holds_sites_scores_and_system(located: Path, tmp_path: Path) -> None:
-    done = export(located, "gpkg", out=tmp_path / "run.gpkg")
+    done = export_run(located, "gpkg", out=tmp_path / "run.gpkg")
     assert done.reference == "ETRS89 / UTM zone 32N"
     with sqlite3.connect(tmp_path / "run.gpkg") as file:
         assert file.execute("PRAGMA application_id").fetchone()[0] == 0x47504B47
@@ -73,7 +72,7 @@ def test_a_geopackage_holds_sites_scores_and_system(located: Path, tmp_path: Pat
 
 
 def test_its_style_colours_each_site_once(located: Path, tmp_path: Path) -> None:
-    export(located, "gpkg", out=tmp_path / "run.gpkg")
+    export_run(located, "gpkg", out=tmp_path / "run.gpkg")
     with sqlite3.connect(tmp_path / "run.gpkg") as file:
         styles = dict(file.execute("SELECT f_table_name, styleQML FROM layer_styles WHERE useAsDefault = 1"))
         registered = file.execute("SELECT data_type FROM gpkg_contents WHERE table_name = 'layer_styles'").fetchone()
@@ -92,7 +91,7 @@ def test_its_style_colours_each_site_once(located: Path, tmp_path: Path) -> None
 
 
 def test_symbols_of_rules_are_there(located: Path, tmp_path: Path) -> None:
-    export(located, "gpkg", out=tmp_path / "run.gpkg")
+    export_run(located, "gpkg", out=tmp_path / "run.gpkg")
     with sqlite3.connect(tmp_path / "run.gpkg") as file:
         styles = [ET.fromstring(text) for (text,) in file.execute("SELECT styleQML FROM layer_styles")]
     for style in styles:
@@ -105,7 +104,7 @@ def test_symbols_of_rules_are_there(located: Path, tmp_path: Path) -> None:
 
 def test_a_geopackage_is_the_same_twice(located: Path, tmp_path: Path) -> None:
     for name in ("a", "b"):
-        export(located, "gpkg", out=tmp_path / name / "run.gpkg")
+        export_run(located, "gpkg", out=tmp_path / name / "run.gpkg")
     assert (tmp_path / "a/run.gpkg").read_bytes() == (tmp_path / "b/run.gpkg").read_bytes()
 
 
@@ -113,7 +112,7 @@ def test_a_geopackage_is_the_same_twice(located: Path, tmp_path: Path) -> None:
 
 
 def test_geojson_is_in_degrees_that_the_projection_s_formulas_bring_back(located: Path, tmp_path: Path) -> None:
-    export(located, "geojson", out=tmp_path)
+    export_run(located, "geojson", out=tmp_path)
     document = json.loads((tmp_path / "sites.geojson").read_text())
     assert "crs" not in document  # RFC 7946
     found = {
@@ -127,7 +126,7 @@ def test_exported_footprints_are_footprints_again(located: Path, tmp_path: Path)
     frame = WorldFrame(f"EPSG:{EPSG}", OFFSET_M)
     world = Georeference(frame, Roi.around((20, 0, 2.5), (40, 20, 5)), "scenario.toml")
     for crs in ("scenario", "wgs84"):
-        export(located, "geojson", crs=crs, out=tmp_path / crs)
+        export_run(located, "geojson", crs=crs, out=tmp_path / crs)
         file = read_geojson(tmp_path / crs / "footprints.geojson", world)
         house = next(one for one in file.footprints if one.name == "house")
         assert (house.kind, house.base_m, house.height_m) == ("building", 0.0, 6.0)
@@ -137,7 +136,7 @@ def test_exported_footprints_are_footprints_again(located: Path, tmp_path: Path)
 
 
 def test_geoparquet_says_its_system_and_holds_positions(located: Path, tmp_path: Path) -> None:
-    export(located, "geoparquet", out=tmp_path)
+    export_run(located, "geoparquet", out=tmp_path)
     table = pq.read_table(tmp_path / "sites.parquet")
     about = json.loads(table.schema.metadata[b"geo"])
     assert about["columns"]["geometry"]["crs"]["id"] == {"authority": "EPSG", "code": EPSG}
@@ -146,7 +145,7 @@ def test_geoparquet_says_its_system_and_holds_positions(located: Path, tmp_path:
 
 
 def test_csv_is_for_a_spreadsheet(located: Path, tmp_path: Path) -> None:
-    export(located, "csv", out=tmp_path)
+    export_run(located, "csv", out=tmp_path)
     assert (tmp_path / "sites.csv").read_bytes().startswith(b"\xef\xbb\xbf")
     with (tmp_path / "sites.csv").open(encoding="utf-8-sig", newline="") as file:
         rows = list(csv.DictReader(file))
@@ -162,7 +161,7 @@ def test_csv_is_for_a_spreadsheet(located: Path, tmp_path: Path) -> None:
 
 
 def test_kml_has_every_site_in_degrees_and_in_its_colour(located: Path, tmp_path: Path) -> None:
-    export(located, "kml", out=tmp_path / "run.kml")
+    export_run(located, "kml", out=tmp_path / "run.kml")
     root = ET.parse(tmp_path / "run.kml").getroot()
     folders = {one.findtext(f"{KML}name"): one for one in root.iter(f"{KML}Folder")}
     styles = {f"#{one.get('id')}": one.findtext(f"{KML}IconStyle/{KML}color") for one in root.iter(f"{KML}Style")}
@@ -186,10 +185,10 @@ def test_kml_has_every_site_in_degrees_and_in_its_colour(located: Path, tmp_path
 
 @pytest.mark.parametrize("to", ["gpkg", "geojson", "geoparquet", "csv"])
 def test_without_a_reference_system_metres_are_local_and_that_is_said(
-    local: Path, tmp_path: Path, egvs: Call, to: str
+    local: Path, tmp_path: Path, run_egvs: Call, to: str
 ) -> None:
     out = tmp_path / ("run.gpkg" if to == "gpkg" else "out")
-    code, told, err = egvs("export", local, "--to", to, "--out", out)
+    code, told, err = run_egvs("export", local, "--to", to, "--out", out)
     assert (code, err) == (0, "")
     assert "positions in local metres of the world frame, as the scenario does not say where on the Earth" in told
     match to:
@@ -217,7 +216,7 @@ def test_without_a_reference_system_metres_are_local_and_that_is_said(
 
 
 def test_local_footprints_are_footprints_of_the_same_scenario(local: Path, tmp_path: Path) -> None:
-    export(local, "geojson", out=tmp_path)
+    export_run(local, "geojson", out=tmp_path)
     world = Georeference(None, Roi.around((20, 0, 2.5), (40, 20, 5)), "scenario.toml")
     house = next(one for one in read_geojson(tmp_path / "footprints.geojson", world).footprints if one.name == "house")
     assert set(house.polygon.exterior.coords) == {tuple(map(float, corner)) for corner in BUILDING[0]}
@@ -239,9 +238,9 @@ def test_local_footprints_are_footprints_of_the_same_scenario(local: Path, tmp_p
         (("--to", "gpkg", "--out", "sites.csv"), "--out: 'sites.csv'; a file that ends in .gpkg"),
     ],
 )
-def test_what_cannot_be_done_is_one_message(local: Path, egvs: Call, options: tuple[str, ...], said: str) -> None:
+def test_what_cannot_be_done_is_one_message(local: Path, run_egvs: Call, options: tuple[str, ...], said: str) -> None:
     before = sorted(local.rglob("*"))
-    code, out, err = egvs("export", local, *options)
+    code, out, err = run_egvs("export", local, *options)
     assert (code, out) == (2, "")
     assert said in err
     assert err.count("\n") == 1
@@ -250,22 +249,25 @@ def test_what_cannot_be_done_is_one_message(local: Path, egvs: Call, options: tu
 
 @pytest.mark.parametrize(("to", "library"), [("gpkg", "pyogrio"), ("geoparquet", "geopandas"), ("geotiff", "rasterio")])
 def test_without_the_extra_it_is_named(
-    local: Path, egvs: Call, monkeypatch: pytest.MonkeyPatch, to: str, library: str
+    local: Path, run_egvs: Call, monkeypatch: pytest.MonkeyPatch, to: str, library: str
 ) -> None:
     monkeypatch.setattr(plugins, "find_spec", lambda name: None)
-    code, _, err = egvs("export", local, "--to", to)
+    code, _, err = run_egvs("export", local, "--to", to)
     told = f"egvs: export to {to} needs {library}, which is not installed: pip install 'egvs[gis]'\n"
     assert (code, err) == (2, told)
 
 
-def test_a_run_that_is_not_there_or_not_done(tmp_path: Path, egvs: Call) -> None:
-    code, _, err = egvs("export", tmp_path / "none", "--to", "csv")
+def test_a_run_that_is_not_there_or_not_done(tmp_path: Path, run_egvs: Call) -> None:
+    code, _, err = run_egvs("export", tmp_path / "none", "--to", "csv")
     assert (code, err) == (2, f"egvs: {tmp_path / 'none'}: no such folder; the folder of a run, which egvs run makes\n")
-    code, _, err = egvs("export", tmp_path, "--to", "csv")
-    assert (code, err) == (2, f"egvs: {tmp_path / 'run.json'}: no such file; a folder that egvs run has written\n")
+    code, _, err = run_egvs("export", tmp_path, "--to", "csv")
+    assert (code, err) == (
+        2,
+        f"egvs: {tmp_path / 'run.json'}: no such file. Name a folder that egvs run has written.\n",
+    )
 
 
-def test_a_run_that_is_not_finished_or_of_another_version(local: Path, tmp_path: Path, egvs: Call) -> None:
+def test_a_run_that_is_not_finished_or_of_another_version(local: Path, tmp_path: Path, run_egvs: Call) -> None:
     """Without its seal a record is of another version."""
     shutil.copytree(local.parent, tmp_path / "copy")
     path = tmp_path / "copy" / "run" / "run.json"
@@ -273,43 +275,43 @@ def test_a_run_that_is_not_finished_or_of_another_version(local: Path, tmp_path:
     for kept, first in ((("check", "statics", "scan", "traffic", "tpog"), "score"), (None, "statics")):
         stages = {name: its for name, its in record["stages"].items() if kept is None or name in kept}
         value = {name: its for name, its in record.items() if name != "own_sha256"} | {"stages": stages}
-        path.write_text(files.json_text(value if kept is None else sealed(value)))
-        code, _, err = egvs("export", path.parent, "--to", "csv", "--out", tmp_path / "out")
+        path.write_text(files.to_json_text(value if kept is None else add_checksum(value)))
+        code, _, err = run_egvs("export", path.parent, "--to", "csv", "--out", tmp_path / "out")
         found = f"the stage {first} is not done, or another version of this program did it"
         assert (code, err) == (2, f"egvs: {path}: {found}; a finished run; egvs run finishes it\n")
         assert not (tmp_path / "out").exists()
 
 
 def test_a_run_from_before_the_scenario_had_a_place(
-    local: Path, tmp_path: Path, egvs: Call, monkeypatch: pytest.MonkeyPatch
+    local: Path, tmp_path: Path, run_egvs: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     placed = Georeference(WorldFrame(f"EPSG:{EPSG}", OFFSET_M), Roi.around((0, 0, 0), (1, 1, 1)), "")
-    monkeypatch.setattr(world_frame, "of", lambda scenario: placed)
-    code, _, err = egvs("export", local, "--to", "csv", "--out", tmp_path / "out")
+    monkeypatch.setattr(geolocation, "scenario_georeference", lambda scenario: placed)
+    code, _, err = run_egvs("export", local, "--to", "csv", "--out", tmp_path / "out")
     found = "its sites have no longitude and latitude, and the scenario, or its network, has a place by now"
     assert (code, err) == (2, f"egvs: {local / 'scores.parquet'}: {found}; egvs run makes it anew\n")
 
 
 def test_a_scenario_that_lies_elsewhere_by_now_is_refused(
-    located: Path, tmp_path: Path, egvs: Call, monkeypatch: pytest.MonkeyPatch
+    located: Path, tmp_path: Path, run_egvs: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     moved = Georeference(WorldFrame(f"EPSG:{EPSG}", (-550000.0, -5630001.0)), Roi.around((0, 0, 0), (1, 1, 1)), "")
     for now in (moved, Georeference(None, moved.roi, "")):
-        monkeypatch.setattr(world_frame, "of", lambda scenario, now=now: now)
-        code, _, err = egvs("export", located, "--to", "csv", "--out", tmp_path / "out")
+        monkeypatch.setattr(geolocation, "scenario_georeference", lambda scenario, now=now: now)
+        code, _, err = run_egvs("export", located, "--to", "csv", "--out", tmp_path / "out")
         assert code == 2
         assert "scores.parquet: its sites lie elsewhere on the Earth than the scenario, or its network, says by" in err
 
 
 @pytest.mark.parametrize("artefact", ["scores.parquet", "blindspots.parquet", "statics.ply"])
 def test_a_damaged_artefact_is_refused_and_nothing_written(
-    local: Path, tmp_path: Path, egvs: Call, artefact: str
+    local: Path, tmp_path: Path, run_egvs: Call, artefact: str
 ) -> None:
     path, out = local / artefact, tmp_path / "out"
     kept = path.read_bytes()
     path.write_bytes(kept[: len(kept) // 2])
     try:
-        code, _, err = egvs("export", local, "--to", "csv", "--out", out)
+        code, _, err = run_egvs("export", local, "--to", "csv", "--out", out)
     finally:
         path.write_bytes(kept)
     assert code == 2
@@ -318,27 +320,27 @@ def test_a_damaged_artefact_is_refused_and_nothing_written(
 
 
 @pytest.mark.parametrize("to", sorted(FORMATS))
-def test_a_target_that_cannot_be_written(located: Path, tmp_path: Path, egvs: Call, to: str) -> None:
+def test_a_target_that_cannot_be_written(located: Path, tmp_path: Path, run_egvs: Call, to: str) -> None:
     (tmp_path / "file").write_text("mine")
-    code, _, err = egvs("export", located, "--to", to, "--out", tmp_path / "file" / f"run.{to}")
+    code, _, err = run_egvs("export", located, "--to", to, "--out", tmp_path / "file" / f"run.{to}")
     assert code == 2
     assert "cannot be written (" in err
     assert err.count("\n") == 1
     assert (tmp_path / "file").read_text() == "mine"
 
 
-def test_a_user_s_file_is_no_folder(located: Path, tmp_path: Path, egvs: Call) -> None:
+def test_a_user_s_file_is_no_folder(located: Path, tmp_path: Path, run_egvs: Call) -> None:
     (tmp_path / "file").write_text("mine")
-    code, _, err = egvs("export", located, "--to", "csv", "--out", tmp_path / "file")
+    code, _, err = run_egvs("export", located, "--to", "csv", "--out", tmp_path / "file")
     assert (code, (tmp_path / "file").read_text()) == (2, "mine")
     assert "is a file; a folder: --to csv writes several files" in err
 
 
-def test_no_file_in_a_user_s_folder_is_replaced(local: Path, egvs: Call) -> None:
+def test_no_file_in_a_user_s_folder_is_replaced(local: Path, run_egvs: Call) -> None:
     """Of a scenario its sites, of a run its blind spots."""
     for to, folder, name in (("csv", local.parent / "mini", "sites.csv"), ("geoparquet", local, "blindspots.parquet")):
         kept, before = (folder / name).read_bytes(), sorted(folder.rglob("*"))
-        code, _, err = egvs("export", local, "--to", to, "--out", folder)
+        code, _, err = run_egvs("export", local, "--to", to, "--out", folder)
         assert (code, err) == (
             2,
             f"egvs: --out: {folder / name} is there already; a new folder, or one without such files\n",
@@ -347,9 +349,9 @@ def test_no_file_in_a_user_s_folder_is_replaced(local: Path, egvs: Call) -> None
 
 
 @pytest.mark.parametrize("to", ["gpkg", "kml"])
-def test_a_user_s_file_is_not_replaced(located: Path, tmp_path: Path, egvs: Call, to: str) -> None:
+def test_a_user_s_file_is_not_replaced(located: Path, tmp_path: Path, run_egvs: Call, to: str) -> None:
     (path := tmp_path / f"mine.{to}").write_text("mine")
-    code, _, err = egvs("export", located, "--to", to, "--out", path)
+    code, _, err = run_egvs("export", located, "--to", to, "--out", path)
     assert (code, err) == (2, f"egvs: --out: {path} is there already; another name\n")
     assert path.read_text() == "mine"
 
@@ -364,7 +366,7 @@ def test_all_files_appear_or_none(located: Path, tmp_path: Path, monkeypatch: py
 
     monkeypatch.setattr(shutil, "copyfile", full)
     with pytest.raises(OSError, match="No space left") as caught:
-        export(located, "csv", out=tmp_path / "out")
+        export_run(located, "csv", out=tmp_path / "out")
     assert caught.value.filename == str(tmp_path / "out" / "footprints.csv")
     assert copied
     assert not list((tmp_path / "out").iterdir())
@@ -376,14 +378,14 @@ def test_a_layer_that_is_no_more_does_not_stay_in_the_run(local: Path, tmp_path:
     folder.mkdir(parents=True)
     for name in ("plan.csv", "mine.csv"):
         (folder / name).write_text("of before")
-    export(tmp_path / "copy" / "run", "csv")
+    export_run(tmp_path / "copy" / "run", "csv")
     assert {path.name for path in folder.iterdir()} == {
         "sites.csv", "blindspots.csv", "footprints.csv", "region.csv", "mine.csv"
     }  # fmt: skip
 
 
-def test_by_default_it_goes_into_the_run_and_again(local: Path, egvs: Call) -> None:
-    told = [egvs("export", local, "--to", "csv") for _ in range(2)]
+def test_by_default_it_goes_into_the_run_and_again(local: Path, run_egvs: Call) -> None:
+    told = [run_egvs("export", local, "--to", "csv") for _ in range(2)]
     assert told[0] == told[1]
     paths = [Path(line) for line in told[0][1].splitlines()[1:]]
     assert [path.name for path in paths] == ["sites.csv", "blindspots.csv", "footprints.csv", "region.csv"]

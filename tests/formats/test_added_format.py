@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.core import plugins
-from pipeline.core.errors import InputError, MissingBackendError
-from pipeline.formats.point_clouds import GROUP, read_points, write_points
+from egvs.core import plugins
+from egvs.core.errors import InputError, MissingBackendError
+from egvs.formats.point_clouds import GROUP, read_points, write_points
 from tests import processes
 from tests.core.test_plugins import install, site  # noqa: F401  the fixture
 
@@ -40,8 +40,8 @@ USER = """
 import sys
 from pathlib import Path
 import numpy as np
-from pipeline.core.errors import InputError
-from pipeline.formats.point_clouds import read_points, write_points
+from egvs.core.errors import InputError
+from egvs.formats.point_clouds import read_points, write_points
 path = Path(sys.argv[1])
 write_points(path, np.array([[0.1, 2.0, 3.0], [4.0, np.nan, 6.0]]))
 points, dropped = read_points(path, "")
@@ -61,9 +61,9 @@ def test_a_package_adds_a_format(tmp_path: Path) -> None:
 
 
 def test_our_own_formats_are_found_and_complete() -> None:
-    assert {"csv", "las", "laz", "pcd", "ply"} <= set(plugins.names(GROUP))
-    for name in plugins.names(GROUP):
-        assert callable(plugins.load(GROUP, name).read)
+    assert {"csv", "las", "laz", "pcd", "ply"} <= set(plugins.plugin_names(GROUP))
+    for name in plugins.plugin_names(GROUP):
+        assert callable(plugins.load_plugin(GROUP, name).read)
 
 
 def test_reading_imports_no_other_format(tmp_path: Path) -> None:
@@ -72,9 +72,9 @@ def test_reading_imports_no_other_format(tmp_path: Path) -> None:
                     "end_header\n1 2 3\n", encoding="ascii")  # fmt: skip
     assert np.array_equal(read_points(path, "")[0], [[1, 2, 3]])
     code = (
-        "import sys\nfrom pathlib import Path\nfrom pipeline.formats.point_clouds import read_points\n"
+        "import sys\nfrom pathlib import Path\nfrom egvs.formats.point_clouds import read_points\n"
         f"read_points(Path({str(path)!r}), '')\n"
-        "print([m for m in sys.modules if m in ('pipeline.formats.pcd', 'pipeline.formats.las', 'pyarrow', 'laspy')])"
+        "print([m for m in sys.modules if m in ('egvs.formats.pcd', 'egvs.formats.las', 'pyarrow', 'laspy')])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
@@ -112,7 +112,7 @@ def test_whole_numbers_are_points(site: Path) -> None:  # noqa: F811
 
 
 def test_what_a_reader_says_itself_is_passed_on(site: Path) -> None:  # noqa: F811
-    body = "from pipeline.core.errors import InputError; raise InputError(place, 'is empty', 'a point')"
+    body = "from egvs.core.errors import InputError; raise InputError(place, 'is empty', 'a point')"
     install(site, "foo", "foo = plug_foo", {"plug_foo": READ.format(body)}, GROUP)
     with pytest.raises(InputError, match=r"a\.foo: is empty; a point$"):
         read_points(site / "a.foo", "")

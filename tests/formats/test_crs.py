@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from pipeline.core.errors import InputError
-from pipeline.formats import crs
-from pipeline.formats.crs import WorldFrame
+from egvs.core.errors import InputError
+from egvs.formats import georeference
+from egvs.formats.georeference import WorldFrame
 
 A_M, F = 6378137.0, 1 / 298.257223563
 UTM32 = WorldFrame("+proj=utm +zone=32 +ellps=WGS84 +datum=WGS84 +units=m +no_defs")
@@ -99,7 +99,7 @@ def test_a_frame_is_a_map_projection_in_metres() -> None:
 
 
 def test_of_a_compound_system_the_horizontal_part_counts() -> None:
-    assert crs.parsed("EPSG:25832+5783", "here").to_epsg() == 25832
+    assert georeference.parse_crs("EPSG:25832+5783", "here").to_epsg() == 25832
 
 
 def test_web_mercator_stretches_and_utm_does_not() -> None:
@@ -112,7 +112,7 @@ def test_web_mercator_stretches_and_utm_does_not() -> None:
 @pytest.mark.parametrize(("lon", "lat", "code"), [(9.7, 50.9, 32632), (139.7, 35.7, 32654), (151.2, -33.9, 32756),
                                                   (-180.0, 10.0, 32601), (180.0, 10.0, 32660)])  # fmt: skip
 def test_the_utm_zone_of_a_place(lon: float, lat: float, code: int) -> None:
-    assert crs.utm_epsg(lon, lat) == code
+    assert georeference.utm_epsg(lon, lat) == code
 
 
 @pytest.mark.parametrize("turned", ["EPSG:2053", "+proj=tmerc +lon_0=9 +axis=wsu +ellps=WGS84 +units=m +no_defs"])
@@ -133,5 +133,5 @@ def test_a_system_that_counts_to_the_west_and_south_would_turn_the_world_round(t
 )  # fmt: skip
 def test_heights_have_the_unit_of_the_vertical_axis_or_of_the_map_projection(system: str, metres: float | None) -> None:
     """A US survey foot is 1200/3937 m; EPSG:6358 counts depths, downwards."""
-    found = crs.height_unit_m(system, "s")
+    found = georeference.height_unit_m(system, "s")
     assert found < 0 if metres is None else found == pytest.approx(metres, rel=1e-9)

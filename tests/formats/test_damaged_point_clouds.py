@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.core.errors import InputError
-from pipeline.formats.point_clouds import read_points
+from egvs.core.errors import InputError
+from egvs.formats.point_clouds import read_points
 from tests.formats.test_point_clouds import ASCII_PCD, ASCII_PLY, packed, pcd, put, quick, viewed
 
 
@@ -53,7 +53,7 @@ OTHER_COLUMNS = r"has no single column 'x_m' \(its columns: x, y_m, z_m\); a hea
         ("a.pcd", ASCII_PCD.replace("x y z", "x x z"), "has no single field 'x'"),
         ("a.pcd", ASCII_PCD.replace("TYPE", "COUNT 1 2 1\nTYPE"), "has no single field 'y'"),
         ("a.pcd", ASCII_PCD.replace("8 8 8", "8 8"), "SIZE has 2 values for 3 FIELDS; one value a field"),
-        ("a.pcd", ASCII_PCD.replace("8 8 8", "8 2 8"), "field 'y' has TYPE F and SIZE 2; F of 4 or 8, I or U"),
+        ("a.pcd", ASCII_PCD.replace("8 8 8", "8 2 8"), "field 'y' has TYPE F and SIZE 2. F of 4 or 8, I or U"),
         ("a.pcd", ASCII_PCD.replace("8 8 8", "8 eight 8"), "the SIZE of y is 'eight'; a whole number"),
         ("a.pcd", ASCII_PCD.replace("F F F", "F Q F"), "field 'y' has TYPE Q and SIZE 8"),
         ("a.pcd", ASCII_PCD.replace("POINTS 2", "POINTS 3"), "POINTS is 3, but WIDTH x HEIGHT is 2; the same number"),
@@ -81,7 +81,7 @@ OTHER_COLUMNS = r"has no single column 'x_m' \(its columns: x, y_m, z_m\); a hea
         ("a.pcd", PACKED + bytes(7), r"ends before its points \(7 bytes of them\); 24, as its header says"),
         ("a.pcd", PACKED + struct.pack("<II", 1, 12) + b"\0", "holds 12 bytes of points, unpacked; 24"),
         ("a.pcd", PACKED + packed(bytes(24))[:-1], "holds 4 bytes of packed points; 5; a whole file"),
-        ("a.pcd", PACKED + struct.pack("<II", 2, 24) + b"\x20\x05", "its packed points are damaged; LZF data of 24"),
+        ("a.pcd", PACKED + struct.pack("<II", 2, 24) + b"\x20\x05", "its packed points are damaged. LZF data of 24"),
         ("a.pcd", PACKED + struct.pack("<II", 1, 24) + b"\xe0", "its packed points are damaged"),
         ("a.pcd", PACKED + struct.pack("<II", 2, 24) + b"\x05\x05", "its packed points are damaged"),
         # PLY

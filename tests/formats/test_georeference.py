@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.core.errors import InputError
-from pipeline.core.grid import Roi
-from pipeline.formats.crs import WorldFrame
-from pipeline.formats.georeference import WORLD, Georeference, coordinates_of, declared_by
+from egvs.core.errors import InputError
+from egvs.core.grid import Roi
+from egvs.formats.georeference import WORLD, Georeference, WorldFrame, declared_crs, geojson_coordinates
 
 FRAME = WorldFrame("EPSG:32632", (-550_000.0, -5_634_000.0))
 ROI = Roi((670.0, 1200.0, 0.0), (60.0, 60.0, 5.0))  # at 9.72 E, 50.865 N
@@ -20,7 +19,7 @@ DEGREES = FRAME.to_degrees(CORNERS)
 
 
 def taken(world: Georeference, xy: NDArray[np.float64], declared: str | None = None) -> NDArray[np.float64]:
-    return world.reading(xy, "a.geojson", declared).to_world(xy)
+    return world.read_coordinates(xy, "a.geojson", declared).to_world(xy)
 
 
 def test_metres_stay_as_they_are_to_the_bit() -> None:
@@ -130,14 +129,14 @@ def test_all_coordinates_of_a_file_are_found_in_their_order() -> None:
         {"geometry": {"type": "Point", "coordinates": [float("nan"), 0]}},
         {"geometry": {"type": "Point", "coordinates": [10**400, 0]}},
     ]  # fmt: skip
-    assert coordinates_of(features).tolist() == [[1, 2], [3, 4], [5, 6], [1, 2], [8, 9]]
-    assert coordinates_of([]).shape == (0, 2)
+    assert geojson_coordinates(features).tolist() == [[1, 2], [3, 4], [5, 6], [1, 2], [8, 9]]
+    assert geojson_coordinates([]).shape == (0, 2)
 
 
 def test_null_says_that_a_file_is_in_the_world_frame() -> None:
-    assert declared_by({"crs": None}, "here") == WORLD
-    assert declared_by({}, "here") is None
+    assert declared_crs({"crs": None}, "here") == WORLD
+    assert declared_crs({}, "here") is None
     named = {"crs": {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::25832"}}}
-    assert declared_by(named, "here") == "urn:ogc:def:crs:EPSG::25832"
+    assert declared_crs(named, "here") == "urn:ogc:def:crs:EPSG::25832"
     with pytest.raises(InputError, match=r"here: crs: .*; .*or null"):
-        declared_by({"crs": "EPSG:25832"}, "here")
+        declared_crs({"crs": "EPSG:25832"}, "here")

@@ -5,15 +5,15 @@ import math
 import numpy as np
 import pytest
 
-from pipeline.core.errors import InputError
-from pipeline.formats import kitti
+from egvs.core.errors import InputError
+from egvs.formats import kitti
 
 BOX = np.array([[10.0, 2.0, -3.0, 4.5, 1.8, 1.5, 0.0]])
 
 
 def test_a_car_ahead_that_drives_away_counted_by_hand():
     """10 m ahead and 2 m to the left; its bottom 3.75 m below the camera; its turn about y (down) is -90 degrees."""
-    (line,) = kitti.lines(["Car"], BOX).splitlines()
+    (line,) = kitti.format_labels(["Car"], BOX).splitlines()
     words = line.split()
     assert words[:3] == ["Car", "0.00", "0"]
     np.testing.assert_allclose(
@@ -29,10 +29,10 @@ def test_boxes_come_back(tmp_path):
     )
     boxes[:4, 6] = [-np.pi, np.pi / 2, -np.pi / 2, 0.0]
     scores = random.uniform(-3, 3, 500)
-    (tmp_path / "a.txt").write_text(kitti.lines(["Bus"] * 500, boxes, scores))
-    found = kitti.read(tmp_path / "a.txt")
+    (tmp_path / "a.txt").write_text(kitti.format_labels(["Bus"] * 500, boxes, scores))
+    found = kitti.read_labels(tmp_path / "a.txt")
     np.testing.assert_allclose(found.boxes[:, :6], boxes[:, :6], atol=1e-5)
-    np.testing.assert_allclose(kitti.wrapped(found.boxes[:, 6] - boxes[:, 6]), 0, atol=1e-5)
+    np.testing.assert_allclose(kitti.wrap_angle(found.boxes[:, 6] - boxes[:, 6]), 0, atol=1e-5)
     np.testing.assert_allclose(found.scores, scores, atol=1e-6)
     assert found.names == ("Bus",) * 500
 
@@ -58,15 +58,15 @@ def test_the_calibration_carries_points_as_boxes_go():
 def test_what_is_no_line_is_named(tmp_path, line, message):
     (tmp_path / "a.txt").write_text(line)
     with pytest.raises(InputError) as told:
-        kitti.read(tmp_path / "a.txt")
+        kitti.read_labels(tmp_path / "a.txt")
     assert message in str(told.value)
 
 
 def test_no_file_an_empty_one_and_no_text(tmp_path):
     with pytest.raises(InputError, match="no such file"):
-        kitti.read(tmp_path / "b.txt")
+        kitti.read_labels(tmp_path / "b.txt")
     (tmp_path / "a.txt").write_text("DontCare -1 -1 -10 0 0 9 9 -1 -1 -1 -1000 -1000 -1000 -10\n\n")
-    assert kitti.read(tmp_path / "a.txt").boxes.shape == (0, 7)
+    assert kitti.read_labels(tmp_path / "a.txt").boxes.shape == (0, 7)
     (tmp_path / "a.txt").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InputError, match="is no text"):
-        kitti.read(tmp_path / "a.txt")
+        kitti.read_labels(tmp_path / "a.txt")

@@ -10,8 +10,8 @@ from pathlib import Path
 import osmium
 import pytest
 
-from pipeline.core.errors import InputError
-from pipeline.formats import osm
+from egvs.core.errors import InputError
+from egvs.formats import osm
 
 SMALL = Path(__file__).parents[1] / "importers" / "data" / "small.osm"
 NODE = '<node id="1" lat="1" lon="2"/>'
@@ -46,27 +46,27 @@ def pbf_of(source: Path, path: Path, with_bounds: bool = True) -> Path:
 def test_pbf_gives_the_same_as_xml_whatever_its_name(tmp_path: Path, name: str) -> None:
     path = pbf_of(SMALL, tmp_path / name)
     assert osm.is_pbf(path) and not osm.is_pbf(SMALL)
-    assert osm.read(path) == osm.read(SMALL)
+    assert osm.read_osm(path) == osm.read_osm(SMALL)
 
 
 @pytest.mark.parametrize("name", ["a.osm.gz", "a.osm.xml.gz", "a.osm"])
 def test_gzip_gives_the_same_whatever_its_name(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     path.write_bytes(gzip.compress(SMALL.read_bytes()))
-    assert osm.read(path) == osm.read(SMALL)
+    assert osm.read_osm(path) == osm.read_osm(SMALL)
 
 
 def test_xml_written_from_pbf_gives_the_same(tmp_path: Path) -> None:
     pbf, xml = pbf_of(SMALL, tmp_path / "a.osm.pbf"), put(tmp_path, "what is there is written over", "b.osm.xml")
     osm.write_xml(pbf, xml)
     assert xml.read_bytes().startswith(b"<?xml")
-    assert osm.read(xml) == osm.read(SMALL)
+    assert osm.read_osm(xml) == osm.read_osm(SMALL)
 
 
 def test_without_declared_bounds_those_of_the_nodes_hold(tmp_path: Path) -> None:
     inside = '<node id="2" lat="51.1234567" lon="-9.7654321"/><node id="1" lat="52.5" lon="9"><tag k="a" v="b"/></node>'
     for path in (xml := put(tmp_path, osm_xml(inside)), pbf_of(xml, tmp_path / "a.osm.pbf", with_bounds=False)):
-        extract = osm.read(path)
+        extract = osm.read_osm(path)
         assert extract.nodes == {1: (52.5, 9.0), 2: (51.1234567, -9.7654321)}
         assert extract.node_tags == {1: {"a": "b"}}
         assert (extract.bounds, extract.declared) == (osm.Bounds(51.1234567, -9.7654321, 52.5, 9.0), False)
@@ -79,7 +79,7 @@ def test_ways_and_relations_are_sorted_and_whole(tmp_path: Path) -> None:
         '<member type="node" ref="1" role=""/><member type="relation" ref="8" role="x"/>'
         '<tag k="type" v="multipolygon"/></relation>'
     )
-    extract = osm.read(put(tmp_path, osm_xml(inside)))
+    extract = osm.read_osm(put(tmp_path, osm_xml(inside)))
     assert list(extract.ways.values()) == [osm.Way(-3, (1,), {"a": "<ü>"}), osm.Way(9, (1, 5), {})]
     members = (("way", 9, "outer"), ("node", 1, ""), ("relation", 8, "x"))
     assert extract.relations == (osm.Relation(7, members, {"type": "multipolygon"}), osm.Relation(8, (), {}))
@@ -92,7 +92,7 @@ def test_what_is_deleted_does_not_count(tmp_path: Path, mark: str) -> None:
         f'<way id="1" {mark}><nd ref="1"/></way><way id="2"><nd ref="1"/></way>'
         f'<relation id="2" {mark}/><relation id="1"/>'
     )
-    extract = osm.read(put(tmp_path, osm_xml(NODE + gone)))
+    extract = osm.read_osm(put(tmp_path, osm_xml(NODE + gone)))
     assert (list(extract.nodes), extract.node_tags, list(extract.ways)) == ([1], {}, [2])
     assert [relation.id for relation in extract.relations] == [1]
 
@@ -128,7 +128,7 @@ def test_what_is_deleted_does_not_count(tmp_path: Path, mark: str) -> None:
 def test_bad_xml_is_refused(tmp_path: Path, content: str, message: str) -> None:
     path = put(tmp_path, content)
     with pytest.raises(InputError, match=message) as caught:
-        osm.read(path)
+        osm.read_osm(path)
     assert str(caught.value).startswith(str(path)) and "\n" not in str(caught.value)
 
 
@@ -140,13 +140,13 @@ def test_a_pbf_file_cut_anywhere_or_damaged_is_refused(tmp_path: Path) -> None:
     for content in [*(whole[:end] for end in (20, 100, len(whole) // 2, len(whole) - 1)), bytes(damaged)]:
         path.write_bytes(content)
         with pytest.raises(InputError, match=r"a\.osm\.pbf: cannot be read as OpenStreetMap data \(.*\); a whole file"):
-            osm.read(path)
+            osm.read_osm(path)
 
 
 def test_a_pbf_file_with_a_node_beyond_the_pole_is_refused(tmp_path: Path) -> None:
     path = pbf_of(put(tmp_path, osm_xml('<node id="6" lat="91" lon="2"/>')), tmp_path / "a.osm.pbf", with_bounds=False)
     with pytest.raises(InputError, match=r"a\.osm\.pbf: node 6: has no position on the globe"):
-        osm.read(path)
+        osm.read_osm(path)
 
 
 # --- values -----------------------------------------------------------------------------------------------------------
@@ -175,7 +175,7 @@ def test_a_pbf_file_with_a_node_beyond_the_pole_is_refused(tmp_path: Path) -> No
     ],
 )
 def test_lengths(text: str, metres: float | None) -> None:
-    assert osm.length_m(text) == (None if metres is None else pytest.approx(metres))
+    assert osm.parse_length_m(text) == (None if metres is None else pytest.approx(metres))
 
 
 @pytest.mark.parametrize(("declared", "codec"), [("Shift_JIS", "cp932"), ("EUC-JP", "euc_jp"), ("UTF-16", "utf-16")])
@@ -184,13 +184,16 @@ def test_a_map_in_another_encoding_is_read(tmp_path: Path, declared: str, codec:
     tag = '<way id="3"><nd ref="1"/><nd ref="1"/><tag k="name" v="青梅街道"/></way>'
     data = osm_xml(NODE + tag).replace("UTF-8", declared).encode(codec)
     (tmp_path / "a.osm").write_bytes(gzip.compress(data, mtime=0) if packed else data)
-    assert osm.read(tmp_path / "a.osm").ways[3].tags == {"name": "青梅街道"}
+    assert osm.read_osm(tmp_path / "a.osm").ways[3].tags == {"name": "青梅街道"}
 
 
 def test_a_map_of_too_many_objects_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EGVS_MAX_MAP_OBJECTS", "10")
     pbf = pbf_of(SMALL, tmp_path / "a.osm.pbf")
     for path in (SMALL, pbf):
-        told = rf"{path.name}: holds more than 10 objects; a part of the map; at most 10 objects; EGVS_MAX_MAP_OBJECTS="
+        told = (
+            rf"{path.name}: holds more than 10 objects; a part of the map\. The limit is 10 objects; set "
+            rf"EGVS_MAX_MAP_OBJECTS="
+        )
         with pytest.raises(InputError, match=told):
-            osm.read(path)
+            osm.read_osm(path)

@@ -14,10 +14,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from pipeline.core.errors import InputError
-from pipeline.formats import pcd as pcd_format
-from pipeline.formats import ply as ply_format
-from pipeline.formats.point_clouds import read_points, write_points
+from egvs.core.errors import InputError
+from egvs.formats import pcd as pcd_format
+from egvs.formats import ply as ply_format
+from egvs.formats.point_clouds import read_points, write_points
 
 needs_laspy = pytest.mark.skipif(importlib.util.find_spec("laspy") is None, reason="laspy is not installed (egvs[las])")
 quick = settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -339,7 +339,7 @@ def test_more_points_than_the_bound_are_not_read(tmp_path: Path, monkeypatch: py
     monkeypatch.setenv("EGVS_MAX_POINTS", "299")
     for name in ("a.las", "a.laz"):
         with pytest.raises(
-            InputError, match=rf"{name}: takes 300 points; at most 299 points; EGVS_MAX_POINTS=... raise"
+            InputError, match=rf"{name}: takes 300 points\. The limit is 299 points; set EGVS_MAX_POINTS=... raise"
         ):
             read_points(las(tmp_path, name)[0], "")
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.core.errors import InputError
-from pipeline.formats import safe_xml
+from egvs.core.errors import InputError
+from egvs.formats import xml
 
 ONE_MB = b" " * 1_000_000
 
@@ -23,7 +23,7 @@ def small_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
 def names(folder: Path, data: bytes) -> list[str | None]:
     """The attribute ``name`` of each child."""
     (folder / "a.xml").write_bytes(data)
-    return [child.get("name") for child in safe_xml.children(folder / "a.xml", "net")]
+    return [child.get("name") for child in xml.iter_elements(folder / "a.xml", "net")]
 
 
 @pytest.mark.parametrize(
@@ -64,7 +64,7 @@ def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
 
 def hostile() -> Iterator[tuple[str, bytes, str]]:
     """(name, file, message) of files that would take more memory than they are worth."""
-    told = "has an element, or a text, of more than 1 MB; at most 1 MB; EGVS_MAX_ELEMENT_MB=... raises that"
+    told = r"has an element, or a text, of more than 1 MB\. The limit is 1 MB; set EGVS_MAX_ELEMENT_MB=... raises that"
     yield "text of the root", b"<net>" + ONE_MB * 3 + b"</net>", told
     yield "text between children", b"<net><e/>" + ONE_MB * 3 + b"<e/></net>", told
     yield "rows in one step", b"<net><e>" + b"<v a='1'/>" * 150_000 + b"</e></net>", told
@@ -73,7 +73,7 @@ def hostile() -> Iterator[tuple[str, bytes, str]]:
     yield "before the root", ONE_MB * 3 + b"<net/>", told
     yield "deep", b"<net>" + b"<e>" * 5000 + b"</e>" * 5000 + b"</net>", "stand more than 100 deep"
     many = b"<net>" + (b"<e/>" + b" " * 900_000) * 6 + b"</net>"
-    packed = "holds more than 5 MB, unpacked; at most 5 MB; EGVS_MAX_UNPACKED_MB=... raises that"
+    packed = r"holds more than 5 MB, unpacked\. The limit is 5 MB; set EGVS_MAX_UNPACKED_MB=... raises that"
     yield "a bomb", gzip.compress(many, mtime=0), packed
     yield "a bomb without an end", gzip.compress(b"<net>" + ONE_MB * 3, mtime=0), told
 
@@ -95,8 +95,8 @@ def test_a_long_file_of_small_children_is_read(tmp_path: Path) -> None:
 
 def test_a_line_without_end_is_refused(tmp_path: Path) -> None:
     (tmp_path / "fcd.csv.gz").write_bytes(gzip.compress(b"1;2" * 700_000, mtime=0))
-    with safe_xml.opened(tmp_path / "fcd.csv.gz") as file, pytest.raises(InputError, match="has a line without end"):
-        safe_xml.line_of(file, "fcd.csv.gz")
+    with xml.open_bounded(tmp_path / "fcd.csv.gz") as file, pytest.raises(InputError, match="has a line without end"):
+        xml.read_line(file, "fcd.csv.gz")
 
 
 def test_values_of_an_attribute_are_found_wherever_the_file_is_cut_for_reading(tmp_path: Path) -> None:
@@ -106,7 +106,7 @@ def test_values_of_an_attribute_are_found_wherever_the_file_is_cut_for_reading(t
         f"<lane id='{i}' shape{mark}{v}{mark[1:]} width='3'/>\n" for i, v in enumerate(values) for mark in ('="', "='")
     )
     (tmp_path / "n.net.xml").write_text(text + "<e shape=")
-    found = [value.decode() for value in safe_xml.values_of(tmp_path / "n.net.xml", "shape")]
+    found = [value.decode() for value in xml.scan_attribute_values(tmp_path / "n.net.xml", "shape")]
     assert found == [value for value in values for _ in range(2)]
 
 
@@ -114,4 +114,4 @@ def test_a_value_without_end_is_refused(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setenv("EGVS_MAX_ELEMENT_MB", "1")
     (tmp_path / "n.net.xml").write_bytes(b"<net><e shape='" + b"1,2 " * 1_000_000)
     with pytest.raises(InputError, match=r"n.net.xml: has a value without end; at most 1 MB"):
-        list(safe_xml.values_of(tmp_path / "n.net.xml", "shape"))
+        list(xml.scan_attribute_values(tmp_path / "n.net.xml", "shape"))

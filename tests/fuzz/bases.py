@@ -91,7 +91,7 @@ def network() -> bytes:
     """One crossing with lights, without the date that SUMO puts into its head."""
     import tempfile
 
-    from pipeline.traffic import sumo
+    from egvs.traffic import sumo
 
     with tempfile.TemporaryDirectory() as folder:
         flags = [
@@ -103,7 +103,7 @@ def network() -> bytes:
             "--default-junction-type",
             "traffic_light",
         ]
-        sumo.run("netgenerate", [*flags, "--offset.disable-normalization", "-o", "net.net.xml"], Path(folder))
+        sumo.run_program("netgenerate", [*flags, "--offset.disable-normalization", "-o", "net.net.xml"], Path(folder))
         return re.sub(rb"<!--.*?-->\s*", b"", (Path(folder) / "net.net.xml").read_bytes(), flags=re.DOTALL)
 
 
@@ -293,7 +293,7 @@ def _write_points(path: Path) -> None:
     if form == "csv":
         path.write_text("x_m,y_m,z_m\n" + rows)
     elif path.stem == "binary":
-        from pipeline.formats.point_clouds import write_points
+        from egvs.formats.point_clouds import write_points
 
         write_points(path, points)
     elif form == "pcd":

@@ -100,7 +100,7 @@ def become(folder: Path, arguments: Sequence[str], printed: Sequence[Path], stor
         tempfile.tempdir = None
         _limit()
         sys.argv = ["egvs", *arguments]
-        from pipeline.cli.app import main
+        from egvs.cli.app import main
 
         main()
         code = 0
@@ -258,7 +258,7 @@ def warm_up(folder: Path) -> None:
     import jinja2
     import typer.main
 
-    from pipeline.cli.app import main
+    from egvs.cli.app import main
     from tests.conftest import write_mini
 
     os.environ["EGVS_STORE"] = ""

@@ -56,7 +56,7 @@ def test_faults_are_told(tmp_path: Path) -> None:
     code = f"""
 import os, pathlib, sys
 from pathlib import Path
-import pipeline.cli.app
+import egvs.cli.app
 from tests.fuzz import cases
 from tests.fuzz.kinds import KINDS
 cases.MOST_BYTES = 1 << 29
@@ -65,7 +65,7 @@ whole_s = cases.MOST_SECONDS
 for fault, line in {FAULTS!r}.items():
     cases.MOST_SECONDS = 0.5 if fault == "out of time" else whole_s
     def main(): exec(line)
-    pipeline.cli.app.main = main
+    egvs.cli.app.main = main
     verdict = bench.judge(bench.files[0], b"site,x_m,y_m,z_m\\n")
     assert verdict.name == fault, (fault, verdict)
 """

@@ -20,16 +20,16 @@ import pytest
 import shapely
 from shapely.geometry import LineString, Point, shape
 
-from pipeline.formats import osm as osm_reader
-from pipeline.importers import openstreetmap as osm
-from pipeline.scenario import loading
-from pipeline.sensing import sites
+from egvs.formats import osm
+from egvs.importers import openstreetmap
+from egvs.scenario import loading
+from egvs.sensors import sites
 from tests.formats.test_osm import pbf_of
 from tests.stages import run_stage
 
 SMALL = Path(__file__).parent / "data" / "small.osm"
 REAL = Path(__file__).parents[3] / "shared" / "real" / "bad_hersfeld.osm"
-Made = tuple[Path, osm.NewScenario]
+Made = tuple[Path, openstreetmap.NewScenario]
 NAMES = ["network.net.xml", "scenario.toml", "sites.csv", "statics.geojson"]
 
 
@@ -37,7 +37,7 @@ NAMES = ["network.net.xml", "scenario.toml", "sites.csv", "statics.geojson"]
 def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     """The small extract's scenario and its summary."""
     folder = tmp_path_factory.mktemp("osm") / "cross"
-    return folder, osm.new(folder, SMALL)
+    return folder, openstreetmap.create_scenario(folder, SMALL)
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +93,7 @@ def test_heights_by_source(made: Made) -> None:
     assert heights["pole"] == {"default": 3}
 
 
-def test_whatever_was_changed_or_left_out_is_counted(made: Made) -> None:
+def test_counts_changed_and_dropped_objects(made: Made) -> None:
     counted = made[1].statics
     assert counted.unreadable == {"height": 1}
     assert counted.repaired == 1
@@ -110,7 +110,7 @@ def test_whatever_was_changed_or_left_out_is_counted(made: Made) -> None:
     assert json.loads((made[0] / "statics.geojson").read_text(encoding="utf-8"))["summary"] == counted.to_json()
 
 
-def test_every_object_is_kept_or_counted(footprints: dict[str, Any], made: Made) -> None:
+def test_every_object_is_used_or_counted(footprints: dict[str, Any], made: Made) -> None:
     whole = Counter(f["properties"]["kind"] for name, f in footprints.items() if not name.endswith("#2"))
     assert whole == made[1].statics.objects
 
@@ -156,7 +156,7 @@ def test_area(footprints: dict[str, Any], name: str, area_m2: float) -> None:
     assert shape(footprints[name]["geometry"]).area == pytest.approx(area_m2, rel=1e-2)
 
 
-def test_a_courtyard_stays_open(footprints: dict[str, Any]) -> None:
+def test_courtyard_stays_open(footprints: dict[str, Any]) -> None:
     rings = footprints["relation/3001"]["geometry"]["coordinates"]
     assert [len(ring) for ring in rings] == [5, 5]
 
@@ -167,18 +167,18 @@ def test_trees_of_a_row_are_8_m_apart(footprints: dict[str, Any]) -> None:
     assert gaps == pytest.approx([16.0, 8.0, 8.0, 8.0], abs=0.01), "the second was mapped singly"
 
 
-def test_nothing_stands_on_the_carriageway(made: Made, footprints: dict[str, Any]) -> None:
+def test_no_solid_is_on_carriageway(made: Made, footprints: dict[str, Any]) -> None:
     low = shapely.union_all([area_of(f) for f in footprints.values() if f["properties"].get("base_m", 0) < 4.5])
     for line, half_width_m in lanes_of(made[0]):
         assert not low.intersects(line.buffer(half_width_m, cap_style="flat"))
     assert {"way/2010#1", "way/2010#2", "way/5002#1", "way/5002#2"} <= footprints.keys()
 
 
-def test_buildings_lie_where_the_network_says(made: Made, footprints: dict[str, Any]) -> None:
+def test_buildings_are_in_network_frame(made: Made, footprints: dict[str, Any]) -> None:
     import sumolib
 
     net = sumolib.net.readNet(str(made[0] / "network.net.xml"))
-    extract = osm_reader.read(SMALL)
+    extract = osm.read_osm(SMALL)
     for way in (2001, 2002, 2003, 2004):
         corners = shapely.MultiPoint(footprints[f"way/{way}"]["geometry"]["coordinates"][0])
         for node in extract.ways[way].nodes:
@@ -206,13 +206,13 @@ def check_sites(folder: Path, poles: int) -> None:
     assert min(Point(a).distance(Point(b)) for a in places for b in places if a != b) >= 5.0
 
 
-def test_sites(made: Made) -> None:
+def test_sites_are_beside_kerb(made: Made) -> None:
     check_sites(made[0], 12)
 
 
-def test_each_pole_is_tried_at_three_heights_and_tilts_and_looks_at_the_region(made: Made) -> None:
+def test_each_pole_has_three_heights_and_tilts_aimed_at_region(made: Made) -> None:
     scenario = loading.load(made[0])
-    found = sites.of(scenario)
+    found = sites.candidate_sites(scenario)
     assert len(found) == made[1].sites == 9 * made[1].poles == 9 * 12
     assert [site.name for site in found[:4]] == ["k01@3m+0deg", "k01@3m-10deg", "k01@3m+aim", "k01@4.5m+0deg"]
     x_m, y_m, z_m = scenario.roi.center_m
@@ -225,7 +225,7 @@ def test_each_pole_is_tried_at_three_heights_and_tilts_and_looks_at_the_region(m
         assert site.sensor == "VLP-32C"
 
 
-def test_the_scenario_loads(made: Made) -> None:
+def test_scenario_loads(made: Made) -> None:
     folder, summary = made
     loaded = loading.load(folder)
     assert loaded.name == "cross"
@@ -238,22 +238,20 @@ def test_the_scenario_loads(made: Made) -> None:
         assert loaded.find(name, "test").is_file()
 
 
-def test_the_junction_is_named_and_the_source_attributed(made: Made) -> None:
+def test_names_junction_and_attributes_source(made: Made) -> None:
     folder, summary = made
     assert summary.junction.title == "signalised junction of East Street and North Street"
     for name in ("scenario.toml", "statics.geojson", "network.net.xml"):
         assert "(c) OpenStreetMap contributors, ODbL" in (folder / name).read_text(encoding="utf-8")
 
 
-def test_a_name_of_odd_characters_is_kept_and_comments_say_what_is_what(tmp_path: Path) -> None:
+def test_special_characters_in_street_name_and_comments(tmp_path: Path) -> None:
     named = edited(tmp_path, ('v="East Street"', 'v="East A\\\\B = #1 &quot;Straße&quot; &amp; more"'))
-    title = osm.new(tmp_path / "named", named).junction.title
+    title = openstreetmap.create_scenario(tmp_path / "named", named).junction.title
     assert title == 'signalised junction of East A\\B = #1 "Straße" & more and North Street'
     assert loading.load(tmp_path / "named").description == f"S{title[1:]}"
     text = (tmp_path / "named" / "scenario.toml").read_text(encoding="utf-8")
-    assert re.search(
-        r"^\] # assumed by the class of the streets: put what was counted in their place$", text, re.MULTILINE
-    )
+    assert re.search(r"^\] # assumed from the road classes", text, re.MULTILINE)
     assert len(re.findall(r"^\[(?:roi|traffic|statics|sites)\] +# \w", text, re.MULTILINE)) == 4
 
 
@@ -261,7 +259,7 @@ def test_a_name_of_odd_characters_is_kept_and_comments_say_what_is_what(tmp_path
 
 
 @pytest.mark.slow
-def test_same_bytes_elsewhere_packed_as_pbf_and_in_another_order(made: Made, tmp_path: Path) -> None:
+def test_same_bytes_from_other_folder_pbf_and_other_order(made: Made, tmp_path: Path) -> None:
     text = SMALL.read_text(encoding="utf-8")
     nodes = re.findall(r" <node .*?(?:</node>|/>)\n", text)
     first, last = text.index(nodes[0]), text.index(nodes[-1]) + len(nodes[-1])
@@ -269,7 +267,7 @@ def test_same_bytes_elsewhere_packed_as_pbf_and_in_another_order(made: Made, tmp
     packed.write_bytes(gzip.compress((text[:first] + "".join(reversed(nodes)) + text[last:]).encode()))
     for number, source in enumerate((packed, pbf_of(SMALL, tmp_path / "small.osm.pbf"))):
         again = tmp_path / "elsewhere" / str(number)
-        osm.new(again, source)
+        openstreetmap.create_scenario(again, source)
         assert sorted(p.name for p in again.iterdir()) == NAMES
         for name in NAMES:
             content = (again / name).read_bytes().replace(f'name = "{number}"\n'.encode(), b"")
@@ -280,13 +278,13 @@ def test_same_bytes_elsewhere_packed_as_pbf_and_in_another_order(made: Made, tmp
 # --- variants ------------------------------------------------------------------------------------------------------
 
 
-def test_driving_on_the_left(tmp_path: Path) -> None:
-    osm.new(tmp_path / "left", SMALL, lefthand=True)
+def test_left_hand_traffic(tmp_path: Path) -> None:
+    openstreetmap.create_scenario(tmp_path / "left", SMALL, lefthand=True)
     assert 'lefthand="true"' in (tmp_path / "left" / "network.net.xml").read_text(encoding="utf-8")
 
 
 def test_sidewalks_and_crossings_change_neither_junction_nor_lanes(made: Made, tmp_path: Path) -> None:
-    walked = osm.new(tmp_path / "walked", SMALL, walk=True)
+    walked = openstreetmap.create_scenario(tmp_path / "walked", SMALL, walk=True)
     plain = made[1]
     assert walked.notes[:-1] == plain.notes and "pedestrians_per_h" in walked.notes[-1]
     assert (walked.junction.title, walked.junction.lanes_in) == (plain.junction.title, plain.junction.lanes_in)
@@ -297,27 +295,27 @@ def test_sidewalks_and_crossings_change_neither_junction_nor_lanes(made: Made, t
     assert ways.crossings > 3 and ways.areas > 3
 
 
-def test_an_empty_folder_is_filled_and_a_name_with_spaces_is_mended(tmp_path: Path) -> None:
+def test_fills_empty_folder_and_repairs_name_with_spaces(tmp_path: Path) -> None:
     folder = tmp_path / "my junction"
     folder.mkdir()
-    osm.new(folder, SMALL, at=(52.0, 10.0))
+    openstreetmap.create_scenario(folder, SMALL, at=(52.0, 10.0))
     assert loading.load(folder).name == "my-junction"
     assert [p.name for p in tmp_path.iterdir()] == ["my junction"]
 
 
 @pytest.mark.slow
-def test_without_signals_the_largest_junction_is_taken_and_said(tmp_path: Path) -> None:
+def test_without_signals_chooses_largest_junction_with_note(tmp_path: Path) -> None:
     plain = edited(tmp_path, (' <node id="1" ([^>]*)>.*?</node>', r' <node id="1" \1/>'))
-    summary = osm.new(tmp_path / "plain", plain)
+    summary = openstreetmap.create_scenario(tmp_path / "plain", plain)
     assert summary.junction.title == "junction without signals of East Street and North Street"
     assert any("no junction in the extract has signals" in note for note in summary.notes)
 
 
 @pytest.mark.slow
-def test_a_ring_that_does_not_close_is_counted(tmp_path: Path) -> None:
+def test_counts_open_ring(tmp_path: Path) -> None:
     deleted = ('<node id="1" ', '<node id="77" action="delete"/><node id="1" ')
     torn = edited(tmp_path, (' <way id="2102">.*?</way>', ""), deleted)
-    summary = osm.new(tmp_path / "torn", torn)
+    summary = openstreetmap.create_scenario(tmp_path / "torn", torn)
     assert summary.statics.dropped["incomplete"] == {"building": 2}
     assert summary.statics.heights["building"]["levels"] == 2
 
@@ -331,10 +329,10 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Made:
     if not REAL.is_file():
         pytest.skip(f"{REAL.name} is not beside the checkout (shared/real)")
     folder = tmp_path_factory.mktemp("osm") / "town"
-    return folder, osm.new(folder, REAL, surroundings_m=None)
+    return folder, openstreetmap.create_scenario(folder, REAL, surroundings_m=None)
 
 
-def test_a_real_town(town: Made) -> None:
+def test_real_town(town: Made) -> None:
     folder, summary = town
     assert "Meisebacher Straße" in summary.junction.title and summary.junction.signalised
     assert summary.to_json()["assumed_traffic"]["vehicles_per_hour"] > 1000
@@ -344,11 +342,11 @@ def test_a_real_town(town: Made) -> None:
     check_sites(folder, 12)
 
 
-def test_a_real_town_lies_where_its_network_says(town: Made) -> None:
+def test_real_town_is_in_network_frame(town: Made) -> None:
     import sumolib
 
     net = sumolib.net.readNet(str(town[0] / "network.net.xml"))
-    extract = osm_reader.read(REAL)
+    extract = osm.read_osm(REAL)
     ends = [node for node in net.getNodes() if node.getType() == "dead_end" and int(node.getID()) in extract.nodes]
     assert len(ends) >= 10
     for node in ends:
@@ -356,8 +354,8 @@ def test_a_real_town_lies_where_its_network_says(town: Made) -> None:
         assert net.convertLonLat2XY(lon_deg, lat_deg) == pytest.approx(node.getCoord(), abs=0.01)
 
 
-def test_a_real_town_at_a_place(town: Made, tmp_path: Path) -> None:
-    summary = osm.new(tmp_path / "other", REAL, at=(50.8704, 9.7080), surroundings_m=None)
+def test_real_town_at_position(town: Made, tmp_path: Path) -> None:
+    summary = openstreetmap.create_scenario(tmp_path / "other", REAL, at=(50.8704, 9.7080), surroundings_m=None)
     assert summary.junction.title == "signalised junction of Benno-Schilde-Straße and Dippelstraße"
     check_sites(tmp_path / "other", 12)
     assert (tmp_path / "other" / "network.net.xml").read_bytes() == (town[0] / "network.net.xml").read_bytes()
@@ -365,11 +363,11 @@ def test_a_real_town_at_a_place(town: Made, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("walk", [False, True])
-def test_people_move_in_a_real_town(town: Made, tmp_path: Path, walk: bool) -> None:
-    from pipeline.stages import traffic
+def test_people_move_in_real_town(town: Made, tmp_path: Path, walk: bool) -> None:
+    from egvs.stages import traffic
 
     del town  # the file is there
-    osm.new(tmp_path / "town", REAL, walk=walk)
+    openstreetmap.create_scenario(tmp_path / "town", REAL, walk=walk)
     rates = {"bicycles_per_h": 100, "pedestrians_per_h": 200} if walk else {"bicycles_per_h": 100}
     people = [f"effects.pedestrians_bicycles.{key}={rate}" for key, rate in rates.items()]
     scenario = loading.load(tmp_path / "town", [*people, "traffic.frames=50", "traffic.warmup_s=60", "tpog.blocks=5",
@@ -379,11 +377,11 @@ def test_people_move_in_a_real_town(town: Made, tmp_path: Path, walk: bool) -> N
     assert ("pedestrian" in summary["beside_vehicles"]) == walk
 
 
-def test_the_traffic_of_a_real_junction_flows(town: Made, tmp_path: Path) -> None:
-    from pipeline.stages import traffic
+def test_traffic_of_real_junction_flows(town: Made, tmp_path: Path) -> None:
+    from egvs.stages import traffic
 
     del town  # the file is there
-    osm.new(tmp_path / "town", REAL, at=(50.8704, 9.7080))
+    openstreetmap.create_scenario(tmp_path / "town", REAL, at=(50.8704, 9.7080))
     summary = run_stage(traffic, loading.load(tmp_path / "town", ["traffic.frames=400"]), tmp_path)
     assert all(count["geh"] < 5 for count in summary["counts"]) and summary["longest_standing_s"] < 120
     assert not {"counts", "standing", "waiting"} & {warning["rule"] for warning in summary["warnings"]}

@@ -15,9 +15,9 @@ import trimesh
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from pipeline.kernels import embree
-from pipeline.kernels.embree import Tree, side_by_side
-from pipeline.sensing.sensors import CATALOGUE
+from egvs.kernels import embree
+from egvs.kernels.embree import TriangleTree, coherent_order
+from egvs.sensors.sensor import CATALOGUE
 
 
 def scattered(count: int, seed: int = 4) -> np.ndarray:
@@ -44,7 +44,7 @@ def alone(triangles: np.ndarray, o: np.ndarray, d: np.ndarray) -> np.ndarray:
 
 def asked(triangles: np.ndarray, o: np.ndarray, d: np.ndarray, beam: np.ndarray | None = None) -> np.ndarray:
     beam = np.arange(len(d), dtype=np.uint32) if beam is None else beam
-    return Tree(triangles).nearest(o, beam, d)
+    return TriangleTree(triangles).nearest(o, beam, d)
 
 
 def test_beams_of_a_sensor_meet_what_each_meets_alone() -> None:
@@ -79,7 +79,7 @@ def test_what_meets_nothing_is_minus_one() -> None:
 
 def test_whatever_stands_beside_a_beam_it_meets_the_same() -> None:
     triangles, o, d = scattered(500), np.zeros(3), fired(120)
-    tree, beam = Tree(triangles), np.arange(len(d), dtype=np.uint32)
+    tree, beam = TriangleTree(triangles), np.arange(len(d), dtype=np.uint32)
     found = tree.nearest(o, beam, d)
     for other in (beam[::-1].copy(), np.random.default_rng(2).permutation(beam), beam[::7].copy()):
         np.testing.assert_array_equal(tree.nearest(o, other, d), found[other])
@@ -89,7 +89,7 @@ def test_whatever_stands_beside_a_beam_it_meets_the_same() -> None:
 def test_beams_of_a_channel_stand_side_by_side(tilt: list[int]) -> None:
     """32 channels that fire in a shuffled order, upright or lying on a side, 16 azimuths in a block."""
     d, beam = fired(900)[:, tilt], np.arange(900 * 32, dtype=np.uint32)
-    order = side_by_side(beam, d)
+    order = coherent_order(beam, d)
     np.testing.assert_array_equal(np.sort(order), beam)
     for block in np.split(order[: 512 * 56], 56):
         assert block.max() - block.min() == 511
@@ -119,7 +119,7 @@ def test_a_direction_that_is_no_number_spoils_no_other(bad: float) -> None:
     d = fired(90)
     rows = np.random.default_rng(6).choice(len(d), 300, replace=False)
     d[rows] = bad
-    order = side_by_side(np.arange(len(d), dtype=np.uint32), d)
+    order = coherent_order(np.arange(len(d), dtype=np.uint32), d)
     np.testing.assert_array_equal(np.sort(order), np.arange(len(d)))
     assert (np.delete(asked(ball(), np.zeros(3), d), rows) >= 0).all()
 
@@ -136,7 +136,7 @@ def test_no_beam_of_a_turned_sensor_leaves_a_closed_room(sensor: str, angles_deg
 
 def test_threads_share_a_tree() -> None:
     triangles, o, d = scattered(2000), np.zeros(3), fired(600)
-    tree, beam = Tree(triangles), np.arange(len(d), dtype=np.uint32)
+    tree, beam = TriangleTree(triangles), np.arange(len(d), dtype=np.uint32)
     true, found = tree.nearest(o, beam, d), [np.empty(0)] * 4
     threads = [threading.Thread(target=lambda n=n: found.__setitem__(n, tree.nearest(o, beam, d))) for n in range(4)]
     for thread in threads:
@@ -151,7 +151,7 @@ def test_a_tree_that_is_let_go_leaves_no_memory() -> None:
     triangles = scattered(50_000)
     peak = []
     for _ in range(20):
-        Tree(triangles)
+        TriangleTree(triangles)
         gc.collect()
         peak.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
     assert peak[-1] - peak[4] < 20_000  # kilobytes; 15 trees are 200,000
@@ -160,18 +160,18 @@ def test_a_tree_that_is_let_go_leaves_no_memory() -> None:
 WITHOUT = """
 import resource
 import numpy as np
-from pipeline.kernels.embree import Tree
+from egvs.kernels.embree import TriangleTree
 small, large = np.random.default_rng(0).uniform(0, 10, (10, 3, 3)), np.zeros((2_000_000, 3, 3))
-Tree(small)
+TriangleTree(small)
 now = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
 for more in (90, 150, 250):
     resource.setrlimit(resource.RLIMIT_AS, (now + (more << 20), resource.RLIM_INFINITY))
     try:
-        Tree(large)
+        TriangleTree(large)
     except MemoryError as error:
         print(error)
     resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-    Tree(small)
+    TriangleTree(small)
 """
 
 
@@ -187,19 +187,19 @@ def test_too_little_memory_is_no_smaller_world(monkeypatch: pytest.MonkeyPatch) 
     with monkeypatch.context() as patch:
         patch.setattr(embree._library, "rtcSetNewGeometryBuffer", lambda *_: None)
         with pytest.raises(MemoryError, match="no room for 360 bytes"):
-            Tree(scattered(10))
+            TriangleTree(scattered(10))
     with monkeypatch.context() as patch:
         patch.setattr(embree._library, "rtcGetDeviceError", lambda _: 4)
         with pytest.raises(MemoryError, match="no tree of 10 triangles: its error 4"):
-            Tree(scattered(10))
+            TriangleTree(scattered(10))
 
 
 ENDS = """
 import threading, time
 import numpy as np
-from pipeline.kernels.embree import Tree
+from egvs.kernels.embree import TriangleTree
 rng = np.random.default_rng(0)
-tree = Tree(rng.uniform(-50, 50, (200_000, 1, 3)) + rng.uniform(-0.5, 0.5, (200_000, 3, 3)))
+tree = TriangleTree(rng.uniform(-50, 50, (200_000, 1, 3)) + rng.uniform(-0.5, 0.5, (200_000, 3, 3)))
 d = rng.normal(size=(2_000_000, 3))
 d /= np.linalg.norm(d, axis=1)[:, None]
 beam = np.arange(len(d), dtype=np.uint32)
@@ -220,10 +220,10 @@ def test_a_program_may_end_while_a_thread_casts() -> None:
 
 INTERPRETED = """
 import numpy as np
-from pipeline.kernels.embree import Tree
+from egvs.kernels.embree import TriangleTree
 ahead = np.array([[[9.0, -1.0, -1.0], [9.0, 1.0, -1.0], [9.0, 0.0, 1.0]]])
 d = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
-print(Tree(ahead).nearest(np.zeros(3), np.arange(2, dtype=np.uint32), d).tolist())
+print(TriangleTree(ahead).nearest(np.zeros(3), np.arange(2, dtype=np.uint32), d).tolist())
 """
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-import pipeline
-from pipeline.artefacts import tables
-from pipeline.report import placement
+import egvs
+from egvs.artefacts import parquet
+from egvs.report import svg_figures
 
 SITES = """site,x_m,y_m,z_m,cost
 a,10,12,3,
@@ -26,42 +26,42 @@ def few(mini: Path) -> Path:
     return mini
 
 
-def test_help_names_the_tables_of_the_scenario(egvs) -> None:
-    code, text, _ = egvs("place", "--help")
+def test_help_names_the_tables_of_the_scenario(run_egvs) -> None:
+    code, text, _ = run_egvs("place", "--help")
     assert code == 0
     assert "[costs]" in text
     assert "[placement.refine]" in " ".join(text.replace("│", " ").split())
 
 
 @pytest.mark.slow
-def test_a_plan_asked_for_by_options_stays_in_the_report_of_the_next_run(few: Path, tmp_path: Path, egvs) -> None:
+def test_a_plan_asked_for_by_options_stays_in_the_report_of_the_next_run(few: Path, tmp_path: Path, run_egvs) -> None:
     out = tmp_path / "out"
-    egvs("run", few, "--out", out)
-    egvs("place", few, "--out", out, "--count", 2, "--set", "costs.pole=5")
+    run_egvs("run", few, "--out", out)
+    run_egvs("place", few, "--out", out, "--count", 2, "--set", "costs.pole=5")
     page = (out / "report.html").read_bytes()
     assert b"Which poles together?" in page
-    egvs("run", few, "--out", out)
+    run_egvs("run", few, "--out", out)
     assert (out / "report.html").read_bytes() == page
 
 
 REFUSED_BEFORE_ANYTHING_RUNS = {
     "the worst of no periods": (
         ["placement.objective='worst'"],
-        'placement.objective: "worst", but the traffic has no',
+        'placement.objective: expected "mean", since the traffic has no periods, got "worst"',
     ),
     "a zone elsewhere": (
         ["placement.zones.far={polygon_m=[[200,0],[201,0],[201,1]],share=0.5}"],
-        "placement.zones.far.polygon_m: all of far is outside the region of interest; corners within x",
+        "placement.zones.far.polygon_m: zone far is outside the region of interest. Use corners within x",
     ),
-    "a price that overflows": (["costs.metre=1e308"], "costs (a): inf; at most 1e+12, in a larger unit of money"),
-    "a price that swallows others": (["costs.pole=1e300"], "costs (a): 1e+300; at most 1e+12"),
+    "a price that overflows": (["costs.metre=1e308"], "costs (a): expected at most 1e+12, got inf"),
+    "a price that swallows others": (["costs.pole=1e300"], "costs (a): expected at most 1e+12, got 1e+300"),
 }
 
 
 @pytest.mark.parametrize("case", REFUSED_BEFORE_ANYTHING_RUNS)
-def test_what_can_be_told_before_a_run_is(few: Path, tmp_path: Path, egvs, case: str) -> None:
+def test_what_can_be_told_before_a_run_is(few: Path, tmp_path: Path, run_egvs, case: str) -> None:
     sets, message = REFUSED_BEFORE_ANYTHING_RUNS[case]
-    code, _, error = egvs(
+    code, _, error = run_egvs(
         "place", few, "--out", tmp_path / "out", "--count", 2, *(x for s in sets for x in ("--set", s))
     )
     assert code == 2
@@ -69,30 +69,30 @@ def test_what_can_be_told_before_a_run_is(few: Path, tmp_path: Path, egvs, case:
     assert not (tmp_path / "out").exists()
 
 
-def test_a_score_that_nothing_raises_is_refused(few: Path, tmp_path: Path, egvs) -> None:
-    code, _, error = egvs("place", few, "--out", tmp_path / "out", "--count", 2, "--set", "score.gamma=0")
+def test_a_score_that_nothing_raises_is_refused(few: Path, tmp_path: Path, run_egvs) -> None:
+    code, _, error = run_egvs("place", few, "--out", tmp_path / "out", "--count", 2, "--set", "score.gamma=0")
     assert code == 2
-    assert "placement: all candidates together have a joint score (egvs) of 0" in error
-    assert "a score.gamma above 0" in error
+    assert "placement: the joint score (egvs) of all candidates is 0" in error
+    assert "score.gamma above 0" in error
     assert not (tmp_path / "out" / "placement.parquet").exists()
 
 
 @pytest.mark.parametrize("gamma", ["inf", "1e300", "1e10"])
 def test_a_gamma_that_no_voxel_reaches_counts_every_beam(few: Path, tmp_path: Path, gamma: str) -> None:
     plans = [
-        pipeline.place(pipeline.load(few, ["placement.count=2", f"score.gamma={of}"]), tmp_path / of)
+        egvs.place(egvs.load(few, ["placement.count=2", f"score.gamma={of}"]), tmp_path / of)
         for of in (gamma, "100000")
     ]
     assert plans[0].joint == plans[1].joint > 0.0
-    assert [pick.site.name for pick in plans[0].picks] == [pick.site.name for pick in plans[1].picks]
+    assert [pick.site.name for pick in plans[0].sensors] == [pick.site.name for pick in plans[1].sensors]
 
 
-def test_costs_stand_beside_each_number_of_sensors(few: Path, tmp_path: Path, egvs) -> None:
+def test_costs_stand_beside_each_number_of_sensors(few: Path, tmp_path: Path, run_egvs) -> None:
     arguments = ("place", few, "--out", tmp_path / "out", "--count", 2)
-    _, text, _ = egvs(*arguments, "--set", "costs.pole=7")
+    _, text, _ = run_egvs(*arguments, "--set", "costs.pole=7")
     header, first, second = _curve(text)
     assert header[-2:] == ["cost", "sites"]
-    curve, _ = tables.read(tmp_path / "out" / "curve.parquet", "curve")
+    curve, _ = parquet.read_artefact(tmp_path / "out" / "curve.parquet", "curve")
     for row, line in zip(curve.to_pylist(), (first, second), strict=True):
         names = ", ".join(json.loads(row["sites"])).split()
         assert line[-len(names) - 1 :] == [f"{row['cost']:g}", *names]
@@ -108,15 +108,15 @@ HALVES = 'traffic.periods=[{name="a", length_s=12, weight=3}, {name="b", begin_s
 
 
 @pytest.mark.slow
-def test_bars_of_the_worst_period_are_shares_already(few: Path, tmp_path: Path, egvs, monkeypatch) -> None:
+def test_bars_of_the_worst_period_are_shares_already(few: Path, tmp_path: Path, run_egvs, monkeypatch) -> None:
     steps = []
-    draw = placement.drawing.curve
-    monkeypatch.setattr(placement.drawing, "curve", lambda its, alt: (steps.extend(its), draw(its, alt))[1])
+    draw = svg_figures.sensor_count_chart
+    monkeypatch.setattr(svg_figures, "sensor_count_chart", lambda its, alt: (steps.extend(its), draw(its, alt))[1])
     out, worst = tmp_path / "out", ("--set", HALVES, "--set", "placement.objective='worst'")
-    egvs("run", few, "--out", out, *worst)
-    code, _, error = egvs("place", few, "--out", out, "--count", 2, *worst)
+    run_egvs("run", few, "--out", out, *worst)
+    code, _, error = run_egvs("place", few, "--out", out, "--count", 2, *worst)
     assert code == 0, error
-    curve, about = tables.read(out / "curve.parquet", "curve")
+    curve, about = parquet.read_artefact(out / "curve.parquet", "curve")
     assert about["plan"]["together"] > 100.0
     assert [step.share for step in steps] == [row["value"] for row in curve.to_pylist()]
     assert 0.1 < steps[0].share < steps[1].share <= 1.0
@@ -124,23 +124,23 @@ def test_bars_of_the_worst_period_are_shares_already(few: Path, tmp_path: Path, 
     assert "by what was asked for (the period that is seen worst), as a share" in page
 
 
-def test_a_folder_in_the_place_of_a_file_costs_no_plan(few: Path, tmp_path: Path, egvs) -> None:
+def test_a_folder_in_the_place_of_a_file_costs_no_plan(few: Path, tmp_path: Path, run_egvs) -> None:
     out = tmp_path / "out"
-    egvs("place", few, "--out", out, "--count", 2)
+    run_egvs("place", few, "--out", out, "--count", 2)
     (out / "curve.parquet").unlink()
     (out / "curve.parquet").mkdir()
     before = (out / "placement.parquet").read_bytes(), (out / "placement.sha256").read_bytes()
-    code, _, error = egvs("place", few, "--out", out, "--count", 3)
+    code, _, error = run_egvs("place", few, "--out", out, "--count", 3)
     assert code == 2
     assert "curve.parquet: is a folder" in error
     assert ((out / "placement.parquet").read_bytes(), (out / "placement.sha256").read_bytes()) == before
 
 
-def test_a_search_that_time_ended_says_so(few: Path, tmp_path: Path, egvs, monkeypatch) -> None:
-    scenario = pipeline.load(few, ["placement.count=2"])
-    placed = pipeline.place(scenario, tmp_path / "out")
+def test_a_search_that_time_ended_says_so(few: Path, tmp_path: Path, run_egvs, monkeypatch) -> None:
+    scenario = egvs.load(few, ["placement.count=2"])
+    placed = egvs.place(scenario, tmp_path / "out")
     ended = replace(placed, solution=replace(placed.solution, is_best=False, fewest_is_proved=None))
     for its, is_told in ((ended, True), (replace(ended, solution=replace(ended.solution, is_best=True)), False)):
-        monkeypatch.setattr("pipeline.placement.placing.place", lambda *_, its=its, **__: its)
-        _, text, _ = egvs("place", few, "--out", tmp_path / "out", "--count", 2, "--exact", "--time-limit", "9s")
-        assert ("ended at its --time-limit of 9s" in text) is is_told
+        monkeypatch.setattr("egvs.placement.plan.place", lambda *_, its=its, **__: its)
+        _, text, _ = run_egvs("place", few, "--out", tmp_path / "out", "--count", 2, "--exact", "--time-limit", "9s")
+        assert ("--exact reached its --time-limit of 9s" in text) is is_told

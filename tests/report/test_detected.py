@@ -6,17 +6,19 @@ from types import SimpleNamespace
 
 import pytest
 
-from pipeline.artefacts import tables
-from pipeline.report.detected import DetectorSummary, SiteDetected
+from egvs.artefacts import parquet
+from egvs.report.sections import DetectorSummary, SiteDetection
 
 NAN = float("nan")
-SCORED = [SimpleNamespace(site=name, egvs=egvs) for name, egvs in zip("abcd", (9.0, 7.0, 5.0, 2.0), strict=True)]
+SCORED = [
+    SimpleNamespace(site=name, egvs=run_egvs) for name, run_egvs in zip("abcd", (9.0, 7.0, 5.0, 2.0), strict=True)
+]
 
 
 def _summary(values, tau):
     known = [value for value in values if value is not None]
     ranks = [None if value is None else 1 + sum(other > value for other in known) for value in values]
-    sites = {s.site: SiteDetected(v, 0.01, r) for s, v, r in zip(SCORED, values, ranks, strict=True)}
+    sites = {s.site: SiteDetection(v, 0.01, r) for s, v, r in zip(SCORED, values, ranks, strict=True)}
     return DetectorSummary("d", "what", tau, sites)
 
 
@@ -62,7 +64,7 @@ def test_orders_are_compared_in_words(values, tau, agreement, judgement):
 
 
 @pytest.mark.slow
-def test_a_validation_is_shown_beside_its_own_run_alone(mini, tmp_path, egvs):
+def test_a_validation_is_shown_beside_its_own_run_alone(mini, tmp_path, run_egvs):
     out = tmp_path / "out"
     validate = ("validate", mini, "--out", out, "--frames", "10", "--detector", "points", "--jobs", "1")
 
@@ -70,39 +72,39 @@ def test_a_validation_is_shown_beside_its_own_run_alone(mini, tmp_path, egvs):
         text = (out / "report.html").read_text()
         return text[text.index('<section id="detected">') :].split("</section>")[0] if 'id="detected"' in text else ""
 
-    assert egvs("run", mini, "--out", out)[0] == 0
+    assert run_egvs("run", mini, "--out", out)[0] == 0
     assert not section()
-    code, printed, error = egvs(*validate)
+    code, printed, error = run_egvs(*validate)
     assert code == 0, error
     shown = html.unescape(section())
     assert f"data:image/png;base64,{base64.b64encode((out / 'validation.png').read_bytes()).decode()}" in shown
     assert "in 10 frames of traffic, at least 2 s apart, with 18 vehicles in the region" in shown
     assert "to compare two orders" in shown  # of two sites
-    assert "judged by frames that the TPOG was counted from" in shown and str(mini) not in shown
-    for row in tables.read(out / "detection.parquet", "detection")[0].to_pylist():
+    assert "evaluated with the frames that the TPOG was computed from" in shown and str(mini) not in shown
+    for row in parquet.read_artefact(out / "detection.parquet", "detection")[0].to_pylist():
         if row["objects_of"] == "vehicles":
             assert f"{100 * row['seen_20']:.1f} ± {100 * row['seen_20_se']:.1f}" in shown
     assert str(out / "report.html") in printed
-    assert egvs("verify", out)[0] == 0
+    assert run_egvs("verify", out)[0] == 0
 
-    assert egvs("run", mini, "--out", out, "--set", "score.gamma=3.0")[0] == 0
+    assert run_egvs("run", mini, "--out", out, "--set", "score.gamma=3.0")[0] == 0
     assert not section()  # the scores that were validated are others
-    assert egvs(*validate, "--set", "score.gamma=3.0")[0] == 0
+    assert run_egvs(*validate, "--set", "score.gamma=3.0")[0] == 0
     assert section()
     (out / "detection.parquet").unlink()
-    assert egvs("run", mini, "--out", out, "--set", "score.gamma=3.0")[0] == 0
+    assert run_egvs("run", mini, "--out", out, "--set", "score.gamma=3.0")[0] == 0
     assert not section()
 
 
 @pytest.mark.slow
-def test_a_damaged_validation_is_named(mini, tmp_path, egvs):
+def test_a_damaged_validation_is_named(mini, tmp_path, run_egvs):
     out = tmp_path / "out"
-    assert egvs("validate", mini, "--out", out, "--frames", "10", "--detector", "points", "--jobs", "1")[0] == 0
+    assert run_egvs("validate", mini, "--out", out, "--frames", "10", "--detector", "points", "--jobs", "1")[0] == 0
     (out / "correlation.parquet").write_bytes(b"PAR1")
-    code, _, error = egvs("run", mini, "--out", out)
+    code, _, error = run_egvs("run", mini, "--out", out)
     assert code == 2
-    assert "correlation.parquet: is not the file of which validation.sha256 has the checksum; remove it, or" in error
+    assert "correlation.parquet: does not match its checksum in validation.sha256; remove it, or" in error
     (out / "validation.sha256").unlink()  # as an earlier version left none
-    code, _, error = egvs("run", mini, "--out", out)
+    code, _, error = run_egvs("run", mini, "--out", out)
     assert code == 2
     assert "correlation.parquet: is not what egvs validate writes; remove it, or run egvs validate again" in error

@@ -17,30 +17,28 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from pipeline.artefacts import tables
-from pipeline.artefacts.readers import read_scores, read_tpog
-from pipeline.core.grid import Grid
-from pipeline.core.reading.seals import sealed
-from pipeline.report import page as report
-from pipeline.report import site_views
-from pipeline.report.drawing import map_frame, maps, raster
-from pipeline.report.drawing.map_frame import MapSite
-from pipeline.report.drawing.maps import Backdrop
-from pipeline.report.drawing.outlines import outlines_of
-from pipeline.report.drawing.roads import Roads
-from pipeline.report.figures import Figures
-from pipeline.report.ranking import Ranking
-from pipeline.scenario.effects import EffectsModel
-from pipeline.scenario.loading import from_values
-from pipeline.scoring.egvs import EntropyField
-from pipeline.scoring.scorer import Scorer
-from pipeline.stages import scan, score
-from pipeline.stages.base import Workspace
-from pipeline.stages.shared.scans import scans
-from pipeline.stages.shared.scene import scene_of
-from pipeline.studies import accuracy, comparison
-from pipeline.studies import variants as study_settings
-from pipeline.world.mesh import World, write_ply
+from egvs.artefacts import parquet
+from egvs.artefacts.readers import read_scores
+from egvs.artefacts.tpog import read_tpog
+from egvs.core.files import add_checksum
+from egvs.core.grid import Grid
+from egvs.report import colours, figures, maps, svg_figures
+from egvs.report import page as report
+from egvs.report import page as report_page
+from egvs.report.basemap import Roads, outlines_of
+from egvs.report.figures import Figures
+from egvs.report.maps import Backdrop
+from egvs.report.ranking import Ranking
+from egvs.report.svg_figures import MapSite
+from egvs.scenario.effects_config import EffectsConfig
+from egvs.scenario.loading import scenario_from_dict
+from egvs.scoring.egvs import EntropyField
+from egvs.scoring.scorer import Scorer
+from egvs.stages import scan, score
+from egvs.stages.inputs import get_scene, open_folder
+from egvs.stages.site_scoring import empty_scans
+from egvs.studies import accuracy, score_errors, study_settings
+from egvs.world.mesh import World, write_ply
 from tests.stages import inputs_of, run_stage
 
 NASTY = '<b>&"x'
@@ -66,7 +64,7 @@ def scenario(folder, sites, columns=(), **keys):
         "sensors": {"small": SENSOR},
         **keys,
     }
-    return from_values(values, folder, str(folder / "scenario.toml"))
+    return scenario_from_dict(values, folder, str(folder / "scenario.toml"))
 
 
 def box(x0, y0, x1, y1, top):
@@ -103,7 +101,7 @@ def drive(path):
     fixed = {"part": 0, "kind": "passenger", "y_m": 4.0, "z_m": 0.75, "yaw_rad": np.pi, "pitch_rad": 0.0}
     fixed |= {"length_m": 4.0, "width_m": 1.8, "height_m": 1.5}
     columns = {"frame": frame, "vehicle": vehicle, "x_m": x_m} | {name: [v] * len(rows) for name, v in fixed.items()}
-    tables.write(path, "trajectories", columns, {"schema": 1, "frames": FRAMES})
+    parquet.write_artefact(path, "trajectories", columns, {"schema": 1, "frames": FRAMES})
 
 
 def finished(folder, sites=SITES, counts=lane, record=True, **keys):
@@ -116,13 +114,13 @@ def finished(folder, sites=SITES, counts=lane, record=True, **keys):
     index = dict(zip(("ix", "iy", "iz"), (a.astype(np.int32) for a in np.unravel_index(flat, grid.shape)), strict=True))
     columns = {"block": np.zeros(len(flat), dtype=np.uint16), **index, "count": counted.ravel()[flat].astype(np.uint32)}
     more = {"grid": grid.to_json(), "frames": FRAMES, "block_frames": FRAMES, "memory_frames": 1.0}
-    tables.write(out / "tpog.parquet", "tpog", columns, {"schema": 1, **more})
+    parquet.write_artefact(out / "tpog.parquet", "tpog", columns, {"schema": 1, **more})
     drive(out / "trajectories.parquet")
     write_ply(out / "statics.ply", world(), {})
     run_stage(scan, about, out, jobs=1)
     run_stage(score, about, out, jobs=1)
     if record:
-        (out / "run.json").write_text(json.dumps(sealed(a_record())), encoding="utf-8")
+        (out / "run.json").write_text(json.dumps(add_checksum(a_record())), encoding="utf-8")
     return about, out
 
 
@@ -212,7 +210,7 @@ def test_counts_stand_beside_what_was_simulated(tmp_path):
         {"place": "<a> to b", "kind": "", "counted_per_h": 320.0, "simulated_per_h": 311.5, "geh": 0.48},
         {"place": "c", "kind": "truck", "counted_per_h": 60.0, "simulated_per_h": 20.0, "geh": 6.32},
     ]
-    (out / "run.json").write_text(json.dumps(sealed(record)), encoding="utf-8")
+    (out / "run.json").write_text(json.dumps(add_checksum(record)), encoding="utf-8")
     read = Reader(page(about, out))
     assert "<a> to b|all|320|311.5|0.5|" in read.rows
     assert "c|truck|60|20|6.3|!|" in [row.replace("||", "|") for row in read.rows]
@@ -260,7 +258,7 @@ def test_every_figure_says_what_it_shows(made):
 
 def test_the_figures_are_files_of_their_own(made):
     for figure in re.findall(r"<svg.*?</svg>", made[2], re.DOTALL):
-        root = ET.fromstring(map_frame.standalone(figure))
+        root = ET.fromstring(svg_figures.standalone(figure))
         assert root.tag == "{http://www.w3.org/2000/svg}svg"
 
 
@@ -277,7 +275,7 @@ def test_it_depends_on_no_path_and_no_moment(made, tmp_path):
 def test_costs_are_shown_and_are_inputs(made, tmp_path):
     about, out, text = made
     shutil.copytree(out, tmp_path / "out")
-    (tmp_path / "out" / "run.json").write_text(json.dumps(sealed(a_record(seconds=98.76))))
+    (tmp_path / "out" / "run.json").write_text(json.dumps(add_checksum(a_record(seconds=98.76))))
     assert "98.76" in page(about, tmp_path / "out") and "98.76" not in text
     assert "77.77" not in text, "SUMO's own seconds differ from run to run"
     assert inputs_of(report, about, tmp_path / "out") != inputs_of(report, about, out)
@@ -291,7 +289,7 @@ def test_whatever_is_shown_is_an_input(made, tmp_path):
     (tmp_path / "out").mkdir()
     for name in ("tpog.parquet", "scores.parquet", "scans.parquet", "statics.ply"):
         shutil.copy(out / name, tmp_path / "out")
-    (tmp_path / "out" / "run.json").write_text(json.dumps(sealed(changed)))
+    (tmp_path / "out" / "run.json").write_text(json.dumps(add_checksum(changed)))
     assert inputs_of(report, about, tmp_path / "out") != before
     assert inputs_of(report, scenario(tmp_path, SITES, seed=3), out) != before
     json.dumps(before.to_json(), allow_nan=False)
@@ -303,7 +301,7 @@ def test_what_is_not_shown_is_no_input(made, tmp_path):
     shutil.copytree(out, tmp_path / "out")
     audited = a_record()
     audited["stages"]["score"] = audited["stages"]["tpog"] | {"summary": {"audit": {"misplaced_chords": 0}}}
-    (tmp_path / "out" / "run.json").write_text(json.dumps(sealed(audited)))
+    (tmp_path / "out" / "run.json").write_text(json.dumps(add_checksum(audited)))
     other, own = inputs_of(report, about, tmp_path / "out"), inputs_of(report, about, out)
     assert other.more["costs"]["score"] == [1.25, 512.0]
     assert (other.files, other.settings, other.more["summaries"]) == (own.files, own.settings, own.more["summaries"])
@@ -340,9 +338,9 @@ def test_what_sites_see_agrees_with_their_scores(made):
     tpog = read_tpog(out / "tpog.parquet")
     field = EntropyField.of(tpog.counts, tpog.frames, tpog.grid)
     rows = {row["site"]: row for row in read_scores(out / "scores.parquet").to_pylist()}
-    work = Workspace(about, out)
-    scorer = Scorer(scene_of(work), tpog)
-    for site_scan in scans(work, ["north", "west"]):
+    work = open_folder(about, out)
+    scorer = Scorer(get_scene(work), tpog)
+    for site_scan in empty_scans(work, ["north", "west"]):
         name, crossed = site_scan.site.name, scorer.hits(site_scan.beams).ravel()[field.cells] > 0
         assert field.per_cell_bit[crossed].sum() / field.per_cell_bit.sum() == pytest.approx(rows[name]["entropy_seen"])
         if rows[name]["rank"] in (1, 4):
@@ -369,9 +367,9 @@ def test_the_record_is_shown(made):
 def test_effects_are_named_and_no_longer_left_out(made):
     about, out, text = made
     assert "Effects none" in Reader(text).text and "fog" in text
-    foggy = about.with_effects(EffectsModel.of({"fog": {"visibility_m": 100}, "moving_occlusion": {}}))
+    foggy = about.with_effects(EffectsConfig.of({"fog": {"visibility_m": 100}, "moving_occlusion": {}}))
     ranking, tpog = Ranking.read(out / "scores.parquet"), read_tpog(out / "tpog.parquet")
-    shown = report.page(foggy, ranking, tpog, Figures("", "", None, Backdrop((), Roads())), {}, None)
+    shown = report_page.render_page(foggy, ranking, tpog, Figures("", "", None, Backdrop((), Roads())), {}, None)
     assert "this run models fog, moving occlusion. Left out are rain, " in Reader(shown).text
 
 
@@ -435,14 +433,14 @@ def test_no_record_no_costs(tmp_path):
     read = Reader(page(about, out))
     assert any(row.strip("|").startswith("traffic|–|") for row in read.rows)
     (out / "run.json").write_text(
-        json.dumps(sealed(a_record() | {"stages": {"scan": {"artefacts": {}, "summary": {}}}}))
+        json.dumps(add_checksum(a_record() | {"stages": {"scan": {"artefacts": {}, "summary": {}}}}))
     )
     assert Reader(page(about, out)).text == read.text
 
 
 def test_a_far_site_is_on_the_map(tmp_path):
     about, out = finished(tmp_path, sites=[*SITES, ("far", 40, 30, 5)])
-    x0, y0, x1, y1 = map_frame.extent(about.roi.grid, [MapSite("far", 40, 30, 5, 1.0, 1)])
+    x0, y0, x1, y1 = svg_figures.extent(about.roi.grid, [MapSite("far", 40, 30, 5, 1.0, 1)])
     assert x0 < 0 and y0 < 0 and x1 > 40 and y1 > 30
     assert "far" in Reader(page(about, out)).text
 
@@ -455,7 +453,7 @@ def choices(text):
 @pytest.mark.slow
 @pytest.mark.parametrize(("count", "is_coarse"), [(40, False), (41, True)])
 def test_every_site_can_be_chosen_with_larger_pixels_where_there_are_many(tmp_path, monkeypatch, count, is_coarse):
-    monkeypatch.setattr(site_views, "_COARSE_PIXELS", 100)
+    monkeypatch.setattr(figures, "_COARSE_PIXELS", 100)
     sites = [(f"g{n:03}", 0.3 * n, -1, 2) for n in range(count)]
     about, out = finished(tmp_path, sites=sites)
     text = page(about, out)
@@ -526,7 +524,7 @@ def test_north_is_up_and_east_is_right():
 def test_large_grids_are_averaged():
     field = np.zeros((1300, 700))
     field[:2, :2] = 3.0
-    smaller = raster.shrunk(field, np.mean)
+    smaller = colours.downsample(field, np.mean)
     assert smaller.shape == (650, 350) and smaller[0, 0] == 3.0 and smaller.sum() == 3.0
 
 
@@ -580,18 +578,18 @@ def test_outlines_are_cut_to_what_is_shown():
     ],
 )
 def test_ticks_are_round(low, high, texts):
-    assert [text for _, text in map_frame.round_values(low, high, 5)] == texts
+    assert [text for _, text in svg_figures.round_values(low, high, 5)] == texts
 
 
 @pytest.mark.slow
-def test_the_accuracy_study_is_shown_where_there_is_one(mini, tmp_path, egvs, monkeypatch):
+def test_the_accuracy_study_is_shown_where_there_is_one(mini, tmp_path, run_egvs, monkeypatch):
     """Its recommendation, the front, the figure; not of another scenario or other files; the run is verified in each
     case."""
     monkeypatch.setattr(study_settings, "VOXELS_M", (1.0,))
     monkeypatch.setattr(study_settings, "GAMMAS", (2.0,))
     monkeypatch.setattr(study_settings, "_others", lambda _: iter(()))
     monkeypatch.setattr(accuracy, "REPEATS", 1)
-    own = comparison.judge
+    own = score_errors.mark_pareto_front
 
     def thinned(rows, tolerance):
         """The clock decides which of two fast settings is the cheapest: here it is always the same."""
@@ -599,20 +597,20 @@ def test_the_accuracy_study_is_shown_where_there_is_one(mini, tmp_path, egvs, mo
             [replace(r, seconds=0.5 if r.setting == "every 2nd azimuth" else 1.0, judged=0.0) for r in rows], tolerance
         )
 
-    monkeypatch.setattr(comparison, "judge", thinned)
+    monkeypatch.setattr(score_errors, "mark_pareto_front", thinned)
     out = tmp_path / "out"
 
     def shown():
         return "What accuracy costs" in (out / "report.html").read_text()
 
-    assert egvs("run", mini, "--out", out)[0] == 0
+    assert run_egvs("run", mini, "--out", out)[0] == 0
     assert not shown()
-    code, printed, error = egvs("accuracy", mini, "--out", out)
+    code, printed, error = run_egvs("accuracy", mini, "--out", out)
     assert code == 0, error
     assert printed.splitlines()[-1] == str(out / "report.html")
     text = (out / "report.html").read_text()
     assert f"data:image/png;base64,{base64.b64encode((out / 'accuracy.png').read_bytes()).decode()}" in text
-    rows = tables.read(out / "accuracy.parquet", "accuracy")[0].to_pylist()
+    rows = parquet.read_artefact(out / "accuracy.parquet", "accuracy")[0].to_pylist()
     best = next(row for row in rows if row["recommended"])
     assert best["setting"] == "every 2nd azimuth"
     section = text[text.index("What accuracy costs") :]
@@ -621,44 +619,44 @@ def test_the_accuracy_study_is_shown_where_there_is_one(mini, tmp_path, egvs, mo
     assert section.count("<tr") == 1 + sum(
         row["front"] or row["recommended"] or row["kind"] == "scenario" for row in rows
     )
-    assert egvs("verify", out)[0] == 0
+    assert run_egvs("verify", out)[0] == 0
 
-    assert egvs("accuracy", mini, "--out", out, "--set", "score.gamma=3.0")[0] == 0
+    assert run_egvs("accuracy", mini, "--out", out, "--set", "score.gamma=3.0")[0] == 0
     assert not shown()  # that study is of another scenario than the run
-    assert egvs("verify", out)[0] == 0
-    assert egvs("run", mini, "--out", out, "--set", "score.gamma=3.0")[0] == 0
+    assert run_egvs("verify", out)[0] == 0
+    assert run_egvs("run", mini, "--out", out, "--set", "score.gamma=3.0")[0] == 0
     assert shown()
-    assert egvs("verify", out)[0] == 0
+    assert run_egvs("verify", out)[0] == 0
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m\npole_a,10,12,3\n")
-    assert egvs("run", mini, "--out", out, "--set", "score.gamma=3.0")[0] == 0
+    assert run_egvs("run", mini, "--out", out, "--set", "score.gamma=3.0")[0] == 0
     assert not shown()  # nor is it of other sites
 
 
 @pytest.mark.slow
-def test_a_study_that_was_replaced_is_named_by_verify(mini, tmp_path, egvs):
+def test_a_study_that_was_replaced_is_named_by_verify(mini, tmp_path, run_egvs):
     out = tmp_path / "out"
-    assert egvs("run", mini, "--out", out)[0] == 0
-    assert egvs("accuracy", mini, "--out", out, "--budget", "0.001s")[0] == 0
+    assert run_egvs("run", mini, "--out", out)[0] == 0
+    assert run_egvs("accuracy", mini, "--out", out, "--budget", "0.001s")[0] == 0
     (out / "accuracy.png").write_bytes((out / "accuracy.png").read_bytes() + b"x")
-    code, printed, _ = egvs("verify", out)
+    code, printed, _ = run_egvs("verify", out)
     assert code == 1
     assert "report.html shows accuracy.png, which was replaced since" in printed
 
 
 @pytest.mark.slow
-def test_a_damaged_study_is_named(mini, tmp_path, egvs):
+def test_a_damaged_study_is_named(mini, tmp_path, run_egvs):
     out = tmp_path / "out"
-    assert egvs("accuracy", mini, "--out", out, "--budget", "0.001s")[0] == 0
-    tables.write(
+    assert run_egvs("accuracy", mini, "--out", out, "--budget", "0.001s")[0] == 0
+    parquet.write_artefact(
         out / "accuracy.parquet",
         "scores",
-        {name: [] for name in tables.schemas.arrow_schema("scores").names},
+        {name: [] for name in parquet.arrow_schema("scores").names},
         {"schema": 1},
     )
-    code, _, error = egvs("run", mini, "--out", out)
+    code, _, error = run_egvs("run", mini, "--out", out)
     assert code == 2
-    assert "accuracy.parquet: is not the file of which accuracy.sha256 has the checksum; remove it, or run" in error
+    assert "accuracy.parquet: does not match its checksum in accuracy.sha256; remove it, or run" in error
     (out / "accuracy.sha256").unlink()  # as an earlier version left none
-    code, _, error = egvs("run", mini, "--out", out)
+    code, _, error = run_egvs("run", mini, "--out", out)
     assert code == 2
     assert "accuracy.parquet: is no accuracy study; remove it, or run egvs accuracy again" in error

@@ -61,7 +61,7 @@ def run(job: Job) -> Job:
 def _work(job: Job, answer: Any, waits: Any) -> None:
     os.setpgid(0, 0)  # SUMO is killed too
     os.environ["EGVS_STORE"] = str(job.store)
-    import pipeline
+    import egvs
 
     steps, states = 0, {}
     watched = (f"{job.out}{os.sep}", f"{job.store}{os.sep}")
@@ -80,8 +80,8 @@ def _work(job: Job, answer: Any, waits: Any) -> None:
             waits.set()
 
     sys.addaudithook(step)
-    pipeline.run(
-        pipeline.load(job.scenario, job.sets), job.out, jobs=1, progress=progress,
+    egvs.run(
+        egvs.load(job.scenario, job.sets), job.out, jobs=1, progress=progress,
         listener=lambda stage, state, _: states.__setitem__(stage, state),
     )  # fmt: skip
     answer.send((steps, states))

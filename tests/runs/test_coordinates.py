@@ -12,11 +12,11 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-import pipeline
-from pipeline.core.errors import InputError
-from pipeline.formats.crs import WorldFrame
-from pipeline.report.ranking import Ranking
-from pipeline.stages import traffic
+import egvs
+from egvs.core.errors import InputError
+from egvs.formats.georeference import WorldFrame
+from egvs.report.ranking import Ranking
+from egvs.stages import traffic
 from tests.checks.conftest import net_xml
 from tests.conftest import write_mini
 from tests.stages import inputs_of
@@ -81,8 +81,8 @@ def moved_mini(folder: Path, move: Move, crs: str | None) -> Path:
 
 
 def scores(folder: Path, out: Path) -> pa.Table:
-    pipeline.run(pipeline.load(folder, PLAIN), out)
-    return pipeline.read_scores(out / "scores.parquet")
+    egvs.run(egvs.load(folder, PLAIN), out)
+    return egvs.read_scores(out / "scores.parquet")
 
 
 @pytest.fixture(scope="module")
@@ -151,9 +151,9 @@ def test_a_periods_fcd_lies_where_the_scenarios_network_says(tmp_path: Path, in_
     )
     scenario.write_text(text)
     assert scores(folder, tmp_path / "run")["egvs"].to_pylist() == in_metres["egvs"].to_pylist()
-    before = inputs_of(traffic, pipeline.load(folder), tmp_path / "run").to_json()
+    before = inputs_of(traffic, egvs.load(folder), tmp_path / "run").to_json()
     (folder / "net.net.xml").write_text(lanes.replace("-550700", "-550701"))
-    assert inputs_of(traffic, pipeline.load(folder), tmp_path / "run").to_json() != before
+    assert inputs_of(traffic, egvs.load(folder), tmp_path / "run").to_json() != before
 
 
 def test_fcd_in_degrees_ends_in_the_scores_of_metres(tmp_path: Path, in_metres: pa.Table) -> None:

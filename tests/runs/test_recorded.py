@@ -9,15 +9,15 @@ from pathlib import Path
 
 import pytest
 
-import pipeline
-from pipeline.core import files
-from pipeline.core.errors import InputError
-from pipeline.core.reading.seals import sealed
-from pipeline.effects import scene_resolving
-from pipeline.runs import workflow
-from pipeline.stages.base import Workspace
-from pipeline.stages.shared.world import world_of
-from pipeline.studies.effect_trials import Trials
+import egvs
+from egvs.core import files
+from egvs.core.errors import InputError
+from egvs.core.files import add_checksum
+from egvs.runs import run
+from egvs.stages import inputs
+from egvs.stages.base import static_world
+from egvs.stages.inputs import open_folder
+from egvs.studies.effect_study import EffectTrials
 
 READ_BY = {
     "trajectories.parquet": ("tpog", "score", "report"),
@@ -31,35 +31,35 @@ PAIRS = [(name, verb) for name, verbs in READ_BY.items() for verb in verbs]
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[pipeline.Scenario, Path, Path]:
+def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[egvs.Scenario, Path, Path]:
     """A scenario, its finished run, and one of other settings."""
     from tests.conftest import write_mini
 
     folder = tmp_path_factory.mktemp("recorded")
-    scenario = pipeline.load(write_mini(folder / "mini"))
-    pipeline.run(scenario, folder / "out")
+    scenario = egvs.load(write_mini(folder / "mini"))
+    egvs.run(scenario, folder / "out")
     others = ["traffic.frames=20", "score.gamma=2", "statics.ground=false", "sensors.small.channels=4"]
-    pipeline.run(pipeline.load(scenario.folder, others), folder / "other")
+    egvs.run(egvs.load(scenario.folder, others), folder / "other")
     return scenario, folder / "out", folder / "other"
 
 
 @pytest.fixture
-def out(runs: tuple[pipeline.Scenario, Path, Path], tmp_path: Path) -> Path:
+def out(runs: tuple[egvs.Scenario, Path, Path], tmp_path: Path) -> Path:
     """A copy of the finished run, in a folder of its own."""
     copy = Path(shutil.copytree(runs[1], tmp_path / "out"))
     record = json.loads((copy / "run.json").read_text())
     record["scenario_folder"] = str(runs[0].folder)
-    (copy / "run.json").write_text(json.dumps(sealed(record)))
+    (copy / "run.json").write_text(json.dumps(add_checksum(record)))
     return copy
 
 
 def contents(folder: Path) -> dict[str, str]:
-    return {path.name: files.sha256_of(path) for path in folder.iterdir() if path.is_file()}
+    return {path.name: files.hash_file(path) for path in folder.iterdir() if path.is_file()}
 
 
-def answer(verb: str, scenario: pipeline.Scenario, out: Path) -> str:
+def answer(verb: str, scenario: egvs.Scenario, out: Path) -> str:
     with pytest.raises(InputError) as caught:
-        workflow.run_one(verb, scenario, out)
+        run.run_one(verb, scenario, out)
     return str(caught.value)
 
 
@@ -72,8 +72,11 @@ def test_any_flipped_bit_is_refused(runs, out: Path, name: str, verb: str) -> No
         (out / name).write_bytes(data)
         before = contents(out)
         said = answer(verb, runs[0], out)
-        now, known = (files.sha256_of(path / name)[:12] for path in (out, runs[1]))
-        altered = f"{out / name}: was altered or replaced (sha256 {now}, in run.json {known}); egvs run makes it again"
+        now, known = (files.hash_file(path / name)[:12] for path in (out, runs[1]))
+        altered = (
+            f"{out / name}: was altered or replaced (sha256 {now}, in run.json {known}). Call egvs run to "
+            f"make it again."
+        )
         assert said == altered
         assert contents(out) == before, "a refused verb wrote something"
 
@@ -85,14 +88,14 @@ def test_a_file_of_another_run_is_refused(runs, out: Path, name: str, verb: str)
     assert f"{out / name}: was altered or replaced" in answer(verb, scenario, out)
 
 
-def test_a_file_that_no_stage_made_here_is_refused(runs, tmp_path: Path, egvs) -> None:
+def test_a_file_that_no_stage_made_here_is_refused(runs, tmp_path: Path, run_egvs) -> None:
     scenario, made, _ = runs
     fresh = tmp_path / "fresh"
     fresh.mkdir()
     for name in ("trajectories.parquet", "statics.ply"):
         shutil.copyfile(made / name, fresh / name)
-    code, _, error = egvs("tpog", scenario.folder, "--out", fresh)
-    what = "no stage that run.json knows of made it here; egvs run makes it again"
+    code, _, error = run_egvs("tpog", scenario.folder, "--out", fresh)
+    what = "was made by no stage in run.json. Call egvs run to make it again."
     assert (code, error) == (2, f"egvs: {fresh / 'trajectories.parquet'}: {what}\n")
     assert not (fresh / "tpog.parquet").exists()
 
@@ -100,39 +103,39 @@ def test_a_file_that_no_stage_made_here_is_refused(runs, tmp_path: Path, egvs) -
 def test_the_run_that_the_message_asks_for_mends_it(runs, out: Path) -> None:
     for name in READ_BY:
         shutil.copyfile(runs[2] / name, out / name)
-    workflow.run(runs[0], out)
+    run.run(runs[0], out)
     assert {name: contents(out)[name] for name in READ_BY} == {name: contents(runs[1])[name] for name in READ_BY}
 
 
 @pytest.mark.slow
-def test_stages_one_by_one_still_go_on_from_what_lies_there(runs, tmp_path: Path, egvs) -> None:
+def test_stages_one_by_one_still_go_on_from_what_lies_there(runs, tmp_path: Path, run_egvs) -> None:
     scenario, made, _ = runs
     for verb in ("statics", "scan", "traffic", "tpog", "score", "report"):
-        code, _, error = egvs(verb, scenario.folder, "--out", tmp_path / "out")
+        code, _, error = run_egvs(verb, scenario.folder, "--out", tmp_path / "out")
         assert code == 0, error
     for name in READ_BY:
-        assert files.sha256_of(tmp_path / "out" / name) == files.sha256_of(made / name)
+        assert files.hash_file(tmp_path / "out" / name) == files.hash_file(made / name)
 
 
-def test_what_a_stage_read_is_known_though_its_maker_is_of_other_settings_now(runs, out: Path, egvs) -> None:
+def test_what_a_stage_read_is_known_though_its_maker_is_of_other_settings_now(runs, out: Path, run_egvs) -> None:
     """Traffic of other settings is no longer what the scenario says, and its record goes; the file is still known."""
     for _ in range(2):
-        code, _, error = egvs("score", runs[0].folder, "--out", out, "--set", "traffic.frames=20")
+        code, _, error = run_egvs("score", runs[0].folder, "--out", out, "--set", "traffic.frames=20")
         assert code == 0, error
         assert "traffic" not in json.loads((out / "run.json").read_text())["stages"]
 
 
 def test_the_report_of_a_run_is_not_drawn_anew_of_altered_artefacts(runs, out: Path) -> None:
-    assert workflow.refresh_report(out) is not None
+    assert run.refresh_report(out) is not None
     before = contents(out)["report.html"]
     shutil.copyfile(runs[2] / "scores.parquet", out / "scores.parquet")
-    assert workflow.refresh_report(out) is None
+    assert run.refresh_report(out) is None
     assert contents(out)["report.html"] == before
 
 
 @pytest.mark.parametrize("name", ["trajectories.parquet", "tpog.parquet", "statics.ply"])
 def test_effects_are_tried_on_no_altered_traffic(runs, out: Path, name: str) -> None:
-    scene = scene_resolving.resolve(runs[0], world_of(Workspace(runs[0], out)))
-    assert Trials.of(scene, out) is not None
+    scene = inputs.resolve_scene(runs[0], static_world(open_folder(runs[0], out)))
+    assert EffectTrials.of(scene, out) is not None
     shutil.copyfile(runs[2] / name, out / name)
-    assert Trials.of(scene, out) is None
+    assert EffectTrials.of(scene, out) is None

@@ -12,11 +12,10 @@ from typing import Any
 import fsspec
 import pytest
 
-import pipeline
-from pipeline.core.errors import InputError
-from pipeline.runs import store_settings, workflow
-from pipeline.runs.remote import Remote
-from pipeline.runs.store import Store
+import egvs
+from egvs.core.errors import InputError
+from egvs.runs import run, store
+from egvs.runs.store import RemoteStore, Store
 from tests.runs.test_store import digests, states
 
 URL = "memory://shared/store"
@@ -42,7 +41,7 @@ def machine(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_what_one_machine_made_another_one_fetches(
     mini: Path, tmp_path: Path, shared: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    scenario = pipeline.load(mini)
+    scenario = egvs.load(mini)
     one = machine(tmp_path / "one", monkeypatch)
     assert set(states(scenario, one / "out").values()) == {"done"}
     other = machine(tmp_path / "other", monkeypatch)
@@ -58,7 +57,7 @@ def test_what_one_machine_made_another_one_fetches(
 def test_what_is_damaged_there_is_made_again(
     damage: str, mini: Path, tmp_path: Path, shared: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    scenario = pipeline.load(mini)
+    scenario = egvs.load(mini)
     one = machine(tmp_path / "one", monkeypatch)
     states(scenario, one / "out")
     (tpog,) = shared.glob("/shared/store/tpog-*")
@@ -86,7 +85,7 @@ def test_what_is_damaged_there_is_made_again(
 
 def test_an_entry_without_its_record_is_none(shared: Any, tmp_path: Path) -> None:
     shared.pipe_file("/shared/store/tpog-x/tpog.parquet", b"half")
-    assert not Remote(URL).fetch("tpog-x", tmp_path)
+    assert not RemoteStore(URL).fetch("tpog-x", tmp_path)
 
 
 def test_a_place_that_cannot_be_reached_is_told_once(
@@ -96,30 +95,30 @@ def test_a_place_that_cannot_be_reached_is_told_once(
     (tmp_path / "file").write_text("no folder")
     url = f"file://{tmp_path / 'file'}/store"
     monkeypatch.setenv("EGVS_STORE", url)
-    workflow.run(pipeline.load(mini), tmp_path / "out")
+    run.run(egvs.load(mini), tmp_path / "out")
     told = [line for line in capsys.readouterr().err.splitlines() if url in line]
     assert told and all("the run goes on without it" in line for line in told)
     with pytest.raises(InputError, match="cannot be written"):
-        Remote(url).check()
+        RemoteStore(url).check()
 
 
 def test_an_unknown_kind_is_refused() -> None:
     with pytest.raises(InputError, match=r"nowhere://x: cannot be reached .*; a place that this machine may read and"):
-        Remote("nowhere://x")
+        RemoteStore("nowhere://x")
 
 
 def test_what_the_environment_says(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EGVS_STORE", "s3://bucket/store")
-    assert store_settings.read()[0] == store_settings.DEFAULT_PLACE
-    assert store_settings.remote_url() == "s3://bucket/store"
-    with store_settings.using("/a/folder", 5.0):
-        assert store_settings.read() == (Path("/a/folder"), 5.0)
-        assert store_settings.remote_url() is None
+    assert store.read_store_settings()[0] == store.DEFAULT_FOLDER
+    assert store.remote_url() == "s3://bucket/store"
+    with store.use_store("/a/folder", 5.0):
+        assert store.read_store_settings() == (Path("/a/folder"), 5.0)
+        assert store.remote_url() is None
     monkeypatch.setenv("EGVS_STORE", "")
-    assert store_settings.read()[0] is None
-    assert store_settings.remote_url() is None
+    assert store.read_store_settings()[0] is None
+    assert store.remote_url() is None
 
 
 def test_a_place_is_probed_and_left_as_it_was(shared: Any) -> None:
-    Remote(URL).check()
+    RemoteStore(URL).check()
     assert not shared.find("/shared")

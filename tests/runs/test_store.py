@@ -18,14 +18,15 @@ from pathlib import Path
 
 import pytest
 
-import pipeline
-from pipeline.artefacts import schemas
-from pipeline.core import code_digest, files
-from pipeline.core.cost import Cost
-from pipeline.core.errors import InputError
-from pipeline.runs import stages, workflow
-from pipeline.runs.stages import STAGES, Made
-from pipeline.runs.store import Entry, Store
+import egvs
+from egvs.artefacts import parquet
+from egvs.artefacts.run_folder import STAGE_NAMES
+from egvs.core import files
+from egvs.core.errors import InputError
+from egvs.core.runtime import ResourceUsage
+from egvs.runs import run, stages, verification
+from egvs.runs.stages import StageResult
+from egvs.runs.store import Store, StoreEntry
 from tests.runs import children
 from tests.runs.children import Child, Job
 
@@ -33,34 +34,34 @@ ROOT = Path(__file__).resolve().parents[2]
 DATA = ("statics.ply", "scans.parquet", "trajectories.parquet", "tpog.parquet", "scores.parquet")
 
 
-def states(scenario: pipeline.Scenario, out: Path, **options: object) -> dict[str, str]:
+def states(scenario: egvs.Scenario, out: Path, **options: object) -> dict[str, str]:
     """Run, and say of each stage whether it was skipped, fetched or made."""
     seen: dict[str, str] = {}
-    workflow.run(scenario, out, listener=lambda stage, state, _: seen.__setitem__(stage, state), **options)  # type: ignore[arg-type]
+    run.run(scenario, out, listener=lambda stage, state, _: seen.__setitem__(stage, state), **options)  # type: ignore[arg-type]
     return seen
 
 
 def digests(out: Path) -> dict[str, str]:
-    return {name: files.sha256_of(out / name) for name in DATA}
+    return {name: files.hash_file(out / name) for name in DATA}
 
 
-def assert_whole(store: Path) -> list[Entry]:
+def assert_whole(store: Path) -> list[StoreEntry]:
     """Every entry is there whole, and nothing else is."""
     kept = Store(store, note=pytest.fail)
     entries = kept.entries()
     assert {entry.folder for entry in entries} == {path for path in store.iterdir() if path.name[0] != "."}
     for entry in entries:
         for name, digest in entry.made.files.items():
-            assert files.sha256_of(entry.folder / name) == digest
+            assert files.hash_file(entry.folder / name) == digest
     for place in (".work", ".locks"):
         assert not (store / place).is_dir() or not list((store / place).iterdir())
     return entries
 
 
 @pytest.fixture
-def done(mini: Path, tmp_path: Path) -> tuple[pipeline.Scenario, Path]:
+def done(mini: Path, tmp_path: Path) -> tuple[egvs.Scenario, Path]:
     """A scenario, and the folder of its finished run."""
-    scenario = pipeline.load(mini)
+    scenario = egvs.load(mini)
     assert set(states(scenario, tmp_path / "out").values()) == {"done"}
     return scenario, tmp_path / "out"
 
@@ -90,7 +91,7 @@ def test_a_second_folder_makes_nothing(
     junction: Path, tmp_path: Path, store: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nothing is simulated, cast or counted, and the folder holds the same plain files, SUMO's among them."""
-    scenario = pipeline.load(junction)
+    scenario = egvs.load(junction)
     one, other = tmp_path / "one", tmp_path / "other"
     assert set(states(scenario, one).values()) == {"done"}
 
@@ -98,7 +99,7 @@ def test_a_second_folder_makes_nothing(
         raise AssertionError("a stage was made")
 
     with monkeypatch.context() as patched:
-        patched.setattr(stages, "make", refuse)
+        patched.setattr(stages, "run_stage", refuse)
         assert set(states(scenario, other).values()) == {"fetched"}
         assert set(states(scenario, other).values()) == {"skipped"}
     names = {p.relative_to(one).as_posix() for p in one.rglob("*") if p.is_file()}
@@ -108,72 +109,74 @@ def test_a_second_folder_makes_nothing(
     assert (
         json.loads((other / "run.json").read_text())["stages"] == json.loads((one / "run.json").read_text())["stages"]
     )
-    assert workflow.verify(other) == []
+    assert verification.verify(other) == []
     (other / "tpog.parquet").write_bytes(b"of the user's own")  # which harms the store not
     assert_whole(store)
 
 
 @pytest.mark.slow
-def test_what_sumo_read_and_the_report_draws_is_held_against_its_digest(junction: Path, tmp_path: Path, egvs) -> None:
-    out, scenario = tmp_path / "out", pipeline.load(junction)
+def test_what_sumo_read_and_the_report_draws_is_held_against_its_digest(
+    junction: Path, tmp_path: Path, run_egvs
+) -> None:
+    out, scenario = tmp_path / "out", egvs.load(junction)
     states(scenario, out)
     network, routes = out / "sumo" / "network.net.xml", out / "sumo" / "trips.rou.xml"
     whole = network.read_bytes()
     kept = json.loads((out / "run.json").read_text())["stages"]["traffic"]["companions"]
-    assert kept["sumo/network.net.xml"] == files.sha256_of(network)
+    assert kept["sumo/network.net.xml"] == files.hash_file(network)
     network.write_bytes(whole.replace(b"speed", b"sqeed", 1))
     routes.write_text("<routes/>")
     (out / "sumo" / "vtypes.add.xml").unlink()
-    code, _, error = egvs("report", junction, "--out", out)
+    code, _, error = run_egvs("report", junction, "--out", out)
     assert (code, error.split(" (")[0]) == (2, f"egvs: {network}: was altered or replaced")
-    assert sorted(workflow.verify(out))[:2] == [
+    assert sorted(verification.verify(out))[:2] == [
         f"sumo/{path.name} was altered after the run" for path in (network, routes)
     ]
-    again = {name: "skipped" for name in STAGES} | {"traffic": "fetched"}
+    again = {name: "skipped" for name in STAGE_NAMES} | {"traffic": "fetched"}
     assert states(scenario, out) == again
     assert network.read_bytes() == whole
-    assert workflow.verify(out) == []
+    assert verification.verify(out) == []
 
 
-def test_a_changed_and_a_former_setting(done: tuple[pipeline.Scenario, Path]) -> None:
+def test_a_changed_and_a_former_setting(done: tuple[egvs.Scenario, Path]) -> None:
     """What a folder held before it was run with other settings comes back from the store."""
     scenario, out = done
     before = digests(out)
-    changed = pipeline.load(scenario.folder, ["score.gamma=9"])
+    changed = egvs.load(scenario.folder, ["score.gamma=9"])
     again = {"score": "done", "report": "done"}
-    assert states(changed, out) == {**dict.fromkeys(STAGES, "skipped"), **again}
-    assert states(scenario, out) == {**dict.fromkeys(STAGES, "skipped"), **dict.fromkeys(again, "fetched")}
+    assert states(changed, out) == {**dict.fromkeys(STAGE_NAMES, "skipped"), **again}
+    assert states(scenario, out) == {**dict.fromkeys(STAGE_NAMES, "skipped"), **dict.fromkeys(again, "fetched")}
     assert digests(out) == before
 
 
 @pytest.mark.slow
 def test_a_file_that_the_kept_stage_does_not_have_goes(mini: Path, tmp_path: Path) -> None:
     """Hits of sites are kept by one setting, and not by the other."""
-    plain, seen = pipeline.load(mini), pipeline.load(mini, ['score.keep_visibility="all"'])
-    pipeline.run(plain, tmp_path / "plain")
-    pipeline.run(seen, tmp_path / "out")
+    plain, seen = egvs.load(mini), egvs.load(mini, ['score.keep_visibility="all"'])
+    egvs.run(plain, tmp_path / "plain")
+    egvs.run(seen, tmp_path / "out")
     assert (tmp_path / "out" / "visibility.parquet").exists()
     assert states(plain, tmp_path / "out")["score"] == "fetched"
     assert not (tmp_path / "out" / "visibility.parquet").exists()
 
 
 @pytest.mark.slow
-def test_a_stage_with_options_is_made_and_not_kept(done: tuple[pipeline.Scenario, Path], tmp_path: Path, store) -> None:
+def test_a_stage_with_options_is_made_and_not_kept(done: tuple[egvs.Scenario, Path], tmp_path: Path, store) -> None:
     scenario, _ = done
     options = {"score": {"audit": True}}
     assert states(scenario, tmp_path / "other", options=options)["score"] == "done"
     before = assert_whole(store)
-    states(pipeline.load(scenario.folder, ["score.gamma=9"]), tmp_path / "third", options=options)
+    states(egvs.load(scenario.folder, ["score.gamma=9"]), tmp_path / "third", options=options)
     assert {e.stage for e in assert_whole(store) if e.folder not in {b.folder for b in before}} == {"report"}
 
 
-def test_a_stage_called_by_itself_is_made_and_kept(done: tuple[pipeline.Scenario, Path], tmp_path: Path) -> None:
+def test_a_stage_called_by_itself_is_made_and_kept(done: tuple[egvs.Scenario, Path], tmp_path: Path) -> None:
     scenario, out = done
     seen: list[str] = []
-    workflow.run_one("statics", scenario, out, listener=lambda _, state, __: seen.append(state))
+    run.run_one("statics", scenario, out, listener=lambda _, state, __: seen.append(state))
     assert seen == ["runs", "done"]
-    other = pipeline.load(scenario.folder, ["statics.ground=false"])
-    workflow.run_one("statics", other, out)
+    other = egvs.load(scenario.folder, ["statics.ground=false"])
+    run.run_one("statics", other, out)
     assert states(other, tmp_path / "other")["statics"] == "fetched"
 
 
@@ -194,7 +197,7 @@ def edited(how: Callable[[dict], object], rehash: bool = False) -> Callable[[Pat
         how(value := json.loads(path.read_text()))
         if rehash:
             del value["sha256"]
-            value["sha256"] = files.hash_of(value)
+            value["sha256"] = files.hash_json(value)
         path.write_text(json.dumps(value))
 
     return edit
@@ -221,13 +224,13 @@ DAMAGE = {
 @pytest.mark.slow
 @pytest.mark.parametrize("case", DAMAGE)
 def test_a_damaged_entry_is_named_and_made_again(
-    done: tuple[pipeline.Scenario, Path], tmp_path: Path, store: Path, capsys: pytest.CaptureFixture[str], case: str
+    done: tuple[egvs.Scenario, Path], tmp_path: Path, store: Path, capsys: pytest.CaptureFixture[str], case: str
 ) -> None:
     scenario, out = done
     pattern, damage = DAMAGE[case]
     (path,) = store.glob(pattern)
     damage(path)
-    expected = {**dict.fromkeys(STAGES, "fetched"), "tpog": "done"}
+    expected = {**dict.fromkeys(STAGE_NAMES, "fetched"), "tpog": "done"}
     found = states(scenario, tmp_path / "other")
     del found["report"], expected["report"]  # which shows what the tpog cost
     assert found == expected
@@ -239,17 +242,17 @@ def test_a_damaged_entry_is_named_and_made_again(
 
 
 @pytest.mark.parametrize("case", DAMAGE)
-def test_a_damaged_entry_is_cleared(done: tuple[pipeline.Scenario, Path], store: Path, egvs, case: str) -> None:
+def test_a_damaged_entry_is_cleared(done: tuple[egvs.Scenario, Path], store: Path, run_egvs, case: str) -> None:
     pattern, damage = DAMAGE[case]
     (path,) = store.glob(pattern)
     damage(path)
-    assert egvs("store")[0] == 0
-    assert egvs("store", "--clear")[0] == 0
+    assert run_egvs("store")[0] == 0
+    assert run_egvs("store", "--clear")[0] == 0
     assert not list(store.glob("*-*"))
 
 
 def test_a_full_disk_is_the_destinations(
-    done: tuple[pipeline.Scenario, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, egvs
+    done: tuple[egvs.Scenario, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_egvs
 ) -> None:
     """A copy that cannot be written is not blamed on the store's file, which was only read."""
 
@@ -257,7 +260,7 @@ def test_a_full_disk_is_the_destinations(
         raise OSError(errno.ENOSPC, "No space left on device", str(path), None, str(other))
 
     monkeypatch.setattr(shutil, "copyfile", full)
-    code, _, said = egvs("run", done[0].folder, "--out", other := tmp_path / "other")
+    code, _, said = run_egvs("run", done[0].folder, "--out", other := tmp_path / "other")
     told = f"egvs: {other / 'statics.ply'}: No space left on device ("
     assert (code, said.splitlines()[-1].startswith(told)) == (1, True)
     assert said.endswith(f" MB are free in {other})\n")
@@ -268,14 +271,14 @@ def test_several_at_once_make_every_stage_once(mini: Path, tmp_path: Path, store
     running = [Child(Job(mini, tmp_path / str(number), store)) for number in range(4)]
     jobs = [child.join() for child in running]
     assert [job.exit_code for job in jobs] == [0] * 4
-    for stage in STAGES:
+    for stage in STAGE_NAMES:
         assert sorted(job.states[stage] for job in jobs) == ["done"] + ["fetched"] * 3, stage
     assert len({tuple(digests(job.out).values()) for job in jobs}) == 1
-    assert len(assert_whole(store)) == len(STAGES)
+    assert len(assert_whole(store)) == len(STAGE_NAMES)
 
 
 @pytest.mark.slow
-def test_who_comes_second_waits_and_takes_it(done: tuple[pipeline.Scenario, Path], tmp_path: Path, store: Path) -> None:
+def test_who_comes_second_waits_and_takes_it(done: tuple[egvs.Scenario, Path], tmp_path: Path, store: Path) -> None:
     scenario, out = done
     kept = Store(store)
     entry = next(entry for entry in kept.entries() if entry.stage == "statics")
@@ -302,25 +305,23 @@ def test_killed_at_ten_steps_the_store_is_whole_and_the_next_run_ends_in_the_sam
         assert children.run(Job(junction, out, store, kill_at=step)).exit_code == -signal.SIGKILL
         for path in out.glob("*.p*"):  # whatever is there under its own name is whole
             if path.suffix in (".parquet", ".ply"):
-                assert files.sha256_of(path) == files.sha256_of(whole.out / path.name)
+                assert files.hash_file(path) == files.hash_file(whole.out / path.name)
         if store.exists():
             assert_whole(store)
         monkeypatch.setenv("EGVS_STORE", str(store))
-        pipeline.run(pipeline.load(junction), out)
+        egvs.run(egvs.load(junction), out)
         assert digests(out) == digests(whole.out)
         assert not list(out.glob(".*.partial"))
-        assert len(assert_whole(store)) >= len(STAGES)
+        assert len(assert_whole(store)) >= len(STAGE_NAMES)
 
 
-def test_what_was_used_longest_ago_goes_first(
-    done: tuple[pipeline.Scenario, Path], store: Path, tmp_path: Path
-) -> None:
+def test_what_was_used_longest_ago_goes_first(done: tuple[egvs.Scenario, Path], store: Path, tmp_path: Path) -> None:
     kept = Store(store)
     for age, entry in enumerate(sorted(kept.entries(), key=lambda e: e.stage)):
         os.utime(entry.folder / "entry.json", (1e9 - age, 1e9 - age))
     kept.take("traffic", next(e.key for e in kept.entries() if e.stage == "traffic"), tmp_path / "taken")
     order = [entry.stage for entry in kept.entries()]
-    assert order == ["traffic", *sorted(set(STAGES) - {"traffic"})]
+    assert order == ["traffic", *sorted(set(STAGE_NAMES) - {"traffic"})]
     sizes = {entry.stage: entry.bytes for entry in kept.entries()}
     removed = kept.prune(sum(sizes[stage] for stage in ("traffic", "check", "report", "scan")))
     assert [entry.stage for entry in removed] == ["tpog", "statics", "score"]
@@ -333,35 +334,35 @@ def test_the_bound_holds_from_the_first_entry_on(
     mini: Path, tmp_path: Path, store: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("EGVS_STORE_MAX_GB", "0.00015")
-    scenario = pipeline.load(mini)
+    scenario = egvs.load(mini)
     assert set(states(scenario, tmp_path / "out").values()) == {"done"}
     entries = assert_whole(store)
-    assert 0 < sum(entry.bytes for entry in entries) <= 1.5e5 and len(entries) < len(STAGES)
+    assert 0 < sum(entry.bytes for entry in entries) <= 1.5e5 and len(entries) < len(STAGE_NAMES)
     monkeypatch.setenv("EGVS_STORE_MAX_GB", "lots")
     with pytest.raises(InputError, match="EGVS_STORE_MAX_GB: 'lots'"):
-        pipeline.run(scenario, tmp_path / "other")
+        egvs.run(scenario, tmp_path / "other")
     assert not (tmp_path / "other").exists()
 
 
 @pytest.mark.parametrize("place", ["file", "file/store", "l" * 300, "/".join(["long"] * 2000)])
 def test_a_store_that_cannot_be_written_is_named_once(
-    mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, egvs, place: str
+    mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_egvs, place: str
 ) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("EGVS_STORE", str(tmp_path / place))
-    code, _, said = egvs("run", mini, "--out", tmp_path / "out")
+    code, _, said = run_egvs("run", mini, "--out", tmp_path / "out")
     assert (code, said.count("the store cannot be written"), said.count("from store")) == (0, 1, 0)
-    assert egvs("statics", mini, "--out", tmp_path / "out")[0] == 0
-    assert egvs("store")[0] == (2 if place == "file" else 0)
+    assert run_egvs("statics", mini, "--out", tmp_path / "out")[0] == 0
+    assert run_egvs("store")[0] == (2 if place == "file" else 0)
 
 
 def test_what_cannot_be_asked_of_the_store_is_named(
-    tmp_path: Path, store: Path, monkeypatch: pytest.MonkeyPatch, egvs
+    tmp_path: Path, store: Path, monkeypatch: pytest.MonkeyPatch, run_egvs
 ) -> None:
     for words in (("--clear", "--prune"), ("--clear", "--prune", "--max", "2G")):
-        code, _, said = egvs("store", *words)
-        assert (code, "--clear: with --prune" in said) == (2, True), said
-    assert egvs("store", "--clear", "--max", "2G")[0] == 2
+        code, _, said = run_egvs("store", *words)
+        assert (code, "--clear: given together with --prune" in said) == (2, True), said
+    assert run_egvs("store", "--clear", "--max", "2G")[0] == 2
     (tmp_path / "file").write_text("")
     for place, words, message in (
         (tmp_path / "file", (), f"{tmp_path / 'file'}: is a file"),
@@ -370,43 +371,44 @@ def test_what_cannot_be_asked_of_the_store_is_named(
         ("", ("--prune",), "there is no store"),
     ):
         monkeypatch.setenv("EGVS_STORE", str(place))
-        code, printed, said = egvs("store", *words)
+        code, printed, said = run_egvs("store", *words)
         assert (code, printed, message in said) == (2, "", True), said
 
 
 def test_an_empty_name_is_no_store(
-    done: tuple[pipeline.Scenario, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, egvs
+    done: tuple[egvs.Scenario, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_egvs
 ) -> None:
     scenario, _ = done
     monkeypatch.setenv("EGVS_STORE", "")
     assert set(states(scenario, tmp_path / "other").values()) == {"done"}
-    assert egvs("store")[1].strip() == "EGVS_STORE is empty: nothing is kept"
+    assert run_egvs("store")[1].strip() == "EGVS_STORE is empty: results are not cached"
 
 
 def test_by_default_it_lies_beside_the_runs(mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("EGVS_STORE")
     monkeypatch.chdir(tmp_path)
-    pipeline.run(pipeline.load(mini))
-    assert len(assert_whole(tmp_path / "runs" / ".store")) == len(STAGES)
+    egvs.run(egvs.load(mini))
+    assert len(assert_whole(tmp_path / "runs" / ".store")) == len(STAGE_NAMES)
 
 
-def test_the_command_line_lists_prunes_and_clears(done: tuple[pipeline.Scenario, Path], store: Path, egvs) -> None:
-    code, printed, _ = egvs("store")
+def test_the_command_line_lists_prunes_and_clears(done: tuple[egvs.Scenario, Path], store: Path, run_egvs) -> None:
+    code, printed, _ = run_egvs("store")
     assert code == 0
-    assert {line.split()[0] for line in printed.splitlines()} == {"stage", *STAGES, f"{store}:"}
+    assert {line.split()[0] for line in printed.splitlines()} == {"stage", *STAGE_NAMES, f"{store}:"}
     assert "7 entries" in printed and "of at most 10 GB" in printed
-    assert "removed 0 entries" in egvs("store", "--prune")[1]
+    assert "removed 0 entries" in run_egvs("store", "--prune")[1]
     largest = max(entry.bytes for entry in Store(store).entries())
-    assert egvs("store", "--prune", "--max", f"{largest / 1e3}K")[0] == 0
+    assert run_egvs("store", "--prune", "--max", f"{largest / 1e3}K")[0] == 0
     assert 0 < len(assert_whole(store)) < 6
-    assert "0 entries, 0 B are left" in egvs("store", "--clear")[1]
-    for words, message in ((("--max", "2G"), "without --prune"), (("--prune", "--max", "much"), "--max: 'much'")):
-        code, _, said = egvs("store", *words)
+    assert "0 entries, 0 B are left" in run_egvs("store", "--clear")[1]
+    cases = ((("--max", "2G"), "without --prune"), (("--prune", "--max", "much"), "expected a size, got 'much'"))
+    for words, message in cases:
+        code, _, said = run_egvs("store", *words)
         assert (code, message in said) == (2, True), said
 
 
 def test_what_is_not_the_stores_own_is_left_alone(
-    mini: Path, tmp_path: Path, store: Path, egvs, monkeypatch: pytest.MonkeyPatch
+    mini: Path, tmp_path: Path, store: Path, run_egvs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A folder that somebody else uses, and names as the store where its own lie is not lost."""
     (removed := store / ".work" / f"removed-scan-{'0' * 32}-1-2").mkdir(parents=True)
@@ -417,11 +419,11 @@ def test_what_is_not_the_stores_own_is_left_alone(
         (store / name).parent.mkdir(exist_ok=True)
         (store / name).write_text("of somebody else")
     monkeypatch.setenv("EGVS_STORE_MAX_GB", "0.00015")
-    pipeline.run(pipeline.load(mini), tmp_path / "out")
+    egvs.run(egvs.load(mini), tmp_path / "out")
     assert not removed.exists() and not damaged.exists()
     for words in (("--prune", "--max", "1K"), ("--clear",)):
         damaged.mkdir()
-        assert egvs("store", *words)[0] == 0
+        assert run_egvs("store", *words)[0] == 0
         assert Store(store).entries() == []
     assert not damaged.exists()
     assert {name: (store / name).read_text() for name in others} == dict.fromkeys(others, "of somebody else")
@@ -430,22 +432,22 @@ def test_what_is_not_the_stores_own_is_left_alone(
 @pytest.mark.parametrize("name", [".store", ".store/mine", "elsewhere/../.store", "link", "link/mine"])
 @pytest.mark.parametrize("verb", ["run", "statics", "accuracy"])
 def test_a_run_does_not_go_into_the_store(
-    mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, egvs, verb: str, name: str
+    mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_egvs, verb: str, name: str
 ) -> None:
     """It would wait for ever on its own lock; the store by default, which a run's folder lies beside, is no other."""
     monkeypatch.delenv("EGVS_STORE")
     monkeypatch.chdir(tmp_path)
     (store := tmp_path / "runs" / ".store").mkdir(parents=True)
     (tmp_path / "runs" / "link").symlink_to(store)
-    code, _, said = egvs(verb, mini, "--out", f"runs/{name}")
+    code, _, said = run_egvs(verb, mini, "--out", f"runs/{name}")
     assert (code, said.count("the store (runs/.store), or lies in it")) == (2, 1), said
     assert not list(store.iterdir())
 
 
-def test_a_run_says_what_it_fetched(done: tuple[pipeline.Scenario, Path], tmp_path: Path, egvs) -> None:
+def test_a_run_says_what_it_fetched(done: tuple[egvs.Scenario, Path], tmp_path: Path, run_egvs) -> None:
     scenario, _ = done
-    code, printed, said = egvs("run", scenario.folder, "--out", tmp_path / "other")
-    assert (code, said.count("from store")) == (0, len(STAGES)), said
+    code, printed, said = run_egvs("run", scenario.folder, "--out", tmp_path / "other")
+    assert (code, said.count("from store")) == (0, len(STAGE_NAMES)), said
     assert "nothing to do" not in printed
 
 
@@ -473,14 +475,14 @@ def test_one_changed_line_makes_what_depends_on_it_again(
     one, but for the report, which shows what stages cost. The program's text is that of a copy, so that nothing is
     compiled anew.
     """
-    copy = tmp_path / "pipeline"
-    shutil.copytree(ROOT / "pipeline", copy, ignore=shutil.ignore_patterns("__pycache__"))
+    copy = tmp_path / "egvs"
+    shutil.copytree(ROOT / "pipeline" / "egvs", copy, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copytree(ROOT / "data_schemas", copy / "data_schemas")
-    monkeypatch.setattr(code_digest, "_ROOT", copy)
-    monkeypatch.setattr(schemas, "folder", lambda: copy / "data_schemas")
+    monkeypatch.setattr(stages, "_ROOT", copy)
+    monkeypatch.setattr(parquet, "schema_folder", lambda: copy / "data_schemas")
 
     def forget() -> None:
-        for remembered in (code_digest.of, code_digest._read, code_digest._path):
+        for remembered in (stages.source_digest, stages._digest_module, stages._module_path):
             remembered.cache_clear()
 
     def made() -> set[str]:
@@ -491,8 +493,8 @@ def test_one_changed_line_makes_what_depends_on_it_again(
 
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m,points\npole_a,10,12,3,\npole_b,30.5,-12,3,measured.csv\n")
     (mini / "measured.csv").write_text("x_m,y_m,z_m\n30.5,0,0\n")
-    scenario = pipeline.load(mini, ["effects.rain.rate_mm_h=20"])
-    assert made() == set(STAGES)
+    scenario = egvs.load(mini, ["effects.rain.rate_mm_h=20"])
+    assert made() == set(STAGE_NAMES)
     assert made() == set()
     for name, again in CHANGED_LINES.items():
         path = copy / name
@@ -502,12 +504,12 @@ def test_one_changed_line_makes_what_depends_on_it_again(
 
 
 @pytest.mark.parametrize("name", [".lock", ".locks", ".work", ".locks/statics-" + "0" * 32])
-def test_locks_and_folders_for_work_are_no_links(mini: Path, tmp_path: Path, store: Path, egvs, name: str) -> None:
+def test_locks_and_folders_for_work_are_no_links(mini: Path, tmp_path: Path, store: Path, run_egvs, name: str) -> None:
     (tmp_path / "mine").write_text("kept")
     (store / name).parent.mkdir(parents=True, exist_ok=True)
     (store / name).symlink_to(tmp_path / "mine")
-    code, _, error = egvs("run", mini, "--out", tmp_path / "out")
-    what = "is a symbolic link, and nothing is written through one; remove it"
+    code, _, error = run_egvs("run", mini, "--out", tmp_path / "out")
+    what = "is a symbolic link, and nothing is written through links. Remove it."
     assert (code, error.splitlines()[-1]) == (2, f"egvs: {store / name}: {what}")
     assert (tmp_path / "mine").read_text() == "kept"
 
@@ -516,7 +518,7 @@ def test_what_an_entry_says_is_json(tmp_path: Path, store: Path) -> None:
     kept, out = Store(store), tmp_path / "out"
     out.mkdir()
     (out / "a").write_text("a")
-    made = Made({"a": files.sha256_of(out / "a")}, {}, {"longest": math.inf}, Cost())
+    made = StageResult({"a": files.hash_file(out / "a")}, {}, {"longest": math.inf}, ResourceUsage())
     kept.put("tpog", "0" * 64, out, made)
     (entry,) = kept.entries()
     assert "Infinity" not in (entry.folder / "entry.json").read_text()

@@ -13,16 +13,16 @@ from pathlib import Path
 
 import pytest
 
-import pipeline
-from pipeline.artefacts import tables
-from pipeline.core import files
-from pipeline.core.errors import InputError, RunError
-from pipeline.core.reading.seals import sealed
-from pipeline.report.ranking import ScoredSite
-from pipeline.runs import workflow
-from pipeline.runs.locking import alone
-from pipeline.runs.stages import STAGES
-from pipeline.world import casting
+import egvs
+from egvs.artefacts import parquet
+from egvs.artefacts.run_folder import STAGE_NAMES
+from egvs.core import files
+from egvs.core.errors import InputError, RunError
+from egvs.core.files import add_checksum
+from egvs.report.ranking import RankedSite
+from egvs.runs import run, stages, verification
+from egvs.runs.run import lock_run_folder
+from egvs.world import ray_casting
 from tests import processes
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -30,13 +30,13 @@ DATA = ("statics.ply", "scans.parquet", "trajectories.parquet", "tpog.parquet", 
 
 
 def digests(out: Path) -> dict[str, str]:
-    return {name: files.sha256_of(out / name) for name in DATA}
+    return {name: files.hash_file(out / name) for name in DATA}
 
 
-def states(scenario: pipeline.Scenario, out: Path, **options: object) -> dict[str, str]:
+def states(scenario: egvs.Scenario, out: Path, **options: object) -> dict[str, str]:
     """Run, and say of each stage whether it ran or was skipped."""
     seen: dict[str, str] = {}
-    workflow.run(scenario, out, listener=lambda stage, state, _: seen.__setitem__(stage, state), **options)  # type: ignore[arg-type]
+    run.run(scenario, out, listener=lambda stage, state, _: seen.__setitem__(stage, state), **options)  # type: ignore[arg-type]
     return seen
 
 
@@ -44,17 +44,17 @@ def states(scenario: pipeline.Scenario, out: Path, **options: object) -> dict[st
 def done(mini: Path, tmp_path: Path) -> tuple[Path, Path]:
     """A scenario folder and the folder of its finished run."""
     out = tmp_path / "out"
-    pipeline.run(pipeline.load(mini), out)
+    egvs.run(egvs.load(mini), out)
     return mini, out
 
 
 def test_artefacts_are_there_and_the_record_names_them(done: tuple[Path, Path]) -> None:
     _, out = done
     record = json.loads((out / "run.json").read_text())
-    assert list(record["stages"]) == list(STAGES)
+    assert list(record["stages"]) == list(STAGE_NAMES)
     for stage in record["stages"].values():
         for name, digest in stage["artefacts"].items():
-            assert files.sha256_of(out / name) == digest
+            assert files.hash_file(out / name) == digest
         assert set(stage["cost"]) == {"seconds", "peak_mb"}
     assert record["scenario"]["roi"]["voxel_m"] == 0.5
     assert record["scenario"]["tpog"] == {"blocks": 4}
@@ -65,27 +65,27 @@ def test_artefacts_are_there_and_the_record_names_them(done: tuple[Path, Path]) 
 def test_columns_and_metadata_are_those_declared(done: tuple[Path, Path]) -> None:
     _, out = done
     for name in ("trajectories", "tpog", "scans", "scores"):
-        table, about = tables.read(out / f"{name}.parquet", name)
+        table, about = parquet.read_artefact(out / f"{name}.parquet", name)
         assert table.num_rows > 0
         assert {"schema", "scenario", "inputs", "seed"} <= set(about)
-    sites = tables.read_metadata(out / "scans.parquet", "scans")["sites"]
+    sites = parquet.read_metadata(out / "scans.parquet", "scans")["sites"]
     assert [s["site"] for s in sites] == ["pole_a", "pole_b"]
     assert set(sites[0]) == {
         "site", "pole", "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg", "sensor", "beams", "beams_in_roi",
         "returns",
     }  # fmt: skip
-    about = tables.read_metadata(out / "tpog.parquet", "tpog")
+    about = parquet.read_metadata(out / "tpog.parquet", "tpog")
     assert about["grid"] == {"origin_m": [0.0, -10.0, 0.0], "voxel_m": 0.5, "shape": [80, 40, 10]}
     assert (about["frames"], about["block_frames"]) == (40, 10)
 
 
-def test_a_second_run_does_nothing_and_says_so(done: tuple[Path, Path], egvs) -> None:
+def test_a_second_run_does_nothing_and_says_so(done: tuple[Path, Path], run_egvs) -> None:
     mini, out = done
     before = {p.name: p.stat().st_mtime_ns for p in out.iterdir() if p.is_file() and p.name != ".lock"}
-    assert set(states(pipeline.load(mini), out).values()) == {"skipped"}
-    code, printed, said = egvs("run", mini, "--out", out)
+    assert set(states(egvs.load(mini), out).values()) == {"skipped"}
+    code, printed, said = run_egvs("run", mini, "--out", out)
     assert code == 0
-    assert said.count("unchanged") == len(STAGES)
+    assert said.count("unchanged") == len(STAGE_NAMES)
     assert "pole_a" in printed
     assert before == {p.name: p.stat().st_mtime_ns for p in out.iterdir() if p.is_file() and p.name != ".lock"}
 
@@ -105,10 +105,10 @@ def test_a_changed_setting_runs_what_depends_on_it(
     done: tuple[Path, Path], tmp_path: Path, change: str, again: set[str]
 ) -> None:
     mini, out = done
-    scenario = pipeline.load(mini, [change])
+    scenario = egvs.load(mini, [change])
     assert {stage for stage, state in states(scenario, out).items() if state == "done"} == again
     fresh = tmp_path / "fresh"
-    pipeline.run(scenario, fresh)
+    egvs.run(scenario, fresh)
     assert digests(out) == digests(fresh)  # nothing of the earlier run shows
 
 
@@ -120,13 +120,15 @@ def test_a_changed_setting_runs_what_depends_on_it(
         ("traffic.frames=4000",),  # the finished file has fewer; the stages before are as they were
     ],
 )
-def test_a_refused_run_leaves_the_folder_as_it_was(done: tuple[Path, Path], settings: tuple[str, ...], egvs) -> None:
+def test_a_refused_run_leaves_the_folder_as_it_was(
+    done: tuple[Path, Path], settings: tuple[str, ...], run_egvs
+) -> None:
     scenario, out = done
     before = {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()}
-    code, _, said = egvs("run", scenario, "--out", out, *(word for its in settings for word in ("--set", its)))
+    code, _, said = run_egvs("run", scenario, "--out", out, *(word for its in settings for word in ("--set", its)))
     assert code == 2, said
     assert {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()} == before
-    assert workflow.verify(out) == []
+    assert verification.verify(out) == []
 
 
 def test_a_run_that_ends_on_its_way_leaves_a_record_of_one_scenario(
@@ -134,7 +136,7 @@ def test_a_run_that_ends_on_its_way_leaves_a_record_of_one_scenario(
 ) -> None:
     """Of what was made by then, and of no score of the scenario before; what did not change is not made again."""
     mini, out = done
-    other, make = pipeline.load(mini, ["statics.ground=false", "traffic.frames=20"]), workflow.stages.make
+    other, make = egvs.load(mini, ["statics.ground=false", "traffic.frames=20"]), stages.run_stage
 
     def fails(name: str, *rest: object, **options: object) -> object:
         if name == "traffic":
@@ -142,64 +144,66 @@ def test_a_run_that_ends_on_its_way_leaves_a_record_of_one_scenario(
         return make(name, *rest, **options)  # type: ignore[arg-type]
 
     with monkeypatch.context() as patch:
-        patch.setattr(workflow.stages, "make", fails)
+        patch.setattr(stages, "run_stage", fails)
         with pytest.raises(RunError):
-            workflow.run(other, out)
+            run.run(other, out)
     record = json.loads((out / "run.json").read_text())
     assert (record["scenario"]["statics"]["ground"], list(record["stages"])) == (False, ["check", "statics", "scan"])
     with pytest.raises(InputError, match="the stage traffic is not done"):
-        workflow.verify(out)
-    again = states(pipeline.load(mini, ["statics.ground=false"]), out)
+        verification.verify(out)
+    again = states(egvs.load(mini, ["statics.ground=false"]), out)
     assert (again["statics"], again["scan"], again["traffic"]) == ("skipped", "skipped", "fetched")
-    assert workflow.verify(out) == []
+    assert verification.verify(out) == []
 
 
 def test_scoring_again_casts_nothing(done: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     mini, out = done
     casts = []
-    monkeypatch.setattr(casting.Caster, "scan", lambda *_: casts.append(1))
+    monkeypatch.setattr(ray_casting.Caster, "scan", lambda *_: casts.append(1))
     for change in ("score.gamma=2.5", "roi.voxel_m=0.25", "traffic.frames=20"):
-        pipeline.run(pipeline.load(mini, [change]), out)
+        egvs.run(egvs.load(mini, [change]), out)
     assert casts == []
 
 
 def test_scores_are_the_same_without_kept_scans(done: tuple[Path, Path], tmp_path: Path) -> None:
     mini, out = done
     lean = tmp_path / "lean"
-    pipeline.run(pipeline.load(mini, ["scan.keep=false"]), lean)
+    egvs.run(egvs.load(mini, ["scan.keep=false"]), lean)
     assert not (lean / "scans.parquet").exists()
-    assert pipeline.read_scores(lean / "scores.parquet") == pipeline.read_scores(out / "scores.parquet")
+    assert egvs.read_scores(lean / "scores.parquet") == egvs.read_scores(out / "scores.parquet")
 
 
 def test_threads_change_no_byte(done: tuple[Path, Path], tmp_path: Path) -> None:
     mini, out = done
     for jobs in (1, 3):
         other = tmp_path / str(jobs)
-        pipeline.run(pipeline.load(mini), other, jobs=jobs)
+        egvs.run(egvs.load(mini), other, jobs=jobs)
         assert digests(other) == digests(out)
 
 
 @pytest.mark.slow
-def test_verify_passes_elsewhere_and_names_an_altered_artefact(done: tuple[Path, Path], tmp_path: Path, egvs) -> None:
+def test_verify_passes_elsewhere_and_names_an_altered_artefact(
+    done: tuple[Path, Path], tmp_path: Path, run_egvs
+) -> None:
     mini, out = done
     moved, source = tmp_path / "elsewhere" / "run", tmp_path / "elsewhere" / "scenario"
     shutil.copytree(out, moved)
     shutil.copytree(mini, source)
-    code, printed, said = egvs("verify", moved, "--scenario", source)
+    code, printed, said = run_egvs("verify", moved, "--scenario", source)
     assert (code, "same bytes" in printed) == (0, True), said + printed
     data = bytearray((moved / "tpog.parquet").read_bytes())
     data[len(data) // 2] ^= 1
     (moved / "tpog.parquet").write_bytes(bytes(data))
-    code, printed, _ = egvs("verify", moved, "--scenario", source)
+    code, printed, _ = run_egvs("verify", moved, "--scenario", source)
     assert code == 1
     assert re.search(r"tpog.parquet was altered", printed)
     assert "scans.parquet" not in printed
 
 
-def test_verify_tells_when_the_scenario_is_another(done: tuple[Path, Path], egvs) -> None:
+def test_verify_tells_when_the_scenario_is_another(done: tuple[Path, Path], run_egvs) -> None:
     mini, out = done
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m\npole_a,11,12,3\npole_b,30.5,-12,3\n")
-    code, printed, _ = egvs("verify", out)
+    code, printed, _ = run_egvs("verify", out)
     assert code == 1
     assert "scans.parquet differs" in printed
 
@@ -208,59 +212,59 @@ def test_verify_of_an_unfinished_run_says_what_is_missing(done: tuple[Path, Path
     _, out = done
     record = json.loads((out / "run.json").read_text())
     del record["stages"]["score"]
-    (out / "run.json").write_text(json.dumps(sealed(record)))
+    (out / "run.json").write_text(json.dumps(add_checksum(record)))
     with pytest.raises(InputError, match="the stage score is not done"):
-        workflow.verify(out)
+        verification.verify(out)
 
 
 def test_two_runs_in_one_folder_are_kept_apart(done: tuple[Path, Path]) -> None:
     mini, out = done
-    with alone(out), pytest.raises(RunError, match="another run is at work"):
-        pipeline.run(pipeline.load(mini), out)
+    with lock_run_folder(out), pytest.raises(RunError, match="another run is at work"):
+        egvs.run(egvs.load(mini), out)
 
 
 def test_a_record_that_is_none_is_refused(done: tuple[Path, Path]) -> None:
     mini, out = done
     (out / "run.json").write_text("[]")
-    with pytest.raises(InputError, match="is not a run's record"):
-        pipeline.run(pipeline.load(mini), out)
+    with pytest.raises(InputError, match="is not the record of a run"):
+        egvs.run(egvs.load(mini), out)
 
 
 @pytest.mark.parametrize("key", ["scenario", "scenario_folder", "egvs", "seed"])
-def test_a_record_with_an_odd_value_is_refused(done: tuple[Path, Path], key: str, egvs) -> None:
+def test_a_record_with_an_odd_value_is_refused(done: tuple[Path, Path], key: str, run_egvs) -> None:
     mini, out = done
     record = json.loads((out / "run.json").read_text())
-    (out / "run.json").write_text(json.dumps(sealed(record | {key: [None]})))
+    (out / "run.json").write_text(json.dumps(add_checksum(record | {key: [None]})))
     for arguments in (("run", mini, "--out", out), ("verify", out)):
-        code, _, said = egvs(*arguments)
+        code, _, said = run_egvs(*arguments)
         assert (code, f"'{key}' is" in said) == (2, True), said
 
 
-def test_a_record_that_was_damaged_at_any_depth_is_refused(done: tuple[Path, Path], egvs) -> None:
+def test_a_record_that_was_damaged_at_any_depth_is_refused(done: tuple[Path, Path], run_egvs) -> None:
     mini, out = done
     text = (out / "run.json").read_text()
     for old, new in (('"peak_mb": ', '"peak_mb": 1'), ('"triangles"', '"triangle"'), ("4", '"4"'), ("9", "9" * 5000)):
         assert old in text
         (out / "run.json").write_text(text.replace(old, new, 1))
         for arguments in (("run", mini, "--out", out), ("verify", out)):
-            code, _, said = egvs(*arguments)
+            code, _, said = run_egvs(*arguments)
             assert (code, said.startswith(f"egvs: {out / 'run.json'}: ")) == (2, True), said
-            assert "remove it and run again" in said
+            assert "Remove it and run again" in said
 
 
 @pytest.mark.slow
-def test_a_single_stage_with_other_settings_leaves_no_mixed_record(done: tuple[Path, Path], egvs) -> None:
+def test_a_single_stage_with_other_settings_leaves_no_mixed_record(done: tuple[Path, Path], run_egvs) -> None:
     mini, out = done
-    assert egvs("score", mini, "--out", out, "--set", "score.gamma=7", "--set", "sites.yaw_deg=5")[0] == 0
-    code, _, said = egvs("verify", out)
+    assert run_egvs("score", mini, "--out", out, "--set", "score.gamma=7", "--set", "sites.yaw_deg=5")[0] == 0
+    code, _, said = run_egvs("verify", out)
     assert (code, "the stage check is not done" in said) == (2, True), said
-    assert egvs("run", mini, "--out", out)[0] == 0
-    assert egvs("verify", out)[0] == 0
+    assert run_egvs("run", mini, "--out", out)[0] == 0
+    assert run_egvs("verify", out)[0] == 0
 
 
-def test_an_artefacts_name_that_is_a_folder_is_told_and_nothing_is_left(mini: Path, tmp_path: Path, egvs) -> None:
+def test_an_artefacts_name_that_is_a_folder_is_told_and_nothing_is_left(mini: Path, tmp_path: Path, run_egvs) -> None:
     (tmp_path / "out" / "scans.parquet").mkdir(parents=True)
-    code, _, said = egvs("run", mini, "--out", tmp_path / "out")
+    code, _, said = run_egvs("run", mini, "--out", tmp_path / "out")
     assert (code, "scans.parquet: is a folder" in said) == (2, True), said
     assert not list((tmp_path / "out").glob(".*.partial"))
 
@@ -277,7 +281,7 @@ def test_notebook_lines_of_the_readme_run(mini: Path, tmp_path: Path, monkeypatc
 
 
 def test_editor_schema_is_not_stale() -> None:
-    from pipeline.scenario.loading import json_schema
+    from egvs.scenario.loading import json_schema
 
     assert (ROOT / "data_schemas" / "scenario.schema.json").read_text(encoding="utf-8") == json_schema(), (
         "run: make schema"
@@ -286,16 +290,16 @@ def test_editor_schema_is_not_stale() -> None:
 
 @pytest.mark.slow
 def test_another_seed_in_the_same_folder_changes_no_byte_of_what_is_not_random(
-    mini: Path, tmp_path: Path, egvs
+    mini: Path, tmp_path: Path, run_egvs
 ) -> None:
     out = tmp_path / "out"
-    assert egvs("run", mini, "--out", out, "--set", "seed=5")[0] == 0
+    assert run_egvs("run", mini, "--out", out, "--set", "seed=5")[0] == 0
     before = {name: (out / name).read_bytes() for name in ("statics.ply", "scans.parquet")}
-    code, _, said = egvs("run", mini, "--out", out, "--set", "seed=6")
+    code, _, said = run_egvs("run", mini, "--out", out, "--set", "seed=6")
     assert code == 0
     assert re.search(r"scan +unchanged", said)
     assert {name: (out / name).read_bytes() for name in before} == before
-    assert egvs("verify", out)[0] == 0
+    assert run_egvs("verify", out)[0] == 0
 
 
 @pytest.mark.slow
@@ -305,17 +309,17 @@ def test_a_ranking_fits_the_terminal(mini: Path, tmp_path: Path, width: int, by:
     """No number is cut, on the narrowest terminal too."""
     from rich.console import Console
 
-    from pipeline.cli.results import ranking_table
+    from egvs.cli.run_tables import ranking_table
 
-    pipeline.run(pipeline.load(mini, [f"score.rank_by={by}"]), tmp_path)
-    table = pipeline.read_scores(tmp_path / "scores.parquet")
+    egvs.run(egvs.load(mini, [f"score.rank_by={by}"]), tmp_path)
+    table = egvs.read_scores(tmp_path / "scores.parquet")
     console = Console(width=width, record=True, file=io.StringIO())
-    console.print(ranking_table(ScoredSite.read(tmp_path / "scores.parquet"), width))
+    console.print(ranking_table(RankedSite.read(tmp_path / "scores.parquet"), width))
     text = console.export_text()
     assert "…" not in text
     assert all(len(line) <= width for line in text.splitlines())
     if by == "egvs" or width > 130:
-        assert all(f"{egvs:.1f}" in text for egvs in table["egvs"].to_pylist())
+        assert all(f"{egvs:.1f}" in text for run_egvs in table["egvs"].to_pylist())
     told = (lambda value: f"{value:.2f}") if by == "points_on_target" else (lambda value: f"{value:.1%}")
     assert by == "egvs" or all(told(value) in text for value in table[by].to_pylist())
 
@@ -346,24 +350,24 @@ def test_a_record_of_an_earlier_version_is_one_of_nothing(done: tuple[Path, Path
     del record["own_sha256"]
     (out / "run.json").write_text(json.dumps(record | {"effects": []}))
     with pytest.raises(InputError, match="the stage check is not done"):
-        workflow.verify(out)
-    assert set(states(pipeline.load(mini), out).values()) == {"fetched"}
-    assert workflow.verify(out) == []
+        verification.verify(out)
+    assert set(states(egvs.load(mini), out).values()) == {"fetched"}
+    assert verification.verify(out) == []
     assert not {"effects", "said"} & json.loads((out / "run.json").read_text()).keys()
 
 
 @pytest.mark.slow
-def test_the_best_sites_alone_are_printed_and_the_others_counted(mini: Path, tmp_path: Path, egvs) -> None:
+def test_the_best_sites_alone_are_printed_and_the_others_counted(mini: Path, tmp_path: Path, run_egvs) -> None:
     rows = [f"p{i:02d},{2 + i},12,{3 + i / 8}" for i in range(9)]
     (mini / "sites.csv").write_text("\n".join(["site,x_m,y_m,z_m", *rows]) + "\n")
-    code, whole, _ = egvs("run", mini, "--out", tmp_path / "out")
+    code, whole, _ = run_egvs("run", mini, "--out", tmp_path / "out")
     assert (code, "more: without --top" in whole) == (0, False)
     ranked = [line.split()[1] for line in whole.splitlines() if re.match(r"\s*\d+\s+p\d\d", line)]
     assert len(ranked) == 9
     for verb in ("run", "score"):
-        code, printed, _ = egvs(verb, mini, "--out", tmp_path / "out", "--top", 4)
+        code, printed, _ = run_egvs(verb, mini, "--out", tmp_path / "out", "--top", 4)
         assert code == 0
         assert [line.split()[1] for line in printed.splitlines() if re.match(r"\s*\d+\s+p\d\d", line)] == ranked[:4]
         assert "... and 5 more: without --top, in " in printed
-    assert "more: without" not in egvs("score", mini, "--out", tmp_path / "out", "--top", 9)[1]
-    assert egvs("run", mini, "--top", 0)[0] == 2
+    assert "more: without" not in run_egvs("score", mini, "--out", tmp_path / "out", "--top", 9)[1]
+    assert run_egvs("run", mini, "--top", 0)[0] == 2

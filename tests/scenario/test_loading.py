@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-import pipeline
-from pipeline.core.errors import InputError
-from pipeline.scenario.models import Scenario
+import egvs
+from egvs.core.errors import InputError
+from egvs.scenario.model import Scenario
 
 BASE = """
 [roi]
@@ -42,7 +42,7 @@ def extended(tmp_path: Path, above: str, below: str = DRAWN, *overrides: str) ->
     for name, text in (("below", below), ("above", 'extends = "../below"\n' + above)):
         (tmp_path / name).mkdir(exist_ok=True)
         (tmp_path / name / "scenario.toml").write_text(text)
-    return pipeline.load(tmp_path / "above", overrides)
+    return egvs.load(tmp_path / "above", overrides)
 
 
 def test_a_rule_for_sites_takes_the_place_of_a_file_and_of_its_measured_scan(tmp_path: Path) -> None:
@@ -99,6 +99,6 @@ def test_two_sources_in_one_place_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("row", ["car", "0"])
 def test_a_row_of_a_table_is_set_by_its_name_or_its_number(mini: Path, row: str) -> None:
-    scenario = pipeline.load(mini, [f"traffic.kinds.{row}.length_m=6.5"])
+    scenario = egvs.load(mini, [f"traffic.kinds.{row}.length_m=6.5"])
     assert scenario.traffic.kinds[0].length_m == 6.5
-    assert scenario.traffic.kinds[1:] == pipeline.load(mini).traffic.kinds[1:]
+    assert scenario.traffic.kinds[1:] == egvs.load(mini).traffic.kinds[1:]

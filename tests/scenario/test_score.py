@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import pipeline
-from pipeline.artefacts import tables
-from pipeline.scenario.effects import EffectsModel
-from pipeline.scenario.score import gamma_for
-from pipeline.studies import variants
-from pipeline.studies.measuring import SettingRunner
-from pipeline.studies.run_comparison import compare
+import egvs
+from egvs.artefacts import parquet
+from egvs.scenario.effects_config import EffectsConfig
+from egvs.scenario.score_config import default_gamma
+from egvs.studies import study_settings
+from egvs.studies.measurement import SettingRunner
+from egvs.studies.run_comparison import compare_runs
 
 OCCLUSION = "effects.moving_occlusion={}"
 
@@ -29,7 +29,7 @@ def auto(mini: Path) -> Path:
 
 def test_it_goes_through_the_gammas_of_the_study() -> None:
     plain, hidden = (
-        {voxel_m: gamma_for(voxel_m, moving_occlusion=occlusion) for voxel_m in (0.125, 0.25, 0.5, 1.0, 2.0)}
+        {voxel_m: default_gamma(voxel_m, moving_occlusion=occlusion) for voxel_m in (0.125, 0.25, 0.5, 1.0, 2.0)}
         for occlusion in (False, True)
     )
     assert plain == {0.125: 0.9, 0.25: 2.0, 0.5: 4.5, 1.0: 10.0, 2.0: 22.0}
@@ -39,31 +39,31 @@ def test_it_goes_through_the_gammas_of_the_study() -> None:
 @pytest.mark.slow
 @given(st.floats(0.01, 100), st.booleans())
 def test_two_digits_and_rising(voxel_m: float, occlusion: bool) -> None:
-    found = gamma_for(voxel_m, moving_occlusion=occlusion)
+    found = default_gamma(voxel_m, moving_occlusion=occlusion)
     assert found == float(f"{found:.1e}")
-    assert gamma_for(1.2 * voxel_m, moving_occlusion=occlusion) > found > 0
+    assert default_gamma(1.2 * voxel_m, moving_occlusion=occlusion) > found > 0
 
 
 def test_of_a_scenario(auto: Path) -> None:
     def of(*overrides: str) -> float:
-        return pipeline.load(auto, overrides).gamma
+        return egvs.load(auto, overrides).gamma
 
-    assert pipeline.load(auto).score.gamma == "auto"
+    assert egvs.load(auto).score.gamma == "auto"
     assert (of(), of("roi.voxel_m=1"), of(OCCLUSION), of("score.gamma=7", OCCLUSION)) == (4.5, 10.0, 2.2, 7.0)
     assert of("score.gamma=inf") == float("inf")
 
 
 def test_other_effects_keep_the_number(auto: Path) -> None:
     """What an effect changes is seen with one gamma."""
-    scenario = pipeline.load(auto)
-    assert scenario.with_effects(EffectsModel.of({"moving_occlusion": {}})).gamma == 4.5
-    hidden = pipeline.load(auto, [OCCLUSION])
+    scenario = egvs.load(auto)
+    assert scenario.with_effects(EffectsConfig.of({"moving_occlusion": {}})).gamma == 4.5
+    hidden = egvs.load(auto, [OCCLUSION])
     assert hidden.with_effects(hidden.effects.only()).gamma == 2.2
 
 
 def test_settings_of_a_study_keep_the_number(auto: Path, tmp_path: Path) -> None:
     runner = SettingRunner(auto, [], tmp_path, 1, lambda *_: None)
-    tried = {its.name: its for its in variants.settings(runner.scenario(variants.OWN))}
+    tried = {its.name: its for its in study_settings.list_settings(runner.scenario(study_settings.SCENARIO_AS_IS))}
     gammas = {name: runner.scenario(setting).gamma for name, setting in tried.items()}
     assert gammas["scenario"] == gammas["voxel 1 m"] == gammas["with moving_occlusion"] == 4.5
     assert gammas["voxel 1 m, gamma 18"] == 18.0
@@ -71,20 +71,20 @@ def test_settings_of_a_study_keep_the_number(auto: Path, tmp_path: Path) -> None
 
 
 @pytest.mark.slow
-def test_a_run_is_that_with_the_number_and_tells_it(auto: Path, tmp_path: Path, egvs) -> None:  # type: ignore[no-untyped-def]
-    code, _, told = egvs("run", auto, "--out", tmp_path / "auto")
+def test_a_run_is_that_with_the_number_and_tells_it(auto: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
+    code, _, told = run_egvs("run", auto, "--out", tmp_path / "auto")
     assert code == 0
     assert "gamma auto 4.5" in told
     assert "4.5 beams<small>in a voxel; more add nothing; set by the size of the voxels (auto)" in (
         tmp_path / "auto" / "report.html"
     ).read_text(encoding="utf-8")
-    assert egvs("run", auto, "--out", tmp_path / "number", "--set", "score.gamma=4.5")[0] == 0
+    assert run_egvs("run", auto, "--out", tmp_path / "number", "--set", "score.gamma=4.5")[0] == 0
     assert "(auto)" not in (tmp_path / "number" / "report.html").read_text(encoding="utf-8")
     first, second = (tmp_path / name / "scores.parquet" for name in ("auto", "number"))
     assert first.read_bytes() == second.read_bytes()
-    assert tables.read_metadata(first, "scores")["gamma"] == 4.5
-    assert egvs("run", auto, "--out", tmp_path / "fine", "--set", "roi.voxel_m=0.25")[0] == 0
-    compared = compare([tmp_path / "auto", tmp_path / "number", tmp_path / "fine"])
+    assert parquet.read_metadata(first, "scores")["gamma"] == 4.5
+    assert run_egvs("run", auto, "--out", tmp_path / "fine", "--set", "roi.voxel_m=0.25")[0] == 0
+    compared = compare_runs([tmp_path / "auto", tmp_path / "number", tmp_path / "fine"])
     assert {d.what: d.values for d in compared.differences}["score.gamma"] == (4.5, 4.5, 2.0)
 
 
@@ -95,8 +95,8 @@ def test_a_run_is_that_with_the_number_and_tells_it(auto: Path, tmp_path: Path, 
         ("-1", "score.gamma: -1; input should be greater than or equal to 0 or 'auto'"),
     ],
 )
-def test_what_is_no_gamma(mini: Path, egvs, value: str, message: str) -> None:  # type: ignore[no-untyped-def]
-    code, _, told = egvs("check", mini, "--set", f"score.gamma={value}")
+def test_what_is_no_gamma(mini: Path, run_egvs, value: str, message: str) -> None:  # type: ignore[no-untyped-def]
+    code, _, told = run_egvs("check", mini, "--set", f"score.gamma={value}")
     assert code == 2
     assert told.count("score.gamma") == 1
     assert message in told

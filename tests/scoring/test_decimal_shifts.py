@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-import pipeline
-from pipeline.artefacts.readers import read_tpog
-from pipeline.core.grid import ON_PLANE_M, Grid
-from pipeline.kernels import march
-from pipeline.scoring.scorer import Scorer
-from pipeline.sensing.scanner import Scanner
-from pipeline.stages import statics, tpog, traffic
+import egvs
+from egvs.artefacts.tpog import read_tpog
+from egvs.core.grid import PLANE_TOLERANCE_M, Grid
+from egvs.kernels import traversal
+from egvs.scoring.scorer import Scorer
+from egvs.sensors.scanner import Scanner
+from egvs.stages import statics, tpog, traffic
 from tests.conftest import collection, feature
 from tests.stages import run_stage
 
@@ -79,11 +79,11 @@ def scored(folder: Path, voxel: float, k: int) -> tuple[Any, list[np.ndarray], l
         lines.append(f"{frame / 2:.2f};b;{x(round(9.0001 - 0.3 * frame, 4))!r};{y(0.0001)!r};270.0;car;1.0")
     (folder / "fcd.csv").write_text("\n".join(lines) + "\n")
     (folder / "scenario.toml").write_text(SCENARIO.format(x=x(4.5), y=y(0.0), voxel=voxel))
-    scenario, out = pipeline.load(folder), folder / "out"
+    scenario, out = egvs.load(folder), folder / "out"
     out.mkdir()
     for stage in (statics, traffic, tpog):
         run_stage(stage, scenario, out)
-    counted, scene = read_tpog(out / "tpog.parquet"), pipeline.build_scene(scenario)
+    counted, scene = read_tpog(out / "tpog.parquet"), egvs.build_scene(scenario)
     scanner, scorer = Scanner(scene), Scorer(scene, counted)
     worth = [scorer.score_and_hits(scanner.scan_site(site)) for site in scene.sites]
     return counted.counts, [hits for _, hits in worth], [score.egvs for score, _ in worth]
@@ -106,11 +106,11 @@ def test_a_beam_in_a_plane_belongs_to_the_voxel_that_begins_there(tenths: int, p
     for k in range(-300, 300, 7):
         grid = Grid((moved(k, 0.0), 0.0, 0.0), tenths / 10, (10, 10, 10))
         site = (moved(k + plane * tenths, 0.0), 0.05, 0.05)
-        for off in (0.0, 0.9 * ON_PLANE_M, -0.9 * ON_PLANE_M):
+        for off in (0.0, 0.9 * PLANE_TOLERANCE_M, -0.9 * PLANE_TOLERANCE_M):
             o, d = grid.segments((site[0] + off, *site[1:]), np.array([[0.0, tenths * 0.8, 0.0], [off, 0.0, 0.5]]))
             assert (o[0], d[0, 0], d[1, 0]) == (plane, 0.0, 0.0)
             hits = np.zeros(1000, dtype=np.uint32)
-            march.count_hits(o, d, np.array(grid.shape), grid.voxel_m, hits)
+            traversal.count_hits(o, d, np.array(grid.shape), grid.voxel_m, hits)
             assert set(np.nonzero(hits.reshape(grid.shape))[0]) == {plane}
 
 

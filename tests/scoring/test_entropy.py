@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.core.errors import InputError
-from pipeline.core.grid import Grid
-from pipeline.scoring.egvs import EntropyField, binary_entropy
+from egvs.core.errors import InputError
+from egvs.core.grid import Grid
+from egvs.scoring.egvs import EntropyField, binary_entropy
 
 LARGEST = 2**32 - 1
 
@@ -158,9 +158,9 @@ def test_counts_beyond_the_frames_are_refused():
 def test_not_a_number_is_no_gamma():
     from pydantic import ValidationError
 
-    from pipeline.scenario.models import ScoreModel
+    from egvs.scenario.score_config import ScoreConfig
 
     for gamma in (nan, -1.0, -inf):
         with pytest.raises(ValidationError):
-            ScoreModel(gamma=gamma)
-    assert ScoreModel(gamma=inf).gamma == inf
+            ScoreConfig(gamma=gamma)
+    assert ScoreConfig(gamma=inf).gamma == inf

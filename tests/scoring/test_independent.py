@@ -20,9 +20,9 @@ import pyarrow.parquet as pq
 import pytest
 import trimesh
 
-from pipeline.scenario import loading
-from pipeline.stages import scan, score, statics, tpog, traffic
-from pipeline.world.mesh import World, read_ply, write_ply
+from egvs.scenario import loading
+from egvs.stages import scan, score, statics, tpog, traffic
+from egvs.world.mesh import World, read_ply, write_ply
 from tests.oracles import cast
 from tests.stages import run_stage
 
@@ -287,7 +287,7 @@ def moved_run(folder, shift):
     for row in rows[1:]:
         row[1:4] = [repr(float(v) + float(s)) for v, s in zip(row[1:4], shift, strict=True)]
     (folder / "sites.csv").write_text("".join(",".join(row) + "\n" for row in rows))
-    return folder, loading.from_values(values, folder, "moved")
+    return folder, loading.scenario_from_dict(values, folder, "moved")
 
 
 def test_a_scene_moved_by_4000_km_gives_the_same_bits(runs, tmp_path):

@@ -11,9 +11,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.scoring import memory
-from pipeline.scoring.leave_out import FEWEST, LONG, Groups, group_sizes
-from pipeline.scoring.uncertainty import Estimate, doubts, in_words
+from egvs.scoring import occupancy
+from egvs.scoring.standard_errors import (
+    GROUP_LENGTH_MEMORIES,
+    MIN_GROUPS,
+    BlockGroups,
+    ScoreUncertainty,
+    group_sizes,
+    summarise_uncertainty,
+    uncertainty_warnings,
+)
 
 
 def remembering(records: int, frames: int, keeps: float, seed: int) -> np.ndarray:
@@ -29,7 +36,7 @@ def remembering(records: int, frames: int, keeps: float, seed: int) -> np.ndarra
 
 @pytest.mark.parametrize("keeps", [0.0, 0.5, 0.9])
 def test_a_known_memory_is_found(keeps: float) -> None:
-    found = [memory.memory_frames(series) for series in remembering(40, 4000, keeps, 1)]
+    found = [occupancy.autocorrelation_time(series) for series in remembering(40, 4000, keeps, 1)]
     assert np.mean(found) == pytest.approx((1 + keeps) / (1 - keeps), rel=0.15)
 
 
@@ -42,25 +49,25 @@ def test_the_sums_by_hand() -> None:
         largest = max(largest, total)
         if lag >= 5 * largest:
             break
-    assert memory.memory_frames(series) == pytest.approx(largest, abs=1e-3)
+    assert occupancy.autocorrelation_time(series) == pytest.approx(largest, abs=1e-3)
 
 
 def test_a_signal_does_not_hide_what_lies_below_it() -> None:
     """The plain sum of a swing of 80 frames cancels within half a cycle; the largest one does not."""
     slow = remembering(20, 4000, 0.9, 2)
     swinging = slow + 1.5 * np.sign(np.sin(2 * np.pi * np.arange(4000) / 80))
-    assert np.mean([memory.memory_frames(series) for series in swinging]) >= 15
+    assert np.mean([occupancy.autocorrelation_time(series) for series in swinging]) >= 15
 
 
 @pytest.mark.parametrize("series", [np.zeros(9), np.full(9, 3), np.array([5]), np.array([1, -1] * 20)])
 def test_what_does_not_vary_or_alternates_has_no_memory(series: np.ndarray) -> None:
-    assert memory.memory_frames(series) == 1.0
+    assert occupancy.autocorrelation_time(series) == 1.0
 
 
 @given(st.floats(1, 500), st.integers(10, 100_000), st.integers(2, 10))
 def test_errors_are_never_narrowed_and_long_records_are_left_alone(lasts: float, frames: int, groups: int) -> None:
-    assert memory.widening(lasts, frames, groups) >= 1.0
-    assert memory.widening(lasts, int(1000 * lasts * groups), groups) < 1.01
+    assert occupancy.standard_error_inflation(lasts, frames, groups) >= 1.0
+    assert occupancy.standard_error_inflation(lasts, int(1000 * lasts * groups), groups) < 1.01
 
 
 @pytest.mark.parametrize(("lasts", "frames", "groups"), [(50, 1000, 10), (50, 2000, 4), (200, 1000, 4), (5, 1000, 10)])
@@ -69,13 +76,13 @@ def test_widening_is_what_the_covariance_itself_says(
 ) -> None:
     """Of a series that keeps a share of itself from frame to frame: the variance of its mean, and the scatter of the
     means of groups that is to be expected, entry by entry of the covariance matrix."""
-    monkeypatch.setattr(memory, "upper", lambda memory, frames: memory)
+    monkeypatch.setattr(occupancy, "memory_upper_bound", lambda memory, frames: memory)
     at = np.arange(frames)
     covariance = ((lasts - 1.0) / (lasts + 1.0)) ** np.abs(at[:, None] - at[None, :])
     of_groups = covariance.reshape(groups, frames // groups, groups, frames // groups).mean(axis=(1, 3))
     scatter = (np.trace(of_groups) - of_groups.sum() / groups) / (groups - 1) / groups
     needed = math.sqrt(covariance.mean() / scatter)
-    assert memory.widening(lasts, frames, groups) == pytest.approx(needed, rel=1e-3)
+    assert occupancy.standard_error_inflation(lasts, frames, groups) == pytest.approx(needed, rel=1e-3)
 
 
 def test_groups_are_long_beside_the_memory_where_the_record_allows() -> None:
@@ -86,18 +93,18 @@ def test_groups_are_long_beside_the_memory_where_the_record_allows() -> None:
     assert group_sizes(3, 20, 1000.0) == [1, 1, 1]
     for memory_frames in (1.0, 12.0, 40.0):
         sizes = group_sizes(100, 25, memory_frames)
-        assert len(sizes) == FEWEST or min(sizes) * 25 >= LONG * memory_frames
+        assert len(sizes) == MIN_GROUPS or min(sizes) * 25 >= GROUP_LENGTH_MEMORIES * memory_frames
 
 
-def estimates(series: np.ndarray, blocks: int) -> list[Estimate]:
+def estimates(series: np.ndarray, blocks: int) -> list[ScoreUncertainty]:
     """Of the means of records (records, frames), as the blocks of a TPOG would give them."""
     found = []
     for one in series:
-        lasts = memory.memory_frames(one)
+        lasts = occupancy.autocorrelation_time(one)
         frames = np.array(group_sizes(blocks, len(one) // blocks, lasts)) * (len(one) // blocks)
         sums = np.array([part.sum() for part in np.split(one, np.cumsum(frames)[:-1])])
         left_out = [(one.sum() - part) / (len(one) - n) for part, n in zip(sums, frames, strict=True)]
-        found.append(Estimate.of(np.array([[one.mean(), *left_out]]), (Groups(frames, lasts),)))
+        found.append(ScoreUncertainty.of(np.array([[one.mean(), *left_out]]), (BlockGroups(frames, lasts),)))
     return found
 
 
@@ -112,23 +119,25 @@ def test_intervals_hold_where_groups_of_ten_would_not(frames: int) -> None:
 
 def test_a_short_record_is_warned_of_and_a_long_one_is_not() -> None:
     (short,) = estimates(remembering(1, 200, 0.95, 4), 10)
-    (doubt,) = doubts(short, "scenario.toml: traffic.frames", 0.5)
-    assert doubt.found.startswith("200 frames (100 s) are short beside the traffic's memory of ")
-    assert "though widened by" in doubt.found
-    assert doubt.cure.startswith("at least ")
-    assert "widened by" in str(in_words(short)["standard_errors_from"])
+    (doubt,) = uncertainty_warnings(short, "scenario.toml: traffic.frames", 0.5)
+    assert doubt.problem.startswith("200 frames (100 s) are few")
+    assert "for autocorrelation" in doubt.problem
+    assert doubt.hint.startswith("Record at least ")
+    assert "for autocorrelation" in str(summarise_uncertainty(short)["standard_errors_from"])
     (long,) = estimates(remembering(1, 20_000, 0.95, 4), 10)
-    assert doubts(long, "scenario.toml: traffic.frames", 0.5) == []
+    assert uncertainty_warnings(long, "scenario.toml: traffic.frames", 0.5) == []
 
 
 def test_of_a_mix_the_variances_and_biases_add_up() -> None:
     """Two records of their own: se^2 = se_1^2 + se_2^2, and t between the smaller and the sum of both freedoms."""
     rng = np.random.default_rng(5)
-    one, other = (Groups(np.full(k, 20), 0.0) for k in (5, 8))
+    one, other = (BlockGroups(np.full(k, 20), 0.0) for k in (5, 8))
     score = np.array([[10.0], [20.0]])
     left = [score + rng.normal(size=(2, k)) for k in (5, 8)]
-    apart = [Estimate.of(np.hstack([score, part]), (its,)) for part, its in zip(left, (one, other), strict=True)]
-    mix = Estimate.of(np.hstack([score, *left]), (one, other))
+    apart = [
+        ScoreUncertainty.of(np.hstack([score, part]), (its,)) for part, its in zip(left, (one, other), strict=True)
+    ]
+    mix = ScoreUncertainty.of(np.hstack([score, *left]), (one, other))
     assert mix.se**2 == pytest.approx(apart[0].se ** 2 + apart[1].se ** 2)
     assert mix.bias == pytest.approx(apart[0].bias + apart[1].bias)
     assert 4 <= mix.freedom <= 4 + 7

@@ -15,21 +15,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import pipeline
-from pipeline.artefacts import periods, tables
-from pipeline.artefacts.period_ranking import PeriodRanking
-from pipeline.artefacts.readers import read_periods, read_scores_by_period, read_tpog
-from pipeline.core.errors import InputError
-from pipeline.core.findings import Finding, warnings_of
-from pipeline.core.grid import Grid
-from pipeline.scoring.egvs import EntropyField, binary_entropy
-from pipeline.scoring.leave_out import Groups, LeaveOut
-from pipeline.scoring.uncertainty import Estimate
-from pipeline.stages import traffic
-from pipeline.stages.base import Workspace
-from pipeline.stages.shared import period_scores
-from pipeline.stages.shared.judged import Judged
-from pipeline.studies.effect_overview import called
+import egvs
+from egvs.artefacts import parquet, tpog
+from egvs.artefacts.readers import PeriodRanking, read_scores_by_period
+from egvs.artefacts.tpog import read_periods, read_tpog
+from egvs.core.errors import Diagnostic, InputError, collect_warnings
+from egvs.core.grid import Grid
+from egvs.scoring import score_table, scorer
+from egvs.scoring.egvs import EntropyField, binary_entropy
+from egvs.scoring.score_table import ScoreColumn
+from egvs.scoring.standard_errors import BlockGroups, BlockJackknife, ScoreUncertainty
+from egvs.stages import traffic
+from egvs.stages.inputs import open_folder
+from egvs.studies.effect_study import effect_statuses
 
 PERIODS = """
 [[traffic.periods]]
@@ -57,7 +55,7 @@ def of(table: object) -> list[dict[str, object]]:
 
 
 def test_the_mix_is_exact(split: Path, tmp_path: Path) -> None:
-    record = pipeline.run(pipeline.load(split), tmp_path)
+    record = egvs.run(egvs.load(split), tmp_path)
     path = tmp_path / "tpog.parquet"
     day, night, mix = read_tpog(path, "day"), read_tpog(path, "night"), read_tpog(path)
     assert (day.frames, night.frames) == (24, 16)
@@ -66,7 +64,7 @@ def test_the_mix_is_exact(split: Path, tmp_path: Path) -> None:
         ("night", 1.0, 4, 3),
     ]
     assert mix.frames == 5 * 24 + 3 * 16
-    boxes = [tables.read(tmp_path / "trajectories.parquet", "trajectories")[0].column("frame").to_numpy()]
+    boxes = [parquet.read_artefact(tmp_path / "trajectories.parquet", "trajectories")[0].column("frame").to_numpy()]
     by_day, by_night = (np.count_nonzero(boxes[0] < 24) / 24, np.count_nonzero(boxes[0] >= 24) / 16)
     mean = record.stages["tpog"].summary["boxes_in_roi"]
     assert mean == pytest.approx((2.5 * by_day + by_night) / 3.5)
@@ -80,14 +78,14 @@ def test_the_mix_is_exact(split: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_each_period_is_scored_as_if_it_were_alone(split: Path, tmp_path: Path) -> None:
-    pipeline.run(pipeline.load(split), tmp_path / "both")
+    egvs.run(egvs.load(split), tmp_path / "both")
     by_period = of(read_scores_by_period(tmp_path / "both" / "scores_by_period.parquet"))
     text = (split / "scenario.toml").read_text().replace(PERIODS, "")
     for name, begin_s, frames in (("day", 0, 24), ("night", 12, 16)):
         (split / "scenario.toml").write_text(text)
         alone = tmp_path / name
-        pipeline.run(pipeline.load(split, [f"traffic.frames={frames}", f"traffic.begin_s={begin_s}"]), alone)
-        rows = of(pipeline.read_scores(alone / "scores.parquet"))
+        egvs.run(egvs.load(split, [f"traffic.frames={frames}", f"traffic.begin_s={begin_s}"]), alone)
+        rows = of(egvs.read_scores(alone / "scores.parquet"))
         for row, its in zip(rows, (row for row in by_period if row["period"] == name), strict=True):
             assert {key: row[key] for key in its if key != "period"} == {k: v for k, v in its.items() if k != "period"}
         assert not (alone / "scores_by_period.parquet").exists()
@@ -97,26 +95,26 @@ def test_each_period_is_scored_as_if_it_were_alone(split: Path, tmp_path: Path) 
 
 @pytest.mark.slow
 def test_frames_stand_one_after_another_and_weights_need_no_new_traffic(split: Path, tmp_path: Path) -> None:
-    pipeline.run(pipeline.load(split), tmp_path)
-    table, about = tables.read(tmp_path / "trajectories.parquet", "trajectories")
+    egvs.run(egvs.load(split), tmp_path)
+    table, about = parquet.read_artefact(tmp_path / "trajectories.parquet", "trajectories")
     assert (about["frames"], about["periods"]) == (40, [{"name": "day", "frames": 24}, {"name": "night", "frames": 16}])
     assert np.unique(table.column("frame")).tolist() == list(range(40))
     file = split / "scenario.toml"
     file.write_text(file.read_text().replace("weight = 2.5", "weight = 1"))
     states: dict[str, str] = {}
-    pipeline.run(pipeline.load(split), tmp_path, listener=lambda stage, state, _: states.update({stage: state}))
+    egvs.run(egvs.load(split), tmp_path, listener=lambda stage, state, _: states.update({stage: state}))
     assert states["traffic"] == "skipped"
     assert (states["tpog"], states["score"]) == ("done", "done")
     assert read_tpog(tmp_path / "tpog.parquet").frames == 2 * 24 + 3 * 16
 
 
 @pytest.mark.slow
-def test_a_run_with_periods_is_the_same_again_and_shows_them(split: Path, tmp_path: Path, egvs) -> None:  # type: ignore[no-untyped-def]
-    code, printed, told = egvs("run", split, "--out", tmp_path / "out")
+def test_a_run_with_periods_is_the_same_again_and_shows_them(split: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
+    code, printed, told = run_egvs("run", split, "--out", tmp_path / "out")
     assert code == 0
     (night,) = (line for line in told.splitlines() if line.split()[0] == "night")
     assert night.split("   ")[-1].startswith("frames 16; vehicles 2 fewest, 2 most, 2 different; rows 32;")
-    assert "standard errors from day: 4 groups of 6 frames" in told
+    assert "standard errors from day: 4 blocks of 6 frames" in told
     assert "rank and share of the best in each period; in the mix: day 71.4%, night 28.6%" in printed
     assert "scores_by_period.parquet" in printed
     page = (tmp_path / "out" / "report.html").read_text()
@@ -128,7 +126,7 @@ def test_a_run_with_periods_is_the_same_again_and_shows_them(split: Path, tmp_pa
     ranking = PeriodRanking.read(tmp_path / "out")
     assert ranking is not None
     assert (ranking.periods, ranking.frames) == (("day", "night"), 40)
-    assert egvs("verify", tmp_path / "out")[0] == 0
+    assert run_egvs("verify", tmp_path / "out")[0] == 0
 
 
 @given(
@@ -138,7 +136,7 @@ def test_a_run_with_periods_is_the_same_again_and_shows_them(split: Path, tmp_pa
 def test_frames_count_in_the_ratio_of_the_weights(rows: list[tuple[int, int]], unit: float) -> None:
     weights, frames = [round(n * unit, 2) for n, _ in rows], [t for _, t in rows]
     try:
-        found = periods.times(weights, frames, "scenario.toml: traffic")
+        found = tpog.frame_multiplicities(weights, frames, "scenario.toml: traffic")
     except InputError:
         return  # too many frames for this mix
     total = sum(m * t for m, t in zip(found, frames, strict=True))
@@ -150,10 +148,10 @@ def test_frames_count_in_the_ratio_of_the_weights(rows: list[tuple[int, int]], u
 
 def test_of_a_mix_each_group_is_left_out_of_its_own_record() -> None:
     rng, grid = np.random.default_rng(2), Grid.from_json({"origin_m": [0.0] * 3, "voxel_m": 1.0, "shape": [5, 4, 1]})
-    records = (Groups(np.array([10, 20]), 0.0), Groups(np.array([8, 8, 8]), 0.0))
+    records = (BlockGroups(np.array([10, 20]), 0.0), BlockGroups(np.array([8, 8, 8]), 0.0))
     counts = [rng.integers(0, 8, size=(k, 20)).astype(np.uint32) for k in (2, 3)]
     hits, times = rng.integers(0, 9, size=20).astype(np.uint32), (4, 3)
-    leave_out = LeaveOut.from_mix(np.vstack(counts), np.arange(20), records, times, grid)
+    leave_out = BlockJackknife.from_mix(np.vstack(counts), np.arange(20), records, times, grid)
     found = leave_out.scores(hits, 5.0)
     weight = [m * its.total for m, its in zip(times, records, strict=True)]
     columns = [(None, None), *((q, g) for q in (0, 1) for g in range(len(counts[q])))]
@@ -172,17 +170,17 @@ def test_of_a_mix_each_group_is_left_out_of_its_own_record() -> None:
         assert found[column] == pytest.approx(total, rel=1e-12)
     assert pytest.approx(np.array(p_left)) == leave_out.p[leave_out.classes].T
     crossed = (np.array(p_left) * (hits > 0)).sum(axis=1) / np.array(p_left).sum(axis=1)
-    assert leave_out.shares_seen(hits, "expected_visibility") == pytest.approx(crossed)
+    assert leave_out.voxel_shares(hits, "expected_visibility") == pytest.approx(crossed)
     mixed = (4 * counts[0].sum(axis=0) + 3 * counts[1].sum(axis=0)).astype(np.int64)
     assert found[0] == pytest.approx(EntropyField.of(mixed, sum(weight), grid).score(hits, 5.0).egvs, rel=1e-13)
-    assert len(Estimate.of(found[None], leave_out.groups).strata) == 2
+    assert len(ScoreUncertainty.of(found[None], leave_out.groups).strata) == 2
 
 
 def test_variances_and_biases_of_a_mix_add_up_by_hand() -> None:
     """One site, 100 bit. By day two equal groups, without which it has 98 and 100; by night groups of 10 and 20
     frames, without which it has 97 and 99."""
-    records = (Groups(np.array([10, 10]), 0.0), Groups(np.array([10, 20]), 0.0))
-    estimate = Estimate.of(np.array([[100.0, 98.0, 100.0, 97.0, 99.0]]), records)
+    records = (BlockGroups(np.array([10, 10]), 0.0), BlockGroups(np.array([10, 20]), 0.0))
+    estimate = ScoreUncertainty.of(np.array([[100.0, 98.0, 100.0, 97.0, 99.0]]), records)
     # day: h = 2, so S~ = 200 - (98 + 100) / 2 = 101; pseudo-values 102 and 100; se^2 = ((1 + 1) / 1) / 2 = 1
     # night: h = 3 and 1.5, so S~ = 200 - (2/3 97 + 1/3 99) = 307/3; pseudo-values 300 - 194 = 106, 150 - 49.5 = 100.5;
     #        se^2 = ((11/3)^2 / 2 + (11/6)^2 / 0.5) / 2 = (121/18 + 121/18) / 2 = 121/18
@@ -192,48 +190,48 @@ def test_variances_and_biases_of_a_mix_add_up_by_hand() -> None:
 
 
 def test_errors_of_a_mix_and_of_its_periods_are_told(split: Path, tmp_path: Path) -> None:
-    record = pipeline.run(pipeline.load(split), tmp_path)
-    rows = of(pipeline.read_scores(tmp_path / "scores.parquet"))
+    record = egvs.run(egvs.load(split), tmp_path)
+    rows = of(egvs.read_scores(tmp_path / "scores.parquet"))
     assert all(row["egvs_se"] > 0 for row in rows)  # type: ignore[operator]
     assert all(row["egvs_se"] > 0 for row in of(read_scores_by_period(tmp_path / "scores_by_period.parquet")))  # type: ignore[operator]
     summary = record.stages["score"].summary
     day, night = summary["standard_errors_from"].split("; ")
-    assert day.startswith("day: 4 groups of 6 frames")
-    assert night.startswith("night: 4 groups of 4 frames")
-    doubts = [finding for finding in warnings_of([summary]) if finding.rule == "traffic's memory"]
+    assert day.startswith("day: 4 blocks of 6 frames")
+    assert night.startswith("night: 4 blocks of 4 frames")
+    doubts = [finding for finding in collect_warnings([summary]) if finding.rule == "traffic's memory"]
     assert doubts
-    assert {finding.place for finding in doubts} <= {
+    assert {finding.where for finding in doubts} <= {
         f"scenario.toml: traffic.periods ({name}).length_s" for name in ("day", "night")
     }
-    assert all(finding.cure.startswith("length_s of at least ") for finding in doubts)
+    assert all(finding.hint.startswith("Set length_s to at least ") for finding in doubts)
 
 
 def test_a_period_whose_best_site_is_another_is_told() -> None:
-    tpog = pipeline.Tpog(
+    tpog = egvs.Tpog(
         Grid.from_json({"origin_m": [0.0] * 3, "voxel_m": 1.0, "shape": [1, 1, 1]}), 1, np.zeros((1, 1, 1), np.int64)
     )
-    named = [period_scores.PeriodTpog(name, tpog) for name in ("morning", "night")]
+    named = [scorer.PeriodTpog(name, tpog) for name in ("morning", "night")]
 
-    def judged(*sites: tuple[float, ...]) -> Judged:
+    def judged(*sites: tuple[float, ...]) -> ScoreColumn:
         mix, *apart = (np.array(values) for values in zip(*sites, strict=True))
-        return Judged("egvs", mix, None, (), tuple(apart))
+        return ScoreColumn("egvs", mix, None, (), tuple(apart))
 
-    (found,) = period_scores.disagreements(["a", "b"], judged((9.0, 9.0, 3.0), (7.0, 6.0, 4.0)), named)
-    assert found.place == "scenario.toml: traffic.periods (night)"
-    assert found.found == "b is the best site, not a of the mix, which is rank 2 there and scores 25.0% less"
-    assert period_scores.disagreements(["a", "b"], judged((9.0, 9.0, 4.0), (7.0, 6.0, 4.0)), named) == []
-    assert period_scores.disagreements(["a"], judged((9.0, 0.0, math.nan)), named) == []
+    (found,) = score_table.period_disagreements(["a", "b"], judged((9.0, 9.0, 3.0), (7.0, 6.0, 4.0)), named)
+    assert found.where == "scenario.toml: traffic.periods (night)"
+    assert found.problem == "b is the best site, not a of the mix, which is rank 2 there and scores 25.0% less"
+    assert score_table.period_disagreements(["a", "b"], judged((9.0, 9.0, 4.0), (7.0, 6.0, 4.0)), named) == []
+    assert score_table.period_disagreements(["a"], judged((9.0, 0.0, math.nan)), named) == []
 
 
 @pytest.mark.slow
 def test_periods_disagree_without_standard_errors_too(
     split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told = Finding("periods disagree", "scenario.toml: traffic.periods (night)", "b is the best site, not a", "")
-    monkeypatch.setattr(period_scores, "disagreements", lambda *_: [told])
+    told = Diagnostic("periods disagree", "scenario.toml: traffic.periods (night)", "b is the best site, not a", "")
+    monkeypatch.setattr(score_table, "period_disagreements", lambda *_: [told])
     for override in ("score.standard_error=true", "score.standard_error=false", "tpog.blocks=1"):
-        record = pipeline.run(pipeline.load(split, [override]), tmp_path / override)
-        assert told in warnings_of([record.stages["score"].summary]), override
+        record = egvs.run(egvs.load(split, [override]), tmp_path / override)
+        assert told in collect_warnings([record.stages["score"].summary]), override
 
 
 def test_the_report_tells_what_its_tables_leave_out(
@@ -242,8 +240,8 @@ def test_the_report_tells_what_its_tables_leave_out(
     rows = "".join(f"p{n},{10 + n},12,3\n" for n in range(4))
     (split / "sites.csv").write_text(f"site,x_m,y_m,z_m\n{rows}")
     for name, count in (("LISTED", 2), ("FIRST", 1), ("LAST", 1)):
-        monkeypatch.setattr(f"pipeline.report.page.{name}", count)
-    pipeline.run(pipeline.load(split), tmp_path)
+        monkeypatch.setattr(f"egvs.report.page.{name}", count)
+    egvs.run(egvs.load(split), tmp_path)
     html = (tmp_path / "report.html").read_text()
     assert "2 more are not shown; scores_by_period.parquet holds them all" in html
     assert "Choose any site here" in html
@@ -252,7 +250,7 @@ def test_the_report_tells_what_its_tables_leave_out(
 
 def test_an_effect_that_periods_forbid_is_not_advised(split: Path) -> None:
     """Replaying the frames of all periods alike is refused in a scenario; it must not be recommended for one."""
-    (found,) = (call for call in called(pipeline.load(split)) if call.name == "moving_occlusion")
+    (found,) = (call for call in effect_statuses(egvs.load(split)) if call.name == "moving_occlusion")
     assert (found.state, found.why) == (
         "off",
         'cannot act here: method = "frames" replays all periods alike, whatever their weights;'
@@ -268,11 +266,11 @@ def test_the_world_frame_counts_where_a_period_alone_is_a_finished_file(
     each = file.read_text().replace(fcd, "").replace("length_s", f"{fcd}length_s")
     file.write_text(each.replace("[traffic]", '[traffic]\nnetwork = "n.net.xml"'))
     (split / "n.net.xml").write_text("<net/>")
-    scenario = pipeline.load(split)
+    scenario = egvs.load(split)
     assert scenario.traffic.fcd is None
     assert scenario.is_recorded
-    monkeypatch.setattr("pipeline.world.world_frame.key", lambda _: {"world_frame": "here"})
-    assert traffic.inputs(Workspace(scenario, split)).settings["world_frame"] == "here"
+    monkeypatch.setattr("egvs.world.geolocation.world_frame_settings", lambda _: {"world_frame": "here"})
+    assert traffic.dependencies(open_folder(scenario, split)).settings["world_frame"] == "here"
 
 
 @pytest.mark.slow
@@ -312,11 +310,11 @@ def test_periods_that_cannot_be_are_refused(
     old: str,
     new: str,
     message: str,
-    egvs,  # type: ignore[no-untyped-def]
+    run_egvs,  # type: ignore[no-untyped-def]
 ) -> None:
     file = split / "scenario.toml"
     file.write_text(file.read_text().replace(old, new))
-    code, _, complaint = egvs("run", split, "--out", tmp_path / "out")
+    code, _, complaint = run_egvs("run", split, "--out", tmp_path / "out")
     assert code == 2
     assert re.search(message, complaint)
 
@@ -326,19 +324,19 @@ def test_a_key_that_acts_in_one_period_may_stand_for_all(split: Path) -> None:
     file = split / "scenario.toml"
     text = file.read_text().replace('fcd = "fcd.csv"', "step_s = 0.5").replace("length_s = 12", 'fcd = "fcd.csv"')
     file.write_text(text.replace("begin_s = 12", 'sumocfg = "night.sumocfg"'))
-    day, night = (scenario.traffic for scenario in pipeline.load(split).by_period().values())
+    day, night = (scenario.traffic for scenario in egvs.load(split).by_period().values())
     assert (day.fcd, night.sumocfg, night.step_s) == ("fcd.csv", "night.sumocfg", 0.5)
 
 
 def test_a_period_that_is_not_there_is_refused(split: Path, tmp_path: Path) -> None:
-    pipeline.run(pipeline.load(split), tmp_path)
+    egvs.run(egvs.load(split), tmp_path)
     with pytest.raises(InputError, match="no period 'noon'; one of day, night"):
         read_tpog(tmp_path / "tpog.parquet", "noon")
     path = tmp_path / "tpog.parquet"
-    table, about = tables.read(path, "tpog")
+    table, about = parquet.read_artefact(path, "tpog")
     columns = {name: table.column(name).to_numpy() for name in table.column_names}
     for broken in ([], [{}], [about["periods"][0] | {"times": 0}], "day"):
-        tables.write(path, "tpog", columns, about | {"periods": broken})
+        parquet.write_artefact(path, "tpog", columns, about | {"periods": broken})
         with pytest.raises(InputError, match="its metadata says periods"):
             read_tpog(path)
 
@@ -347,10 +345,10 @@ def test_entropy_of_a_mix_is_that_of_its_share() -> None:
     assert binary_entropy(3, 8) == binary_entropy(15, 40)
 
 
-def test_a_file_that_a_period_lacks_is_told_before_the_first_stage(split: Path, tmp_path: Path, egvs) -> None:  # type: ignore[no-untyped-def]
+def test_a_file_that_a_period_lacks_is_told_before_the_first_stage(split: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
     file = split / "scenario.toml"
     file.write_text(file.read_text().replace("begin_s = 12", 'fcd = "nacht.csv"'))
-    code, _, complaint = egvs("run", split, "--out", tmp_path / "out")
+    code, _, complaint = run_egvs("run", split, "--out", tmp_path / "out")
     assert code == 2
     assert re.search(r"scenario\.toml: traffic\.periods \(night\)\.fcd.*nacht\.csv", complaint)
     assert not (tmp_path / "out" / "statics.ply").exists()

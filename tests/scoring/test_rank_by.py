@@ -12,22 +12,20 @@ from typing import get_args
 import numpy as np
 import pytest
 
-import pipeline
-from pipeline.artefacts import tables
-from pipeline.artefacts.period_ranking import PeriodRanking
-from pipeline.artefacts.readers import read_scores, read_scores_by_period, read_tpog, read_visibility
-from pipeline.artefacts.traffic_frames import read
-from pipeline.core.findings import warnings_of
-from pipeline.scenario import loading
-from pipeline.scenario.score import OtherScore, ScoreModel
-from pipeline.scoring.egvs import binary_entropy
-from pipeline.scoring.targets.detectability import expected_detections
-from pipeline.scoring.targets.named import WORTHS
-from pipeline.scoring.targets.record import TargetRecord
-from pipeline.scoring.targets.seen import see
-from pipeline.scoring.visibility import Beams
-from pipeline.sensing.scanner import Scanner
-from pipeline.stages import score
+import egvs
+from egvs.artefacts import parquet
+from egvs.artefacts.readers import PeriodRanking, read_scores, read_scores_by_period, read_visibility
+from egvs.artefacts.tpog import read_tpog
+from egvs.artefacts.traffic_frames import read_frames
+from egvs.core.errors import collect_warnings
+from egvs.scenario import loading
+from egvs.scenario.score_config import OtherScore, ScoreConfig
+from egvs.scoring.egvs import binary_entropy
+from egvs.scoring.target_scores import TARGET_SCORES, expected_detections
+from egvs.scoring.targets import TargetRecord, visible_targets
+from egvs.scoring.visibility import Beams
+from egvs.sensors.scanner import Scanner
+from egvs.stages import score
 from tests.scoring.targets import scenes
 from tests.stages import inputs_of, run_stage
 
@@ -36,7 +34,7 @@ SITES = "site,x_m,y_m,z_m\n" + "".join(f"s{n},{5 + 6 * n},{11 - 22 * (n % 2)},{2
 
 
 def run(folder: Path, out: Path, *overrides: str) -> dict[str, dict[str, float]]:
-    pipeline.run(loading.load(folder, overrides), out, jobs=2)
+    egvs.run(loading.load(folder, overrides), out, jobs=2)
     return {row["site"]: row for row in read_scores(out / "scores.parquet").to_pylist()}
 
 
@@ -51,10 +49,10 @@ def test_means_over_vehicles_are_those_of_the_slow_twin(
 ) -> None:
     rows = run(mini, tmp_path / "run", ALL)
     scenario = loading.load(mini)
-    frames = list(read(tmp_path / "run" / "trajectories.parquet", np.arange(40)))
+    frames = list(read_frames(tmp_path / "run" / "trajectories.parquet", np.arange(40)))
     monkeypatch.setattr(scenes, "GRID", scenario.roi.grid)
-    scanner = Scanner(pipeline.build_scene(scenario))
-    blocks = np.repeat([one.number // 10 for one in frames], [len(one.wanted(scenes.GRID.roi)) for one in frames])
+    scanner = Scanner(egvs.build_scene(scenario))
+    blocks = np.repeat([one.number // 10 for one in frames], [len(one.target_rows(scenes.GRID.roi)) for one in frames])
     widened = []
     for site in scanner.scene.sites:
         points = np.array(scenes.seen_slowly(frames, Beams.of(scanner.scan_site(site)))["points"])
@@ -74,8 +72,8 @@ def test_sites_rank_by_the_score_that_is_named(mini: Path, tmp_path: Path, name:
     assert by_rank(rows, name)
     columns = set(next(iter(rows.values())))
     assert {name, f"{name}_se", "egvs_se", "beats_next"} <= columns
-    assert columns.isdisjoint(set(WORTHS) - {name})
-    assert tables.read_metadata(tmp_path / "run" / "scores.parquet", "scores")["rank_by"] == name
+    assert columns.isdisjoint(set(TARGET_SCORES) - {name})
+    assert parquet.read_metadata(tmp_path / "run" / "scores.parquet", "scores")["rank_by"] == name
     ranked = sorted(rows.values(), key=lambda row: row["rank"])
     assert ranked[-1]["beats_next"] == 1.0
     assert all(0.5 <= row["beats_next"] <= 1.0 for row in ranked)
@@ -103,7 +101,7 @@ def test_the_error_of_a_share_of_voxels_is_that_of_its_groups(mini: Path, tmp_pa
     }[name]
     path = tmp_path / "run" / "tpog.parquet"
     counts = {}
-    for row in tables.read(path, "tpog")[0].to_pylist():
+    for row in parquet.read_artefact(path, "tpog")[0].to_pylist():
         counts.setdefault((row["ix"], row["iy"], row["iz"]), [0, 0])[row["block"]] += row["count"]
     for site, row in rows.items():
         hits = read_visibility(tmp_path / "run" / "visibility.parquet", site)
@@ -131,8 +129,8 @@ def test_a_mix_of_periods_weighs_vehicles_with_and_without_errors(mini: Path, tm
     rank = ("score.rank_by=seen_well", periods)
     rows, plain = run(mini, tmp_path / "a", *rank), run(mini, tmp_path / "b", *rank, "score.standard_error=false")
     apart = read_scores_by_period(tmp_path / "a" / "scores_by_period.parquet").to_pylist()
-    frames = read(tmp_path / "a" / "trajectories.parquet", np.arange(40))
-    vehicles = np.array([len(one.wanted(loading.load(mini).roi.box)) for one in frames])
+    frames = read_frames(tmp_path / "a" / "trajectories.parquet", np.arange(40))
+    vehicles = np.array([len(one.target_rows(loading.load(mini).roi.box)) for one in frames])
     share = [3 * vehicles[:24].sum() / 24, vehicles[24:].sum() / 16]
     for site, row in rows.items():
         assert plain[site]["seen_well"] == row["seen_well"]
@@ -150,16 +148,16 @@ def test_a_mix_of_periods_weighs_vehicles_with_and_without_errors(mini: Path, tm
         assert [its.rank for its in periods] == [its["rank"] for its in own]
 
 
-def test_no_vehicle_in_the_region_is_refused_where_vehicles_rank(mini: Path, tmp_path: Path, egvs) -> None:  # type: ignore[no-untyped-def]
+def test_no_vehicle_in_the_region_is_refused_where_vehicles_rank(mini: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
     away = ("--set", "roi.center_m=[20, 60, 2.5]", "--set", "sites.file=far.csv")
     (mini / "far.csv").write_text("site,x_m,y_m,z_m\nfar,20,72,3\n")
-    code, _, told = egvs("run", mini, "--out", tmp_path / "a", *away, "--set", "score.rank_by=seen_well")
+    code, _, told = run_egvs("run", mini, "--out", tmp_path / "a", *away, "--set", "score.rank_by=seen_well")
     assert code == 2
     assert "scenario.toml: score.rank_by = 'seen_well': no vehicle has its centre in the region of interest" in told
     assert 'or rank_by = "egvs"' in told
     assert not (tmp_path / "a" / "scores.parquet").exists()
-    record = pipeline.run(loading.load(mini, away[1::2]), tmp_path / "b", jobs=1)
-    assert [it.rule for it in warnings_of(stage.summary for stage in record.stages.values())] == [
+    record = egvs.run(loading.load(mini, away[1::2]), tmp_path / "b", jobs=1)
+    assert [it.rule for it in collect_warnings(stage.summary for stage in record.stages.values())] == [
         "traffic in the region",
         "no ranking",
     ]
@@ -176,14 +174,14 @@ def test_errors_that_are_not_known_are_told_as_such(mini: Path, tmp_path: Path) 
     assert by_rank(rows, "seen_well")
     assert all(math.isnan(row["seen_well_se"]) and math.isnan(row["beats_next"]) for row in rows.values())
     sets = ["score.rank_by=seen_well", "score.others=[]"]
-    record = pipeline.run(loading.load(mini, sets), tmp_path / "run", jobs=1)
-    (doubt,) = (it for it in warnings_of([record.stages["score"].summary]) if it.rule == "no standard error")
-    assert "all vehicles in the region are in one of the 4 groups of frames" in doubt.found
+    record = egvs.run(loading.load(mini, sets), tmp_path / "run", jobs=1)
+    (doubt,) = (it for it in collect_warnings([record.stages["score"].summary]) if it.rule == "no standard error")
+    assert "all vehicles in the region are in one of the 4 groups of frames" in doubt.problem
 
 
 def test_only_scores_over_vehicles_read_trajectories(mini: Path, tmp_path: Path) -> None:
     plain = ["score.others=[]", "score.blindspots=false"]
-    pipeline.run(loading.load(mini, plain), tmp_path, jobs=1)
+    egvs.run(loading.load(mini, plain), tmp_path, jobs=1)
     assert "trajectories.parquet" not in inputs_of(score, loading.load(mini, plain), tmp_path).files
     assert "trajectories.parquet" in inputs_of(score, loading.load(mini), tmp_path).files
     (tmp_path / "trajectories.parquet").unlink()
@@ -194,9 +192,9 @@ def test_only_scores_over_vehicles_read_trajectories(mini: Path, tmp_path: Path)
 
 
 def test_what_is_asked_for_comes_once() -> None:
-    model = ScoreModel(rank_by="seen_well", others=("entropy_seen", "seen_well"))
-    assert model.asked == ("seen_well", "entropy_seen")
-    assert ScoreModel(others=()).asked == ()
+    model = ScoreConfig(rank_by="seen_well", others=("entropy_seen", "seen_well"))
+    assert model.additional == ("seen_well", "entropy_seen")
+    assert ScoreConfig(others=()).additional == ()
 
 
 @pytest.mark.parametrize(
@@ -207,8 +205,8 @@ def test_what_is_asked_for_comes_once() -> None:
         ('score.others=["seen_well","seen_well"]', "seen_well stands there twice"),
     ],
 )
-def test_unknown_scores_are_refused(mini: Path, tmp_path: Path, egvs, override: str, message: str) -> None:  # type: ignore[no-untyped-def]
-    code, _, told = egvs("run", mini, "--out", tmp_path / "run", "--set", override)
+def test_unknown_scores_are_refused(mini: Path, tmp_path: Path, run_egvs, override: str, message: str) -> None:  # type: ignore[no-untyped-def]
+    code, _, told = run_egvs("run", mini, "--out", tmp_path / "run", "--set", override)
     assert code == 2
     assert message in told, told
 
@@ -217,18 +215,18 @@ def test_traffic_without_a_vehicles_centre_is_told(mini: Path, tmp_path: Path) -
     """Cars reach into a narrow region, but none has its centre there."""
     (mini / "near.csv").write_text("site,x_m,y_m,z_m\nnear,20,12,3\n")
     edge = ["roi.center_m=[20, 12.9, 2.5]", "roi.size_m=[40, 20, 5]", "sites.file=near.csv"]
-    record = pipeline.run(loading.load(mini, edge), tmp_path / "run", jobs=1)
-    told = [it for it in warnings_of([record.stages["score"].summary]) if it.rule == "no vehicles"]
+    record = egvs.run(loading.load(mini, edge), tmp_path / "run", jobs=1)
+    told = [it for it in collect_warnings([record.stages["score"].summary]) if it.rule == "no vehicles"]
     values = read_scores(tmp_path / "run" / "scores.parquet")["expected_detections"].to_pylist()
     assert read_tpog(tmp_path / "run" / "tpog.parquet").counts.any()
     nobody = "no vehicle has its centre in the region of interest in the 40 frames looked at"
-    assert [it.found for it in told] == [f"{nobody}: expected_detections is no number"]
+    assert [it.problem for it in told] == [f"{nobody}: expected_detections is no number"]
     assert math.isnan(values[0])
 
 
 @pytest.mark.slow
-def test_terminal_and_report_show_the_score_that_ranks(mini: Path, tmp_path: Path, egvs) -> None:  # type: ignore[no-untyped-def]
-    code, printed, _ = egvs("run", mini, "--out", tmp_path, "--set", "score.rank_by=seen_well")
+def test_terminal_and_report_show_the_score_that_ranks(mini: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
+    code, printed, _ = run_egvs("run", mini, "--out", tmp_path, "--set", "score.rank_by=seen_well")
     assert code == 0
     best = next(row for row in read_scores(tmp_path / "scores.parquet").to_pylist() if row["rank"] == 1)
     says = f"sees {best['seen_well']:.0%} of vehicles well"
@@ -240,13 +238,13 @@ def test_terminal_and_report_show_the_score_that_ranks(mini: Path, tmp_path: Pat
     assert "Sites are ranked by the share of vehicles that they see well" in page
     assert 'data-label="seen well"' in page
     assert 'data-label="EGVS bit"' in page
-    assert egvs("verify", tmp_path)[0] == 0
+    assert run_egvs("verify", tmp_path)[0] == 0
 
 
 def test_the_expected_detections_are_those_of_the_calibration(mini: Path, tmp_path: Path) -> None:
     rows, scenario = run(mini, tmp_path / "run"), loading.load(mini)
     record = TargetRecord.read(tmp_path / "run" / "trajectories.parquet", scenario.roi.grid)
-    scanner = Scanner(pipeline.build_scene(scenario))
+    scanner = Scanner(egvs.build_scene(scenario))
     for site in scanner.scene.sites:
-        seen = see(record, Beams.of(scanner.scan_site(site)))
+        seen = visible_targets(record, Beams.of(scanner.scan_site(site)))
         assert rows[site.name]["expected_detections"] == expected_detections(seen)

@@ -11,12 +11,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from pipeline.artefacts.readers import read_scores, read_tpog, read_visibility
-from pipeline.core.errors import InputError
-from pipeline.scenario import loading
-from pipeline.scoring.egvs import binary_entropy
-from pipeline.scoring.scorer import ranks
-from pipeline.stages import scan, score, statics, tpog, traffic
+from egvs.artefacts.readers import read_scores, read_visibility
+from egvs.artefacts.tpog import read_tpog
+from egvs.core.errors import InputError
+from egvs.scenario import loading
+from egvs.scoring.egvs import binary_entropy
+from egvs.scoring.scorer import ranks
+from egvs.stages import scan, score, statics, tpog, traffic
 from tests.stages import run_stage
 
 STAGES = (traffic, statics, tpog, scan, score)
@@ -184,8 +185,8 @@ def put(name, row, value):
         ("tpog", put("count", 0, 2**32 - 1), "of 40 frames"),
         ("tpog", lambda t, a: (t, a | {"schema": 999}), "schema version 999"),
         ("tpog", lambda t, a: (t.drop_columns("count"), a), "column 'count' is missing"),
-        ("scans", put("dx_m", 5, np.nan), "no number"),
-        ("scans", put("dz_m", 5, np.inf), "no number"),
+        ("scans", put("dx_m", 5, np.nan), "not finite"),
+        ("scans", put("dz_m", 5, np.inf), "not finite"),
     ],
 )
 def test_altered_artefacts_are_refused(mini, tmp_path, artefact, change, message):

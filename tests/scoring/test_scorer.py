@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import pipeline
-from pipeline.core.errors import InputError
-from pipeline.scoring.scorer import PeriodTpog, Scorer
-from pipeline.sensing.scanner import Scanner
-from pipeline.sensing.sites import Pose
+import egvs
+from egvs.core.errors import InputError
+from egvs.scoring.scorer import PeriodTpog, Scorer
+from egvs.sensors.scanner import Scanner
+from egvs.sensors.sites import Pose
 
 OCCLUSION = 'effects.moving_occlusion.method="frames"'
 
@@ -21,30 +21,30 @@ OCCLUSION = 'effects.moving_occlusion.method="frames"'
 @pytest.fixture(params=[[], ["effects.rain.rate_mm_h=30"], [OCCLUSION]], ids=["plain", "rain", "occlusion"])
 def run(request, mini, tmp_path):
     """A scenario, its scene, and the folder of its run."""
-    scenario = pipeline.load(mini, ["score.keep_visibility=all", *request.param])
-    pipeline.run(scenario, tmp_path / "run")
-    return pipeline.build_scene(scenario), tmp_path / "run"
+    scenario = egvs.load(mini, ["score.keep_visibility=all", *request.param])
+    egvs.run(scenario, tmp_path / "run")
+    return egvs.build_scene(scenario), tmp_path / "run"
 
 
 def scorer_of(scene, folder) -> Scorer:
-    return Scorer(scene, pipeline.read_tpog(folder / "tpog.parquet"), folder / "trajectories.parquet")
+    return Scorer(scene, egvs.read_tpog(folder / "tpog.parquet"), folder / "trajectories.parquet")
 
 
 def test_it_gives_what_the_stage_wrote(run):
     scene, folder = run
-    rows = {row["site"]: row for row in pipeline.read_scores(folder / "scores.parquet").to_pylist()}
+    rows = {row["site"]: row for row in egvs.read_scores(folder / "scores.parquet").to_pylist()}
     scanner, scorer = Scanner(scene), scorer_of(scene, folder)
     for site in scene.sites:
         worth, hits = scorer.score_and_hits(scanner.scan_site(site))
         assert (worth.egvs, worth.entropy_seen) == (rows[site.name]["egvs"], rows[site.name]["entropy_seen"])
-        assert np.array_equal(hits, pipeline.read_visibility(folder / "visibility.parquet", site.name))
+        assert np.array_equal(hits, egvs.read_visibility(folder / "visibility.parquet", site.name))
         assert rows[site.name]["egvs_limit"] == scorer.limit
 
 
 def test_a_score_is_that_of_the_hits_of_all_voxels(run):
     """Also where a period alone has traffic that the whole has not."""
     scene, folder = run
-    scanner, tpog = Scanner(scene), pipeline.read_tpog(folder / "tpog.parquet")
+    scanner, tpog = Scanner(scene), egvs.read_tpog(folder / "tpog.parquet")
     elsewhere = PeriodTpog("elsewhere", replace(tpog, counts=np.roll(tpog.counts, 5, axis=1)))
     for site in scene.sites:
         scan = scanner.scan_site(site)
@@ -76,18 +76,18 @@ def test_threads_and_other_processes_get_the_same(run):
 
 
 def test_traffic_to_replay_must_be_named(mini, tmp_path):
-    scenario = pipeline.load(mini, [OCCLUSION])
-    pipeline.run(scenario, tmp_path)
+    scenario = egvs.load(mini, [OCCLUSION])
+    egvs.run(scenario, tmp_path)
     with pytest.raises(InputError, match="no trajectories to replay"):
-        Scorer(pipeline.build_scene(scenario), pipeline.read_tpog(tmp_path / "tpog.parquet"))
+        Scorer(egvs.build_scene(scenario), egvs.read_tpog(tmp_path / "tpog.parquet"))
 
 
 def test_a_new_pose_is_hidden_by_vehicles_that_no_site_has_before_it(mini, tmp_path):
     """Boxes are left out that lie outside the region of interest and the sensor: for each sensor anew."""
-    scenario = pipeline.load(mini, [OCCLUSION])
-    pipeline.run(scenario, tmp_path)
-    scene = pipeline.build_scene(scenario)
+    scenario = egvs.load(mini, [OCCLUSION])
+    egvs.run(scenario, tmp_path)
+    scene = egvs.build_scene(scenario)
     far = Pose(-12.0, -2.0, 1.0)  # behind the car that comes along y = -2, beyond every site
     scan = Scanner(scene).scan(far, scene.sensor("small"))
-    plain = Scorer(pipeline.build_scene(pipeline.load(mini)), pipeline.read_tpog(tmp_path / "tpog.parquet"))
+    plain = Scorer(egvs.build_scene(egvs.load(mini)), egvs.read_tpog(tmp_path / "tpog.parquet"))
     assert 0 < scorer_of(scene, tmp_path).score(scan).egvs < plain.score(scan).egvs

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from pipeline.core.grid import Grid
-from pipeline.scoring.thinning import TOLERANCE, ByRange, RangeTable
+from egvs.core.grid import Grid
+from egvs.scoring.visibility import TOLERANCE, ByRange, RangeTable
 
 GRID = Grid((0.0, 0.0, 0.0), 0.5, (30, 20, 6))
 WHOLE = 2**32

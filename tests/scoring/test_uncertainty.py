@@ -13,36 +13,35 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import pipeline
-from pipeline.artefacts import tables
-from pipeline.artefacts.readers import SEPARABLE
-from pipeline.cli.results import ranking_table
-from pipeline.core.errors import InputError
-from pipeline.core.grid import Grid
-from pipeline.report.ranking import ScoredSite
-from pipeline.scoring import egvs, uncertainty
-from pipeline.scoring.egvs import EntropyField, binary_entropy
-from pipeline.scoring.leave_out import FEWEST, Groups, LeaveOut, group_sizes
-from pipeline.scoring.scorer import Scorer
-from pipeline.scoring.uncertainty import Estimate
-from pipeline.stages.base import Workspace
-from pipeline.stages.shared.scans import scans
-from pipeline.stages.shared.scene import scene_of
+import egvs
+from egvs.artefacts import parquet
+from egvs.artefacts.readers import DISTINCT_PROBABILITY
+from egvs.cli.run_tables import ranking_table
+from egvs.core.errors import InputError
+from egvs.core.grid import Grid
+from egvs.report.ranking import RankedSite
+from egvs.scoring import egvs as scoring_egvs
+from egvs.scoring import standard_errors
+from egvs.scoring.egvs import EntropyField, binary_entropy
+from egvs.scoring.scorer import Scorer
+from egvs.scoring.standard_errors import MIN_GROUPS, BlockGroups, BlockJackknife, ScoreUncertainty, group_sizes
+from egvs.stages.inputs import get_scene, open_folder
+from egvs.stages.site_scoring import empty_scans
 
 GRID = Grid.from_json({"origin_m": [0.0, 0.0, 0.0], "voxel_m": 1.0, "shape": [6, 5, 2]})
 CELLS = np.arange(60)
 
 
-def record(frames: np.ndarray, memory: float = 0.0) -> tuple[Groups, ...]:
+def record(frames: np.ndarray, memory: float = 0.0) -> tuple[BlockGroups, ...]:
     """One record's groups; without a memory nothing is widened."""
-    return (Groups(frames, memory),)
+    return (BlockGroups(frames, memory),)
 
 
-def left_out_of(blocks: np.ndarray, block_frames: int, cells: np.ndarray = CELLS) -> LeaveOut:
+def left_out_of(blocks: np.ndarray, block_frames: int, cells: np.ndarray = CELLS) -> BlockJackknife:
     """From the counts of blocks, (blocks, n), joined to groups."""
     sizes = group_sizes(len(blocks))
     counts = np.array([part.sum(axis=0) for part in np.split(blocks, np.cumsum(sizes)[:-1])]).astype(np.uint32)
-    return LeaveOut.from_counts(counts, cells, Groups(block_frames * np.array(sizes), 0.0), GRID)
+    return BlockJackknife.from_counts(counts, cells, BlockGroups(block_frames * np.array(sizes), 0.0), GRID)
 
 
 def random_counts(blocks: int, block_frames: int = 20) -> np.ndarray:
@@ -92,7 +91,7 @@ def left_out_means(values: np.ndarray, frames: np.ndarray) -> np.ndarray:
 
 def test_of_a_mean_it_is_the_textbook_s_standard_error_without_bias() -> None:
     values = np.random.default_rng(5).normal(10.0, 2.0, size=(12, 3))
-    found = Estimate.of(left_out_means(values, np.full(12, 50)), record(np.full(12, 50)))
+    found = ScoreUncertainty.of(left_out_means(values, np.full(12, 50)), record(np.full(12, 50)))
     assert found.strata[0].joined == 1
     assert found.se == pytest.approx(values.std(axis=0, ddof=1) / np.sqrt(12))
     assert found.bias == pytest.approx(np.zeros(3), abs=1e-9)
@@ -104,7 +103,7 @@ def test_unequal_groups_weigh_by_their_frames() -> None:
     errors, said = [], []
     for _ in range(400):
         values = rng.normal(0.0, 1.0, size=(10, 1)) / np.sqrt(frames[:, None])
-        found = Estimate.of(left_out_means(values, frames), record(frames))
+        found = ScoreUncertainty.of(left_out_means(values, frames), record(frames))
         errors.append(found.scores[0])
         said.append(found.se[0] ** 2)
     assert np.sqrt(np.mean(said)) == pytest.approx(np.std(errors), rel=0.1)
@@ -113,7 +112,7 @@ def test_unequal_groups_weigh_by_their_frames() -> None:
 def test_chances_add_up_and_equal_sites_are_even() -> None:
     values = np.random.default_rng(7).normal(0.0, 1.0, size=(10, 3))
     values[:, 2] = values[:, 0]
-    found = Estimate.of(left_out_means(values, np.full(10, 5)), record(np.full(10, 5)))
+    found = ScoreUncertainty.of(left_out_means(values, np.full(10, 5)), record(np.full(10, 5)))
     a, b = np.array([0, 1, 0]), np.array([1, 0, 2])
     chances = found.beats(a, b)
     assert chances[0] + chances[1] == pytest.approx(1.0)
@@ -126,7 +125,10 @@ def test_a_site_s_error_knows_nothing_of_the_others() -> None:
     values = np.random.default_rng(8).normal(0.0, 1.0, size=(10, 5))
     rows = left_out_means(values, np.full(10, 5))
     order = [3, 0, 4, 1, 2]
-    one, other = Estimate.of(rows, record(np.full(10, 5))), Estimate.of(rows[order], record(np.full(10, 5)))
+    one, other = (
+        ScoreUncertainty.of(rows, record(np.full(10, 5))),
+        ScoreUncertainty.of(rows[order], record(np.full(10, 5))),
+    )
     assert one.strata[0].joined == other.strata[0].joined == 1
     assert (one.se[order] == other.se).all()
 
@@ -140,21 +142,22 @@ def wandering(groups: int, memory: float, seed: int) -> np.ndarray:
 
 
 def test_groups_too_short_for_the_traffic_are_joined_or_warned_of() -> None:
-    patient = [Estimate.of(wandering(16, 0.9, seed), record(np.full(16, 10))) for seed in range(60)]
+    patient = [ScoreUncertainty.of(wandering(16, 0.9, seed), record(np.full(16, 10))) for seed in range(60)]
     assert np.mean([e.strata[0].joined > 1 for e in patient]) > 0.8
-    assert all(e.groups >= FEWEST for e in patient)
-    few = [Estimate.of(wandering(7, 0.97, seed), record(np.full(7, 10))) for seed in range(200)]
+    assert all(e.groups >= MIN_GROUPS for e in patient)
+    few = [ScoreUncertainty.of(wandering(7, 0.97, seed), record(np.full(7, 10))) for seed in range(200)]
     warned = [e for e in few if e.strata[0].still_alike]
     assert warned
-    doubts = [uncertainty.doubts(e, "scenario.toml: traffic.frames", 0.5) for e in warned]
-    assert all("neighbouring groups of 10 frames are alike" in doubt.found for (doubt,) in doubts)
-    assert {doubt.cure for (doubt,) in doubts} == {"at least 140 frames, better 560"}
+    doubts = [standard_errors.uncertainty_warnings(e, "scenario.toml: traffic.frames", 0.5) for e in warned]
+    assert all("neighbouring blocks of 10 frames are correlated" in doubt.problem for (doubt,) in doubts)
+    assert {doubt.hint for (doubt,) in doubts} == {"Record at least 140 frames, better 560."}
     own = {"night": "scenario.toml: traffic.periods (night).length_s"}
-    (doubt,) = uncertainty.doubts(warned[0], "scenario.toml: traffic.frames", 0.5, ["night"], own)
-    assert (doubt.place, doubt.cure) == (own["night"], "length_s of at least 70, better 280")
-    (doubt,) = uncertainty.doubts(warned[0], "scenario.toml: traffic.frames", 0.5, ["day"], own)
-    assert (doubt.place, doubt.cure) == ("scenario.toml: traffic.frames (day)", "at least 140 frames, better 560")
-    honest = [Estimate.of(wandering(16, 0.0, seed), record(np.full(16, 10))) for seed in range(200)]
+    (doubt,) = standard_errors.uncertainty_warnings(warned[0], "scenario.toml: traffic.frames", 0.5, ["night"], own)
+    assert (doubt.where, doubt.hint) == (own["night"], "Set length_s to at least 70, better 280.")
+    (doubt,) = standard_errors.uncertainty_warnings(warned[0], "scenario.toml: traffic.frames", 0.5, ["day"], own)
+    assert doubt.where == "scenario.toml: traffic.frames (day)"
+    assert doubt.hint == "Record at least 140 frames, better 560."
+    honest = [ScoreUncertainty.of(wandering(16, 0.0, seed), record(np.full(16, 10))) for seed in range(200)]
     assert np.mean([e.strata[0].joined > 1 for e in honest]) < 0.1
 
 
@@ -181,7 +184,9 @@ def occupied(runs: int, chains: int, frames: int, rng: np.random.Generator) -> t
 def test_intervals_cover_the_truth_as_often_as_they_say(
     blocks: int, frames: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(egvs, "_n_ln_n", functools.cache(egvs._n_ln_n))  # asked for 2,400 numbers, 200,000 times
+    monkeypatch.setattr(
+        scoring_egvs, "_n_ln_n", functools.cache(scoring_egvs._n_ln_n)
+    )  # asked for 2,400 numbers, 200,000 times
     rng = np.random.default_rng(20)
     runs, chains = 200, 60
     states, p = occupied(runs, chains, frames, rng)
@@ -192,7 +197,7 @@ def test_intervals_cover_the_truth_as_often_as_they_say(
     held, ses, scores = [], [], []
     for run in counts:
         leave_out = left_out_of(run, frames // blocks)
-        found = Estimate.of(np.array([leave_out.scores(w, 10.0) for w in weights]), leave_out.groups)
+        found = ScoreUncertainty.of(np.array([leave_out.scores(w, 10.0) for w in weights]), leave_out.groups)
         low, high = found.intervals().T
         held.append((low <= truth) & (truth <= high))
         ses.append(found.se)
@@ -203,28 +208,28 @@ def test_intervals_cover_the_truth_as_often_as_they_say(
 
 
 def test_scores_say_how_sure_they_are(mini: Path, tmp_path: Path) -> None:
-    scenario = pipeline.load(mini)
-    record = pipeline.run(scenario, tmp_path / "out")
-    rows = pipeline.read_scores(tmp_path / "out" / "scores.parquet").to_pylist()
+    scenario = egvs.load(mini)
+    record = egvs.run(scenario, tmp_path / "out")
+    rows = egvs.read_scores(tmp_path / "out" / "scores.parquet").to_pylist()
     assert all(row["egvs_se"] > 0 and row["egvs_bias"] < 0 for row in rows)
     assert sorted(row["beats_next"] for row in rows)[-1] == 1.0
-    assert record.stages["score"].summary["standard_errors_from"] == "4 groups of 10 frames, widened by 5%"
-    leave_out = LeaveOut.of(tmp_path / "out" / "tpog.parquet", pipeline.read_tpog(tmp_path / "out" / "tpog.parquet"))
+    assert record.stages["score"].summary["standard_errors_from"] == "4 blocks of 10 frames (+5 % for autocorrelation)"
+    leave_out = BlockJackknife.of(tmp_path / "out" / "tpog.parquet", egvs.read_tpog(tmp_path / "out" / "tpog.parquet"))
     assert leave_out is not None
-    work, tpog = Workspace(scenario, tmp_path / "out"), pipeline.read_tpog(tmp_path / "out" / "tpog.parquet")
-    scorer = Scorer(scene_of(work), tpog, leave_out=leave_out)
-    for scan, row in zip(scans(work), rows, strict=True):
+    work, tpog = open_folder(scenario, tmp_path / "out"), egvs.read_tpog(tmp_path / "out" / "tpog.parquet")
+    scorer = Scorer(get_scene(work), tpog, leave_out=leave_out)
+    for scan, row in zip(empty_scans(work), rows, strict=True):
         assert scorer.score(scan.beams).left_out[0] == pytest.approx(row["egvs"], rel=1e-12)
 
 
 def test_many_blocks_are_joined_as_they_are_read(mini: Path, tmp_path: Path) -> None:
     """Group by group, what is read from the file is what the blocks add up to."""
-    pipeline.run(pipeline.load(mini, ["traffic.frames=40", "tpog.blocks=40"]), tmp_path)
+    egvs.run(egvs.load(mini, ["traffic.frames=40", "tpog.blocks=40"]), tmp_path)
     path = tmp_path / "tpog.parquet"
-    tpog, table = pipeline.read_tpog(path), tables.read(path, "tpog")[0].to_pydict()
+    tpog, table = egvs.read_tpog(path), parquet.read_artefact(path, "tpog")[0].to_pydict()
     dense = np.zeros((40, *tpog.grid.shape), dtype=np.int64)
     dense[tuple(table[name] for name in ("block", "ix", "iy", "iz"))] = table["count"]
-    leave_out = LeaveOut.of(path, tpog)
+    leave_out = BlockJackknife.of(path, tpog)
     assert leave_out is not None
     assert leave_out.groups[0].frames.tolist() == [10] * 4  # two cars that drive through are remembered
     weights = np.arange(tpog.counts.size, dtype=np.uint32) % 7
@@ -236,21 +241,21 @@ def test_many_blocks_are_joined_as_they_are_read(mini: Path, tmp_path: Path) -> 
 
 
 def test_a_block_that_does_not_exist_is_refused(mini: Path, tmp_path: Path) -> None:
-    pipeline.run(pipeline.load(mini), tmp_path)
+    egvs.run(egvs.load(mini), tmp_path)
     path = tmp_path / "tpog.parquet"
-    table, about = tables.read(path, "tpog")
+    table, about = parquet.read_artefact(path, "tpog")
     columns = {name: table.column(name).to_numpy() for name in table.column_names}
-    tables.write(path, "tpog", columns | {"block": np.full(len(table), 4, dtype=np.uint16)}, about)
+    parquet.write_artefact(path, "tpog", columns | {"block": np.full(len(table), 4, dtype=np.uint16)}, about)
     with pytest.raises(InputError, match="block 4 of 4; 0 to 3"):
-        LeaveOut.of(path, pipeline.read_tpog(path))
+        BlockJackknife.of(path, egvs.read_tpog(path))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("change", ["score.standard_error=false", "tpog.blocks=1"])
 def test_without_errors_the_scores_are_the_same(mini: Path, tmp_path: Path, change: str) -> None:
-    pipeline.run(pipeline.load(mini), tmp_path / "with")
-    pipeline.run(pipeline.load(mini, [change]), tmp_path / "without")
-    table, plain = (pipeline.read_scores(tmp_path / name / "scores.parquet") for name in ("with", "without"))
+    egvs.run(egvs.load(mini), tmp_path / "with")
+    egvs.run(egvs.load(mini, [change]), tmp_path / "without")
+    table, plain = (egvs.read_scores(tmp_path / name / "scores.parquet") for name in ("with", "without"))
     assert set(table.column_names) - set(plain.column_names) == {
         "egvs_se",
         "egvs_bias",
@@ -258,17 +263,17 @@ def test_without_errors_the_scores_are_the_same(mini: Path, tmp_path: Path, chan
         "expected_detections_se",
     }
     assert table.select(plain.column_names) == plain
-    assert ranking_table(ScoredSite.all_of(plain)).caption is None
+    assert ranking_table(RankedSite.all_of(plain)).caption is None
 
 
-def test_the_ranking_marks_neighbours_that_are_not_separable(mini: Path, tmp_path: Path, egvs) -> None:
+def test_the_ranking_marks_neighbours_that_are_not_separable(mini: Path, tmp_path: Path, run_egvs) -> None:
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m\npole_a,10,12,3\npole_b,30.5,-12,3\npole_c,10,12,3.001\n")
-    code, printed, _ = egvs("run", mini, "--out", tmp_path / "out")
+    code, printed, _ = run_egvs("run", mini, "--out", tmp_path / "out")
     assert code == 0
     assert "~ " in printed
     assert "not separable" in printed
-    rows = tables.read(tmp_path / "out" / "scores.parquet", "scores")[0].to_pylist()
-    unsure = [row["site"] for row in rows if row["beats_next"] < SEPARABLE]
+    rows = parquet.read_artefact(tmp_path / "out" / "scores.parquet", "scores")[0].to_pylist()
+    unsure = [row["site"] for row in rows if row["beats_next"] < DISTINCT_PROBABILITY]
     assert set(unsure) & {"pole_a", "pole_c"}
 
 
@@ -276,6 +281,6 @@ def test_an_empty_road_has_no_error() -> None:
     counts = np.zeros((4, 0), dtype=np.uint32)
     leave_out = left_out_of(counts, 10, np.empty(0, dtype=np.int64))
     scores = np.array([leave_out.scores(np.ones(60, dtype=np.uint32), 10.0) for _ in range(2)])
-    found = Estimate.of(scores, leave_out.groups)
+    found = ScoreUncertainty.of(scores, leave_out.groups)
     assert found.se.tolist() == [0.0, 0.0]
-    assert uncertainty.beats_next(found).tolist() == [0.5, 1.0]
+    assert standard_errors.beats_next(found).tolist() == [0.5, 1.0]

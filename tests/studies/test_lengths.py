@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-import pipeline
-from pipeline.scenario.models import Scenario
-from pipeline.studies import lengths, variants
+import egvs
+from egvs.scenario.model import Scenario
+from egvs.studies import study_settings
 
 TRAFFIC = """[traffic]
 network = "net.net.xml"
@@ -53,15 +53,15 @@ def frames_of(scenario: Scenario) -> list[int | None]:
 def test_each_period_is_watched_so_many_times_as_long(
     split: Path, times: float, period_s: float, overrides: tuple[str, ...], frames: list[int]
 ) -> None:
-    assert lengths.watched(pipeline.load(split), times, period_s) == (sum(frames), overrides)
+    assert study_settings.scale_traffic(egvs.load(split), times, period_s) == (sum(frames), overrides)
     period = [f"traffic.frame_period_s={period_s}"]
-    assert frames_of(pipeline.load(split, [*overrides, *period])) == frames
+    assert frames_of(egvs.load(split, [*overrides, *period])) == frames
 
 
 def test_the_reference_lasts_as_many_times_as_long_in_every_period(split: Path) -> None:
-    reference = variants.reference(pipeline.load(split), 8)
-    assert frames_of(pipeline.load(split, reference.overrides)) == [3200, 6400]
-    names = {setting.name for setting in variants._watched(pipeline.load(split))}
+    reference = study_settings.reference_setting(egvs.load(split), 8)
+    assert frames_of(egvs.load(split, reference.overrides)) == [3200, 6400]
+    names = {setting.name for setting in study_settings._traffic_settings(egvs.load(split))}
     assert {"240 frames", "2400 frames", "4800 frames, step 0.5 s"} <= names | {"240 frames"}
     assert "1200 frames" not in names
 
@@ -71,9 +71,9 @@ def test_periods_of_finished_files_are_neither_lengthened_nor_cut(mini: Path) ->
     day, night = ('name = "a"\nlength_s = 12\n', 'name = "b"\nbegin_s = 12\nlength_s = 8\n')
     rows = f"[[traffic.periods]]\n{day}\n[[traffic.periods]]\n{night}"
     file.write_text(file.read_text().replace("[[traffic.kinds]]", f"{rows}\n[[traffic.kinds]]", 1))
-    scenario = pipeline.load(mini)
-    assert lengths.is_finished(scenario)
-    assert lengths.counted_frames(scenario) == 24 + 16
-    assert lengths.watched(scenario, 2, 0.5) == (0, ())
-    assert lengths.watched(scenario, 1, 0.5) == (40, ())
-    assert list(variants._watched(scenario)) == []
+    scenario = egvs.load(mini)
+    assert study_settings.is_finished(scenario)
+    assert study_settings.counted_frames(scenario) == 24 + 16
+    assert study_settings.scale_traffic(scenario, 2, 0.5) == (0, ())
+    assert study_settings.scale_traffic(scenario, 1, 0.5) == (40, ())
+    assert list(study_settings._traffic_settings(scenario)) == []

@@ -6,19 +6,19 @@ from dataclasses import fields
 
 import pytest
 
-from pipeline.studies.comparison import Row
-from pipeline.studies.pareto_figure import make_figure
-from pipeline.studies.variants import APPROXIMATES, MEASURES, SCENARIO
+from egvs.studies.pareto_figure import make_figure
+from egvs.studies.score_errors import SettingResult
+from egvs.studies.study_settings import APPROXIMATES, MEASURES, SCENARIO
 
 
-def row(setting: str, kind: str, knob: str, seconds: float, judged: float, **more: object) -> Row:
-    values = {field.name: 0 for field in fields(Row)} | {"tau": 0.9, "regret": 0.1}
-    return Row(
+def row(setting: str, kind: str, knob: str, seconds: float, judged: float, **more: object) -> SettingResult:
+    values = {field.name: 0 for field in fields(SettingResult)} | {"tau": 0.9, "regret": 0.1}
+    return SettingResult(
         **{**values, "setting": setting, "kind": kind, "knob": knob, "seconds": seconds, "judged": judged, **more}
     )
 
 
-def settings(seconds: float, judged: float) -> list[Row]:
+def settings(seconds: float, judged: float) -> list[SettingResult]:
     """Settings on a front from 1 s and 10 % to 32 s and 0.3 %, and the scenario's own somewhere."""
     knobs = ("frames", "step", "grid", "period", "azimuth", "channels")
     front = [row(f"{250 << i} frames", APPROXIMATES, knobs[i], 2.0**i, 0.1 / 2**i, front=True) for i in range(6)]

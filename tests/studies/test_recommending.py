@@ -6,16 +6,16 @@ from dataclasses import fields
 
 import pytest
 
-from pipeline.studies import comparison
-from pipeline.studies.comparison import Row
+from egvs.studies import score_errors
+from egvs.studies.score_errors import SettingResult
 
 BLANK = {"str": "", "float": 0.0, "int": 0, "bool": False}
 
 
-def row(setting: str, seconds: float, judged: float = 0.01, **more: object) -> Row:
-    blank = {field.name: BLANK[str(field.type)] for field in fields(Row)}
+def row(setting: str, seconds: float, judged: float = 0.01, **more: object) -> SettingResult:
+    blank = {field.name: BLANK[str(field.type)] for field in fields(SettingResult)}
     kind = "scenario" if setting == "own" else "approximates"
-    return Row(**{**blank, "setting": setting, "kind": kind, "seconds": seconds, "judged": judged, **more})
+    return SettingResult(**{**blank, "setting": setting, "kind": kind, "seconds": seconds, "judged": judged, **more})
 
 
 @pytest.mark.parametrize(
@@ -30,6 +30,6 @@ def row(setting: str, seconds: float, judged: float = 0.01, **more: object) -> R
         ([row("own", 10.0, judged=0.03), row("usual", 9.0, judged=0.03, default=True)], None),
     ],
 )
-def test_what_saves_less_than_a_fifth_is_not_worth_a_command(rows: list[Row], right: str | None) -> None:
-    chosen = [found.setting for found in comparison.judge(rows, 0.02) if found.recommended]
+def test_what_saves_less_than_a_fifth_is_not_worth_a_command(rows: list[SettingResult], right: str | None) -> None:
+    chosen = [found.setting for found in score_errors.mark_pareto_front(rows, 0.02) if found.recommended]
     assert chosen == ([] if right is None else [right])

@@ -12,30 +12,30 @@ import pytest
 from rich.console import Console
 from scipy.stats import kendalltau
 
-import pipeline
-from pipeline.cli.studies import comparison_tables
-from pipeline.core.errors import InputError
-from pipeline.core.reading.seals import sealed
-from pipeline.studies import run_comparison
-from pipeline.studies.run_comparison import SiteResult, compare
+import egvs
+from egvs.cli import study_tables
+from egvs.core.errors import InputError
+from egvs.core.files import add_checksum
+from egvs.studies import run_comparison
+from egvs.studies.run_comparison import SiteResult, compare_runs
 
 
 @pytest.fixture
 def two(mini: Path, tmp_path: Path) -> tuple[Path, Path]:
     """The small scenario, and the same with another gamma and a third site in the place of the second."""
     first, second = tmp_path / "first", tmp_path / "second"
-    pipeline.run(pipeline.load(mini), first)
+    egvs.run(egvs.load(mini), first)
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m\npole_a,10,12,3.5\npole_c,12,12,3\n")
-    pipeline.run(pipeline.load(mini, ["score.gamma=2", "seed=8"]), second)
+    egvs.run(egvs.load(mini, ["score.gamma=2", "seed=8"]), second)
     return first, second
 
 
 def test_scores_shares_ranks_and_settings_are_those_of_the_runs(two: tuple[Path, Path]) -> None:
-    found = compare(two)
+    found = compare_runs(two)
     assert [run.label for run in found.runs] == ["A", "B"]
     assert set(found.sites) == {"pole_a", "pole_b", "pole_c"}
     for run, folder in zip(found.runs, two, strict=True):
-        for row in pipeline.read_scores(folder / "scores.parquet").to_pylist():
+        for row in egvs.read_scores(folder / "scores.parquet").to_pylist():
             site = run.sites[row["site"]]
             assert (site.egvs, site.rank, site.egvs_se) == (row["egvs"], row["rank"], row["egvs_se"])
             assert site.share == pytest.approx(row["egvs"] / row["egvs_limit"])
@@ -54,7 +54,7 @@ def test_scores_shares_ranks_and_settings_are_those_of_the_runs(two: tuple[Path,
 
 
 def test_a_run_beside_itself_agrees_and_differs_in_nothing(two: tuple[Path, Path]) -> None:
-    found = compare([two[0], two[0]])
+    found = compare_runs([two[0], two[0]])
     (pair,) = found.agreements
     assert (pair.tau, pair.rho, pair.regret_a) == pytest.approx((1.0, 1.0, 0.0))
     assert (found.differences, found.notes) == ((), ())
@@ -65,20 +65,20 @@ def test_runs_agree_by_the_scores_that_rank_them(mini: Path, tmp_path: Path, cap
     rows = "".join(f"p{n},{4 + 7 * n},{12 - 24 * (n % 2)},{2 + n}\n" for n in range(5))
     (mini / "sites.csv").write_text(f"site,x_m,y_m,z_m\n{rows}")
     for name, by in (("a", "egvs"), ("b", "seen_well"), ("c", "seen_well")):
-        pipeline.run(pipeline.load(mini, [f"score.rank_by={by}"]), tmp_path / name)
-    found = compare([tmp_path / name for name in "abc"])
-    scores = [pipeline.read_scores(tmp_path / name / "scores.parquet").to_pydict() for name in "ab"]
+        egvs.run(egvs.load(mini, [f"score.rank_by={by}"]), tmp_path / name)
+    found = compare_runs([tmp_path / name for name in "abc"])
+    scores = [egvs.read_scores(tmp_path / name / "scores.parquet").to_pydict() for name in "ab"]
     assert found.agreements[0].tau == pytest.approx(kendalltau(scores[0]["egvs"], scores[1]["seen_well"]).statistic)
     assert found.agreements[2].tau == pytest.approx(1.0)
     assert found.notes == tuple(f"A ranks by egvs, {other} by seen_well: compare ranks alone" for other in "BC")
-    comparison_tables.print_comparison(found)
+    study_tables.print_comparison(found)
     told = capsys.readouterr().out
     assert "B seen well" in told
     assert all(f"{value:.1%}" in told for value in scores[1]["seen_well"])
 
 
-def row(site: str, egvs: float, rank: int) -> SiteResult:
-    return SiteResult(site, (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, "s"), 135.5, 34.6, egvs, None, rank, egvs / 100)
+def row(site: str, run_egvs: float, rank: int) -> SiteResult:
+    return SiteResult(site, (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, "s"), 135.5, 34.6, run_egvs, None, rank, run_egvs / 100)
 
 
 def test_agreement_by_hand() -> None:
@@ -96,20 +96,20 @@ def test_agreement_by_hand() -> None:
     assert pair.regret_a == pytest.approx(0.25)
 
 
-def test_runs_that_share_no_site_are_told(two: tuple[Path, Path], mini: Path, tmp_path: Path, egvs) -> None:
+def test_runs_that_share_no_site_are_told(two: tuple[Path, Path], mini: Path, tmp_path: Path, run_egvs) -> None:
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m\nlamp,10,12,3\n")
-    pipeline.run(pipeline.load(mini), tmp_path / "third")
-    code, printed, _ = egvs("compare", two[0], tmp_path / "third")
+    egvs.run(egvs.load(mini), tmp_path / "third")
+    code, printed, _ = run_egvs("compare", two[0], tmp_path / "third")
     assert code == 0
     assert "note: A and B share no site: their rankings cannot be held against each other" in printed
 
 
-def test_the_command_line_prints_it(two: tuple[Path, Path], egvs) -> None:
-    code, printed, _ = egvs("compare", *two)
+def test_the_command_line_prints_it(two: tuple[Path, Path], run_egvs) -> None:
+    code, printed, _ = run_egvs("compare", *two)
     assert code == 0
     for part in ("A bit", "B rank", "score.gamma", "note: 1 site has the same name", str(two[0])):
         assert part in printed
-    code, printed, _ = egvs("compare", two[0], two[0], "--top", 1)
+    code, printed, _ = run_egvs("compare", two[0], two[0], "--top", 1)
     assert "their settings and files are the same" in printed
     assert "pole_a" not in printed or "pole_b" not in printed.split("runs")[0]
 
@@ -130,8 +130,8 @@ def test_tables_fit_the_terminal(width: int, runs: int, monkeypatch: pytest.Monk
         (),
     )
     console = Console(width=width, record=True)
-    monkeypatch.setattr(comparison_tables, "console", lambda *_, **__: console)
-    comparison_tables.print_comparison(found)
+    monkeypatch.setattr(study_tables, "console", lambda *_, **__: console)
+    study_tables.print_comparison(found)
     lines = console.export_text().splitlines()
     assert max(map(len, lines)) <= width
     assert sum("123456.7" in line for line in lines) >= 1  # no number is cut
@@ -144,18 +144,18 @@ def test_tables_fit_the_terminal(width: int, runs: int, monkeypatch: pytest.Monk
 def test_a_row_that_a_run_lacks_is_told_once_and_by_its_name(
     mini: Path,
     tmp_path: Path,
-    egvs,  # type: ignore[no-untyped-def]
+    run_egvs,  # type: ignore[no-untyped-def]
 ) -> None:
-    pipeline.run(pipeline.load(mini), tmp_path / "first")
+    egvs.run(egvs.load(mini), tmp_path / "first")
     file = mini / "scenario.toml"
     van = '[[traffic.kinds]]\nname = "van"\nlength_m = 5\nwidth_m = 2\nheight_m = 2\n'
     file.write_text(
         file.read_text().replace("[statics]", f"{van}\n[statics]").replace("length_m = 4.5", "length_m = 4.4")
     )
-    pipeline.run(pipeline.load(mini), tmp_path / "second")
-    found = {d.what: d.values for d in compare([tmp_path / "first", tmp_path / "second"]).differences}
+    egvs.run(egvs.load(mini), tmp_path / "second")
+    found = {d.what: d.values for d in compare_runs([tmp_path / "first", tmp_path / "second"]).differences}
     assert found == {"traffic.kinds[car].length_m": (4.5, 4.4), "traffic.kinds[van]": (None, "there")}
-    _, printed, _ = egvs("compare", tmp_path / "first", tmp_path / "second")
+    _, printed, _ = run_egvs("compare", tmp_path / "first", tmp_path / "second")
     assert "traffic.kinds[car].length_m" in printed
 
 
@@ -163,8 +163,8 @@ def test_a_row_that_a_run_lacks_is_told_once_and_by_its_name(
 def test_an_effect_that_a_run_lacks_is_told_by_its_parameters_alone(mini: Path, tmp_path: Path) -> None:
     folders = tmp_path / "plain", tmp_path / "rain"
     for folder, named in zip(folders, ([], ["effects.rain.rate_mm_h=30"]), strict=True):
-        pipeline.run(pipeline.load(mini, named), folder)
-    assert [(one.what, one.values) for one in compare(folders).differences] == [
+        egvs.run(egvs.load(mini, named), folder)
+    assert [(one.what, one.values) for one in compare_runs(folders).differences] == [
         ("effects.rain.rate_mm_h", (None, 30.0))
     ]
 
@@ -187,14 +187,14 @@ def test_letters_go_on_after_z() -> None:
 
 def test_what_is_no_finished_run_is_refused(two: tuple[Path, Path], tmp_path: Path) -> None:
     with pytest.raises(InputError, match="1 run; two or more folders of finished runs"):
-        compare(two[:1])
-    with pytest.raises(InputError, match=r"run\.json: no such file; a folder that egvs run has written"):
-        compare([two[0], tmp_path / "nowhere"])
+        compare_runs(two[:1])
+    with pytest.raises(InputError, match=r"run\.json: no such file. Name a folder that egvs run has written."):
+        compare_runs([two[0], tmp_path / "nowhere"])
     record = json.loads((two[1] / "run.json").read_text())
     (two[1] / "scores.parquet").write_bytes((two[0] / "scores.parquet").read_bytes())
     with pytest.raises(InputError, match="is not what the run in its folder made"):
-        compare(two)
+        compare_runs(two)
     del record["stages"]["score"]
-    (two[1] / "run.json").write_text(json.dumps(sealed(record)))
+    (two[1] / "run.json").write_text(json.dumps(add_checksum(record)))
     with pytest.raises(InputError, match="the stage score is not done; a finished run"):
-        compare(two)
+        compare_runs(two)

@@ -2,9 +2,9 @@
 
 import pytest
 
-from pipeline.artefacts import tables
-from pipeline.stages import traffic
-from pipeline.traffic import sumo
+from egvs.artefacts import parquet
+from egvs.stages import traffic
+from egvs.traffic import sumo
 from tests.stages import run_stage
 from tests.traffic.helpers import SMALL, netgenerate, scenario
 
@@ -25,7 +25,7 @@ def recorded(town, tmp_path_factory):
     """The stage's result, table and folder for the town's drawn traffic."""
     out = tmp_path_factory.mktemp("recorded")
     result = run_stage(traffic, scenario(town, network="net.xml", **SMALL), out)
-    table, metadata = tables.read(out / "trajectories.parquet", "trajectories")
+    table, metadata = parquet.read_artefact(out / "trajectories.parquet", "trajectories")
     return result, table, metadata, out
 
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pyarrow as pa
 
-from pipeline.scenario.loading import from_values
-from pipeline.scenario.traffic import TrafficModel, VehicleKind
-from pipeline.traffic import fcd, sumo
-from pipeline.traffic.boxes import Size
-from pipeline.traffic.frames import FrameGroup
+from egvs.scenario.loading import scenario_from_dict
+from egvs.scenario.traffic_config import TrafficConfig, VehicleKind
+from egvs.traffic import fcd, sumo
+from egvs.traffic.fcd import FrameGroup
+from egvs.traffic.vehicle_boxes import VehicleSize
 
 SMALL = {"vehicles": 12, "frames": 240, "warmup_s": 60.0, "trips_per_s": 1.0}
 
@@ -21,12 +21,12 @@ def scenario(folder, seed=1, **keys):
         "sites": {"grid": {"low_m": [0, 0], "high_m": [1, 1], "spacing_m": 1, "heights_m": [3]}},
         "traffic": {"frame_period_s": 0.25, **keys},
     }
-    return from_values(values, folder, str(folder / "scenario.toml"))
+    return scenario_from_dict(values, folder, str(folder / "scenario.toml"))
 
 
 def netgenerate(folder, *flags, name="net.xml"):
     folder.mkdir(parents=True, exist_ok=True)
-    sumo.run("netgenerate", [*flags, "-o", name], folder)
+    sumo.run_program("netgenerate", [*flags, "-o", name], folder)
     return folder / name
 
 
@@ -35,11 +35,11 @@ def group_of(rows):
     frame, names, types, x, y, angle, speed = zip(*rows, strict=True)
     frame = np.array(frame, dtype=np.int64)
     numbers = [np.array(v, dtype=float) for v in (x, y, np.zeros(len(rows)), angle, np.zeros(len(rows)), speed)]
-    table = pa.table([frame * 1000, pa.array(names), pa.array(types), *numbers], schema=fcd.SCHEMA)
+    table = pa.table([frame * 1000, pa.array(names), pa.array(types), *numbers], schema=fcd.FCD_SCHEMA)
     return FrameGroup(int(frame.min()), int(np.ptp(frame)) + 1, frame, table)
 
 
-SIZES = {"car": Size(4.0, 2.0, 1.5, "passenger"), "bus": Size(12.0, 2.5, 3.0, "bus")}
+SIZES = {"car": VehicleSize(4.0, 2.0, 1.5, "passenger"), "bus": VehicleSize(12.0, 2.5, 3.0, "bus")}
 
 
 def car(**keys):
@@ -47,4 +47,4 @@ def car(**keys):
 
 
 def drawn(**keys):
-    return TrafficModel(network="net.xml", **keys)
+    return TrafficConfig(network="net.xml", **keys)

@@ -5,11 +5,10 @@ import shutil
 import numpy as np
 import pytest
 
-from pipeline.core.errors import InputError, RunError
-from pipeline.scenario.loading import load
-from pipeline.stages import traffic
-from pipeline.traffic import network
-from pipeline.traffic.demand import trips as demand
+from egvs.core.errors import InputError, RunError
+from egvs.scenario.loading import load
+from egvs.stages import traffic
+from egvs.traffic import demand, network
 from tests.stages import run_stage
 from tests.traffic.helpers import car, drawn, scenario
 
@@ -23,8 +22,8 @@ SHORT = {"frames": 5, "warmup_s": 5.0, "frame_period_s": 0.25}
 @pytest.fixture
 def crowded(town, tmp_path):
     """A user's configuration: sixty cars that are all under way from the first second on."""
-    roads = network.read(town / "net.xml")
-    pairs = demand.pairs(roads, car(), drawn(min_trip_m=200), np.random.default_rng(0), "place")
+    roads = network.read_net_xml(town / "net.xml")
+    pairs = demand.origin_destination_pairs(roads, car(), drawn(min_trip_m=200), np.random.default_rng(0), "place")
     ends = [(roads.edges[o].id, roads.edges[t].id) for o, t in zip(pairs.origin, pairs.target, strict=True)]
     trips = (
         f'<trip id="t{i}" depart="0" departLane="free" departPos="random_free" from="{start}" to="{end}"/>'
@@ -52,7 +51,7 @@ def test_a_users_demand_is_capped_where_that_is_asked_for(crowded):
 
 
 def lane_km(town):
-    lanes = (lane for edge in network.read(town / "net.xml").edges for lane in edge.lanes)
+    lanes = (lane for edge in network.read_net_xml(town / "net.xml").edges for lane in edge.lanes)
     return sum(lane.length_m for lane in lanes) / 1000
 
 
@@ -76,11 +75,11 @@ def test_lanes_that_the_fleet_may_not_use_do_not_count(tmp_path):
     edges = "".join(f'<edge id="{id}" from="a" to="b">{lane.format(id, m, who)}</edge>' for id, m, who in roads)
     (tmp_path / "net.xml").write_text(f"<net>{edges}</net>")
     bus = car(name="coach", vclass="bus")
-    net, dense = network.read(tmp_path / "net.xml"), {"vehicles_per_lane_km": 40.0}
-    assert demand.vehicles_to_hold(drawn(kinds=(car(),), **dense), net) == 20
-    assert demand.vehicles_to_hold(drawn(kinds=(car(), bus), **dense), net) == 30
-    assert demand.vehicles_to_hold(drawn(kinds=(car(),), vehicles_per_lane_km=0.1), net) == 1
-    assert demand.vehicles_to_hold(drawn(vehicles=3), net) == 3
+    net, dense = network.read_net_xml(tmp_path / "net.xml"), {"vehicles_per_lane_km": 40.0}
+    assert demand.target_vehicle_count(drawn(kinds=(car(),), **dense), net) == 20
+    assert demand.target_vehicle_count(drawn(kinds=(car(), bus), **dense), net) == 30
+    assert demand.target_vehicle_count(drawn(kinds=(car(),), vehicles_per_lane_km=0.1), net) == 1
+    assert demand.target_vehicle_count(drawn(vehicles=3), net) == 3
 
 
 @pytest.mark.parametrize(

@@ -6,12 +6,11 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from pipeline.core.errors import InputError
-from pipeline.scenario.traffic import CountModel
-from pipeline.stages import traffic
-from pipeline.traffic import network
-from pipeline.traffic.demand import counts
-from pipeline.traffic.demand.ways import Ways
+from egvs.core.errors import InputError
+from egvs.scenario.traffic_config import CountConfig
+from egvs.stages import traffic
+from egvs.traffic import demand, network
+from egvs.traffic.demand import RouteFinder
 from tests.stages import run_stage
 from tests.traffic.helpers import drawn, netgenerate, scenario
 
@@ -53,7 +52,7 @@ def test_turning_movements_an_edge_and_a_kind_are_met(cross, tmp_path):
     assert [c["counted_per_h"] for c in met] == [300, 80, 120, 200, 60] and met[-1]["kind"] == "truck"
     assert all(c["geh"] < 5 for c in met), met
     assert [c["geh"] for c in met] == pytest.approx(
-        [counts.geh(c["counted_per_h"], c["simulated_per_h"]) for c in met], abs=0.011
+        [demand.geh(c["counted_per_h"], c["simulated_per_h"]) for c in met], abs=0.011
     )
     assert result["warnings"] == [] and "--max-num-vehicles" not in result["flags"]
     routes = (tmp_path / "sumo" / "trips.rou.xml").read_text()
@@ -81,7 +80,7 @@ def test_counts_that_the_lanes_cannot_carry_are_told(cross, tmp_path):
     warning, waiting = result["warnings"]
     assert (warning["rule"], waiting["rule"]) == ("counts", "waiting")
     assert not warning["is_error"]
-    assert re.search(r"1 of 1 counts are missed .*left0A0 to A0top0: \d+(\.\d)? for 9000", warning["found"])
+    assert re.search(r"misses 1 of 1 counts .*left0A0 to A0top0: \d+(\.\d)? instead of 9000", warning["problem"])
 
 
 @pytest.mark.slow
@@ -94,11 +93,11 @@ def test_frames_far_apart_change_no_rate(cross, tmp_path):
     assert met["simulated_per_h"] == pytest.approx(300, abs=8)  # 285 if divided by 20 minutes
 
 
-def test_a_kind_may_not_be_called_like_the_fleet(cross, tmp_path):
+def test_rejects_kind_called_fleet(cross, tmp_path):
     kinds = [KINDS[0] | {"name": "fleet"}, KINDS[1]]
     rows = [turn("left", "right", 300), turn("left", "right", 60, "fleet")]
     model = scenario(cross, network="net.xml", kinds=kinds, counts=rows, **LASTING)
-    with pytest.raises(InputError, match=r"counts \(left0A0 to A0right0\): a kind called 'fleet'; another name"):
+    with pytest.raises(InputError, match=r"counts \(left0A0 to A0right0\): a kind is called 'fleet'"):
         run_stage(traffic, model, tmp_path)
 
 
@@ -121,22 +120,22 @@ def test_what_drove_past_is_counted_by_edge_and_by_turn(tmp_path):
         {"edge": "a", "per_hour": 144}, {"edge": "b", "per_hour": 36}, {"edge": "b", "per_hour": 36, "kind": "truck"},
         {"from_edge": "a", "to_edge": "c", "per_hour": 0}, {"from_edge": "c", "to_edge": "a", "per_hour": 36},
     ]  # fmt: skip
-    model = drawn(counts=tuple(CountModel(**row) for row in wanted))
-    met = counts.met(model, tmp_path / "driven.xml", 100.0, 200.0)
+    model = drawn(counts=tuple(CountConfig(**row) for row in wanted))
+    met = demand.count_fits(model, tmp_path / "driven.xml", 100.0, 200.0)
     assert [c.simulated_per_h for c in met] == [36 * n for n in (3, 2, 1, 2, 1)]
 
 
 def test_geh_by_hand():
-    assert counts.geh(100, 100) == counts.geh(0, 0) == 0
-    assert counts.geh(400, 500) == pytest.approx((2 * 100**2 / 900) ** 0.5)
-    assert counts.geh(500, 400) == counts.geh(400, 500)
+    assert demand.geh(100, 100) == demand.geh(0, 0) == 0
+    assert demand.geh(400, 500) == pytest.approx((2 * 100**2 / 900) ** 0.5)
+    assert demand.geh(500, 400) == demand.geh(400, 500)
 
 
 def test_ways_over_a_place_are_no_detours(town):
-    roads = network.read(town / "net.xml")
-    ways = Ways(roads, "passenger")
+    roads = network.read_net_xml(town / "net.xml")
+    ways = RouteFinder(roads, "passenger")
     inner = next(edge for edge in roads.edges if (edge.from_node, edge.to_node) == ("A0", "A1"))
-    place = ways.place(inner.id, None, "place")
+    place = ways.locate(inner.id, None, "place")
     ends = {edge.id: (edge.from_node, edge.to_node) for edge in roads.edges}
     found = ways.candidates([place], drawn(), np.random.default_rng(1), "place")
     assert len(found) > 3
@@ -150,9 +149,9 @@ def test_ways_over_a_place_are_no_detours(town):
 def test_a_place_that_nothing_leads_to_is_a_way_by_itself(tmp_path):
     """A web of streets has no fringe; that no trip is to start there keeps no counted vehicle away."""
     netgenerate(tmp_path, "--spider", "--spider.arm-number", "3", "--spider.circle-number", "1")
-    roads = network.read(tmp_path / "net.xml")
-    ways, edge = Ways(roads, "passenger"), roads.edges[0].id
-    place = ways.place(edge, None, "place")
+    roads = network.read_net_xml(tmp_path / "net.xml")
+    ways, edge = RouteFinder(roads, "passenger"), roads.edges[0].id
+    place = ways.locate(edge, None, "place")
     for weights in ({}, {edge: 0.0}):
         assert ways.candidates([place], drawn(edge_weights=weights), np.random.default_rng(1), "place") == [(edge,)]
 
@@ -161,10 +160,10 @@ def test_a_place_that_nothing_leads_to_is_a_way_by_itself(tmp_path):
     ("rows", "message"),
     [
         ([{"edge": "nowhere", "per_hour": 1}], r"traffic\.counts \(nowhere\): the network has no edge 'nowhere'"),
-        ([turn("left", "right", 10, "tram")], r"counts \(left0A0 to .*\): the fleet has no kind 'tram'; .*car, truck"),
+        ([turn("left", "right", 10, "tram")], r"counts \(left0A0 to .*\): the fleet has no kind 'tram'.*car, truck"),
         (
             [{"from_edge": "A0top0", "to_edge": "left0A0", "per_hour": 5}],
-            r"\(A0top0 to left0A0\): no way leads from 'A0top0' to 'left0A0'",
+            r"\(A0top0 to left0A0\): there is no way from 'A0top0' to 'left0A0'",
         ),
         ([{"edge": "a", "to_edge": "b", "per_hour": 1}], r"either edge, or both from_edge and to_edge are needed"),
         ([{"to_edge": "b", "per_hour": 1}], r"either edge, or both from_edge and to_edge are needed"),
@@ -178,6 +177,6 @@ def test_a_place_that_nothing_leads_to_is_a_way_by_itself(tmp_path):
         ([{"edge": "a", "per_hour": 0}], r"counts: no vehicle was counted anywhere; at least one per_hour above 0"),
     ],
 )
-def test_a_wrong_count_is_named(cross, tmp_path, rows, message):
+def test_rejects_wrong_count(cross, tmp_path, rows, message):
     with pytest.raises(InputError, match=message):
         run_stage(traffic, counted(cross, rows), tmp_path)

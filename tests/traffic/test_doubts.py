@@ -4,11 +4,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from pipeline.core.grid import Roi
-from pipeline.stages import traffic
-from pipeline.traffic import boxes, network, recording, sumo_folder, tally, trajectories
-from pipeline.traffic.recording import Recording
-from pipeline.traffic.tally import TrafficTally
+from egvs.core.grid import Roi
+from egvs.stages import traffic
+from egvs.traffic import network, recording, sumo_folder, trajectories, vehicle_boxes
+from egvs.traffic.recording import Recording
+from egvs.traffic.trajectories import TrafficStatistics
 from tests.stages import run_stage
 from tests.traffic.helpers import SIZES, group_of, scenario
 
@@ -21,8 +21,8 @@ def recorded(**keys):
 
 
 def counted(rows, frames=300, on_purpose=frozenset()):
-    tally = TrafficTally(frames, on_purpose=on_purpose)
-    tally.add(boxes.from_bumpers(group_of(rows), SIZES, 1.0, "place"))
+    tally = TrafficStatistics(frames, stopped_on_purpose=on_purpose)
+    tally.add(vehicle_boxes.boxes_from_bumpers(group_of(rows), SIZES, 1.0, "place"))
     return tally
 
 
@@ -30,26 +30,26 @@ def test_who_stands_longer_than_a_signal_keeps_it_is_told_with_the_place():
     rows = [(f, "stuck", "car", 100, 62, 0, 0.0 if 10 <= f < 210 else 5.0) for f in range(300)]
     rows += [(f, "parked", "car", 0, 20 if f < 299 else 30, 0, 0.0) for f in range(300)]
     tally = counted(rows, on_purpose={"parked"})
-    (found,) = trajectories.doubts(tally, recorded(patience_s=180.0), ROI)
+    (found,) = trajectories.traffic_warnings(tally, recorded(patience_s=180.0), ROI)
     assert found.rule == "standing" and not found.is_error
-    assert found.place == "s.toml: traffic: x 100 m, y 60 m (76 m from the region of interest)"  # the box's centre
-    assert found.found.startswith("vehicle 'stuck' stood there for 199 s")
+    assert found.where == "s.toml: traffic: x 100 m, y 60 m (76 m from the region of interest)"  # the box's centre
+    assert found.problem.startswith("vehicle 'stuck' stood there for 199 s")
     assert tally.to_json(1.0)["longest_standing_s"] == 299
     short = counted([row for row in rows if row[0] < 130])
-    assert [d.rule for d in trajectories.doubts(short, recorded(patience_s=180.0), ROI)] == ["standing"]
+    assert [d.rule for d in trajectories.traffic_warnings(short, recorded(patience_s=180.0), ROI)] == ["standing"]
     brief = counted([row for row in rows if row[0] < 100])
-    assert trajectories.doubts(brief, recorded(patience_s=180.0), ROI) == []
-    assert trajectories.doubts(tally, recorded(), ROI) == []  # of a finished file nothing is promised
+    assert trajectories.traffic_warnings(brief, recorded(patience_s=180.0), ROI) == []
+    assert trajectories.traffic_warnings(tally, recorded(), ROI) == []  # of a finished file nothing is promised
 
 
 def test_overlaps_in_many_frames_are_told_where_most_are():
     rows = [(f, name, "car", 10.0, 31.0 + i, 0, 5.0) for f in range(20) for i, name in enumerate("ab")]
     rows += [(f, name, "car", 90.0, 31.0 + i, 0, 5.0) for f in range(5) for i, name in enumerate("cd")]
     rows += [(299, "e", "car", 0.0, 0.0, 0, 5.0)]
-    (found,) = trajectories.doubts(counted(sorted(rows)), recorded(), ROI)
+    (found,) = trajectories.traffic_warnings(counted(sorted(rows)), recorded(), ROI)
     assert found.rule == "overlaps"
-    assert found.place == "s.toml: traffic: x 10 m, y 30 m (in the region of interest)"
-    assert found.found == "vehicles overlap in 7% of the frames; 20 of 25 pairs do so there"
+    assert found.where == "s.toml: traffic: x 10 m, y 30 m (in the region of interest)"
+    assert found.problem == "vehicles overlap in 7% of the frames; 20 of 25 pairs do so there"
 
 
 COLLISION = '<collision time="{}" lane="{}" collider="{}" victim="{}"{}/>'
@@ -62,28 +62,28 @@ def test_collisions_are_told_with_junction_and_edge(tmp_path):
         ("13", "out_1", "e", "f", ' colliderFront="325,0,3"'), ("14", "old_1", "g", "h", ""),
     ]  # fmt: skip
     text = "".join(COLLISION.format(*one) for one in seen)
-    (tmp_path / sumo_folder.COLLISIONS).write_text(f"<collisions>{text}</collisions>")
+    (tmp_path / sumo_folder.COLLISIONS_FILE).write_text(f"<collisions>{text}</collisions>")
     prepared = SimpleNamespace(folder=tmp_path, timing=SimpleNamespace(first_ms=10_000))
     crashes = recording._collisions(prepared)
     assert len(crashes) == 4
-    (found,) = recording._crashed(crashes, scenario(tmp_path, network="net.xml"))
-    assert found.found == (
+    (found,) = recording._collision_warning(crashes, scenario(tmp_path, network="net.xml"))
+    assert found.problem == (
         "4 pairs of vehicles collided, and drove on through each other: 2 at junction J_1 (in the region of interest), "
         "1 at edge out (300 m from the region of interest), 1 at edge old"
     )
-    assert recording._crashed({}, scenario(tmp_path, network="net.xml")) == []
+    assert recording._collision_warning({}, scenario(tmp_path, network="net.xml")) == []
 
 
 def test_a_demand_that_does_not_fit_is_told(town, tmp_path):
     """Six hundred cars an hour too many for one street."""
-    roads = network.read(town / "net.xml")
+    roads = network.read_net_xml(town / "net.xml")
     way_in = next(edge for edge in roads.edges if edge.from_node.startswith("left"))
     flow = f'<flow id="f" begin="0" end="100" number="900" from="{way_in.id}" to="{way_in.id}"/>'
     (tmp_path / "own.rou.xml").write_text(f"<routes>{flow}</routes>")
     keys = {"network": str(town / "net.xml"), "routes": ["own.rou.xml"], "frames": 60, "warmup_s": 10.0}
     result = run_stage(traffic, scenario(tmp_path, **keys), tmp_path / "out")
     found = [warning for warning in result["warnings"] if warning["rule"] == "waiting"]
-    assert len(found) == 1 and "vehicles could not start to the end" in found[0]["found"]
+    assert len(found) == 1 and "vehicles could not start to the end" in found[0]["problem"]
     assert not (tmp_path / "out" / "sumo" / "statistics.xml").exists()
 
 
@@ -95,4 +95,4 @@ def test_a_demand_that_does_not_fit_is_told(town, tmp_path):
     ],
 )
 def test_a_place_is_told_with_its_distance(at_m, words):
-    assert tally.where(at_m, ROI) == words
+    assert trajectories.describe_location(at_m, ROI) == words

@@ -4,20 +4,19 @@ from dataclasses import replace
 
 import pytest
 
-from pipeline.artefacts import tables
-from pipeline.core.errors import InputError
-from pipeline.core.progress import silent
-from pipeline.effects.base import Traffic
-from pipeline.scenario.effects import EffectParameters
-from pipeline.stages import traffic
-from pipeline.traffic import recording, trajectories
-from pipeline.traffic.boxes import Size
-from pipeline.traffic.extensions import TrafficPlan
-from pipeline.world import world_frame
+from egvs.artefacts import parquet
+from egvs.core.errors import InputError
+from egvs.core.runtime import no_progress
+from egvs.effects.base import Traffic
+from egvs.scenario.effects_config import EffectParameters
+from egvs.stages import traffic
+from egvs.traffic import recording, trajectories
+from egvs.traffic.vehicle_boxes import ExtraTraffic, VehicleSize
+from egvs.world import geolocation
 from tests.stages import run_stage
 from tests.traffic.helpers import SMALL, scenario
 
-TRAM = Size(30.0, 2.4, 3.5, "tram")
+TRAM = VehicleSize(30.0, 2.4, 3.5, "tram")
 
 
 class Raised:
@@ -51,7 +50,7 @@ class Guests(Traffic):
         vtype = '<vType id="guest" vClass="passenger" length="30" width="2.4" height="3.5"/>'
         stop = f'<stop edge="{lane.id}" duration="9999" parking="true"/>'
         guest = f'<trip id="guest" type="guest" depart="0" from="{lane.id}" to="{lane.id}">{stop}</trip>'
-        return TrafficPlan(f"<routes>{vtype}{guest}</routes>", 1, (f"a guest from {begin_s:g} to {end_s:g} s",))
+        return ExtraTraffic(f"<routes>{vtype}{guest}</routes>", 1, (f"a guest from {begin_s:g} to {end_s:g} s",))
 
     def box_change(self, scenario, sizes):
         return Raised(sizes)
@@ -59,10 +58,12 @@ class Guests(Traffic):
 
 def recorded(scene, out, *acting):
     with (
-        recording.record(scene, out / "sumo", acting, silent, None, world_frame.of(scene)) as rows,
-        tables.writer(out / "trajectories.parquet", "trajectories") as file,
+        recording.record_traffic(
+            scene, out / "sumo", acting, no_progress, None, geolocation.scenario_georeference(scene)
+        ) as rows,
+        parquet.artefact_writer(out / "trajectories.parquet", "trajectories") as file,
     ):
-        tally, reports = trajectories.write(scene, rows, acting, file, silent)
+        tally, reports = trajectories.write_trajectories(scene, rows, acting, file, no_progress)
         file.describe({"schema": 1, "frames": 1})
         return tally.to_json(rows.window.period_ms / 1000.0), reports, rows.summary()
 
@@ -85,14 +86,14 @@ def test_an_extension_adds_traffic_that_does_not_count_and_changes_boxes(town, t
 def test_two_extensions_have_a_route_file_each_and_change_boxes_one_after_another(town, tmp_path):
     class Others(Guests):
         def plan(self, *arguments):
-            return TrafficPlan("<routes/>", 0)
+            return ExtraTraffic("<routes/>", 0)
 
     scene = scenario(town, network="net.xml", **SMALL)
     counts, _, summary = recorded(scene, tmp_path, Guests(EffectParameters()), Others(EffectParameters()))
     flags = " ".join(summary.flags)
     assert "trips.rou.xml,others.rou.xml,others1.rou.xml" in flags and "--max-num-vehicles 13" in flags
     assert counts["vehicles"]["most"] == 12
-    lifted = tables.read(tmp_path / "trajectories.parquet", "trajectories")[0]["z_m"].to_numpy()
+    lifted = parquet.read_artefact(tmp_path / "trajectories.parquet", "trajectories")[0]["z_m"].to_numpy()
     assert lifted.min() > 200 and lifted.max() < 202
 
 

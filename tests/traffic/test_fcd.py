@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.errors import InputError
-from pipeline.traffic import fcd
-from pipeline.traffic.frames import Window, groups
+from egvs.core.errors import InputError
+from egvs.traffic import fcd
+from egvs.traffic.fcd import FrameWindow, group_frames
 
 HEADER = "timestep_time;vehicle_id;vehicle_x;vehicle_y;vehicle_angle;vehicle_type;vehicle_speed"
 CSV = f"""{HEADER}
@@ -66,7 +66,7 @@ def parquet_bytes(name=b"b"):
 
 
 def read_all(path):
-    return pa.concat_tables([fcd.SCHEMA.empty_table(), *fcd.read(path)])
+    return pa.concat_tables([fcd.FCD_SCHEMA.empty_table(), *fcd.read_fcd(path)])
 
 
 @pytest.mark.parametrize("zipped", [False, True], ids=["plain", "gzipped"])
@@ -129,7 +129,7 @@ BAD = {
     "truncated Parquet": (parquet_bytes()[:-30], r"cannot be read as Parquet"),
     "Parquet with a name that is no text": (
         parquet_bytes().replace(b"vehicle_angle", b"vehicle\xffangle"),
-        r"cannot be read as Parquet \(it is no text in utf-8: byte 7 is 0xff\)",
+        r"cannot be read as Parquet \(it is no utf-8 text: byte 7 is 0xff\)",
     ),
     "Parquet with an id that is no text": (parquet_bytes(b"\xff"), r"cannot be read as Parquet \(.*UTF8"),
     "infinite speed": (
@@ -144,14 +144,14 @@ def test_damaged_file_is_refused(tmp_path, content, message):
     path = tmp_path / "bad.fcd"
     path.write_bytes(content)
     with pytest.raises(InputError, match=message) as caught:
-        list(fcd.read(path))
+        list(fcd.read_fcd(path))
     assert str(path) in str(caught.value)
     assert len(str(caught.value).splitlines()) == 1
 
 
 def test_missing_file_is_refused(tmp_path):
     with pytest.raises(InputError, match="no such file"):
-        list(fcd.read(tmp_path / "none.csv"))
+        list(fcd.read_fcd(tmp_path / "none.csv"))
 
 
 def steps(*times_s, vehicle="v"):
@@ -164,12 +164,12 @@ def steps(*times_s, vehicle="v"):
             pa.array(["car"] * n),
             *[zeros] * 6,
         ],
-        schema=fcd.SCHEMA,
+        schema=fcd.FCD_SCHEMA,
     )
 
 
 def picked(tables, window, each=2):
-    found = list(groups(tables, window, each, "place"))
+    found = list(group_frames(tables, window, each, "place"))
     assert [g.first_frame for g in found] == list(np.cumsum([0] + [g.frames for g in found[:-1]]))
     assert sum(g.frames for g in found) == window.count
     return [(int(f), t) for g in found for f, t in zip(g.frame, g.rows["time_ms"].to_pylist(), strict=True)]
@@ -177,7 +177,7 @@ def picked(tables, window, each=2):
 
 def test_warm_up_and_period_choose_the_time_steps():
     times = np.arange(25_200, 25_205, 0.25)
-    assert picked([steps(*times)], Window(3, 500, skip_ms=1000)) == [
+    assert picked([steps(*times)], FrameWindow(3, 500, skip_ms=1000)) == [
         (0, 25_201_000),
         (1, 25_201_500),
         (2, 25_202_000),
@@ -185,7 +185,7 @@ def test_warm_up_and_period_choose_the_time_steps():
 
 
 def test_an_empty_step_of_a_complete_recording_is_an_empty_frame():
-    window = Window(5, 1000, first_ms=1000, complete=True)
+    window = FrameWindow(5, 1000, first_ms=1000, complete=True)
     assert picked([steps(0, 1, 3)], window) == [(0, 1000), (2, 3000)]
     assert picked([], window) == []
 
@@ -194,17 +194,17 @@ def test_too_few_frames_are_counted():
     with pytest.raises(
         InputError, match=r"frames = 5: the file has 3 frames 1 s apart after a warm-up of 1 s \(4 time steps in all"
     ):
-        list(groups([steps(0, 1, 2, 3)], Window(5, 1000, skip_ms=1000), 10, "place"))
+        list(group_frames([steps(0, 1, 2, 3)], FrameWindow(5, 1000, skip_ms=1000), 10, "place"))
 
 
 def test_a_period_between_the_files_steps_is_refused():
     with pytest.raises(InputError, match=r"frame_period_s = 0.25: the file's time steps are 1 s apart"):
-        list(groups([steps(0, 1, 2, 3)], Window(2, 250), 10, "place"))
+        list(group_frames([steps(0, 1, 2, 3)], FrameWindow(2, 250), 10, "place"))
 
 
 def test_a_file_without_vehicles_is_refused():
     with pytest.raises(InputError, match="holds no vehicle"):
-        list(groups([], Window(2, 250), 10, "place"))
+        list(group_frames([], FrameWindow(2, 250), 10, "place"))
 
 
 @given(
@@ -216,7 +216,7 @@ def test_groups_do_not_depend_on_how_rows_arrive(present, cuts, each):
     whole = steps(*np.repeat(np.arange(len(present)), present).tolist())
     edges = sorted({0, whole.num_rows, *(c for c in cuts if c < whole.num_rows)})
     pieces = [whole.slice(a, b - a) for a, b in pairwise(edges) if b > a]
-    window = Window(len(present), 1000, first_ms=0, complete=True)
+    window = FrameWindow(len(present), 1000, first_ms=0, complete=True)
     expected = [(f, f * 1000) for f, n in enumerate(present) for _ in range(n)]
     assert picked(pieces, window, each) == expected
 
@@ -225,7 +225,7 @@ def test_the_message_names_the_file_only_once(tmp_path):
     path = tmp_path / "x.csv"
     path.write_text("a;b\n1;2\n")
     with pytest.raises(InputError) as caught:
-        list(fcd.read(path))
+        list(fcd.read_fcd(path))
     assert len(re.findall("x.csv", str(caught.value))) == 1
 
 
@@ -233,9 +233,9 @@ def test_frames_of_too_many_vehicles_are_refused(monkeypatch):
     monkeypatch.setenv("EGVS_MAX_ROWS", "5")
     tables = [steps(*[0.0] * 4), steps(*[0.0] * 4)]
     with pytest.raises(
-        InputError, match=r"has more than 5 vehicles in frames side by side; at most 5 rows; EGVS_MAX_RO"
+        InputError, match=r"has more than 5 vehicles in frames side by side\. The limit is 5 rows; set EGVS_MAX_RO"
     ):
-        list(groups(tables, Window(1, 1000), 1, "here"))
+        list(group_frames(tables, FrameWindow(1, 1000), 1, "here"))
 
 
 def test_a_parquet_file_of_more_rows_than_it_can_hold_is_refused(tmp_path):
@@ -258,7 +258,7 @@ def test_a_row_group_of_more_than_the_bound_is_not_unpacked(tmp_path, monkeypatc
     columns |= {"timestep_time": np.zeros(n), "vehicle_id": ["v"] * n, "vehicle_type": ["car"] * n}
     pq.write_table(pa.table(columns), tmp_path / "f.parquet")
     with pytest.raises(
-        InputError, match=r"f.parquet: has a row group of 1 MB, unpacked; at most 1 MB; EGVS_MAX_UNPACKED"
+        InputError, match=r"f.parquet: has a row group of 1 MB, unpacked\. The limit is 1 MB; set EGVS_MAX_UNPACKED"
     ):
         read_all(tmp_path / "f.parquet")
 
@@ -269,4 +269,4 @@ def test_a_header_that_is_no_text_is_refused(tmp_path):
     head = b"timestep_time;vehicle_id;vehicle_x;vehicle_y;vehicle_angle;vehicle_type;vehic\xff\xffpeed\n"
     path.write_bytes(head + b"0.00;east;1.0;-2.0;90.0;car;2.0\n")
     with pytest.raises(InputError, match=r"fcd\.csv: its first line cannot be read"):
-        list(fcd.read(path))
+        list(fcd.read_fcd(path))

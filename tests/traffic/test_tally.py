@@ -9,9 +9,9 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.traffic import boxes, tally
-from pipeline.traffic.frames import FrameGroup
-from pipeline.traffic.tally import TrafficTally
+from egvs.traffic import trajectories, vehicle_boxes
+from egvs.traffic.fcd import FrameGroup
+from egvs.traffic.trajectories import TrafficStatistics
 from tests.traffic.helpers import SIZES, group_of
 
 
@@ -31,13 +31,23 @@ def test_overlap_of_two_cars(other, expected):
     if angle == 90:
         y -= 2  # level with the first car's middle
     rows = [(0, "a", "car", 0, 0, 0, 1), (0, "b", "car", x, y, angle, 1)]
-    assert len(tally.overlapping(boxes.from_bumpers(group_of(rows), SIZES, 1.0, "place"))) == expected
+    assert (
+        len(trajectories.find_overlaps(vehicle_boxes.boxes_from_bumpers(group_of(rows), SIZES, 1.0, "place")))
+        == expected
+    )
 
 
 def test_vehicles_on_a_bridge_and_below_it_do_not_overlap():
     group = group_of([(0, "a", "car", 0, 0, 0, 1), (0, "b", "car", 0, 0, 90, 1)])
     raised = group.rows.set_column(5, "z", pa.array([0.0, 5.0]))
-    assert len(tally.overlapping(boxes.from_bumpers(FrameGroup(0, 1, group.frame, raised), SIZES, 1.0, "place"))) == 0
+    assert (
+        len(
+            trajectories.find_overlaps(
+                vehicle_boxes.boxes_from_bumpers(FrameGroup(0, 1, group.frame, raised), SIZES, 1.0, "place")
+            )
+        )
+        == 0
+    )
 
 
 def footprint(found, i):
@@ -56,7 +66,7 @@ def test_overlaps_are_those_that_polygons_find(seed):
         for f in range(3)
         for i in range(10)
     ]
-    found = boxes.from_bumpers(group_of(rows), SIZES, 1.0, "place")
+    found = vehicle_boxes.boxes_from_bumpers(group_of(rows), SIZES, 1.0, "place")
     shapes = [footprint(found, i) for i in range(30)]
     expected = {
         (i, j)
@@ -64,7 +74,7 @@ def test_overlaps_are_those_that_polygons_find(seed):
         for j in range(i)
         if found.frame[i] == found.frame[j] and shapes[i].intersection(shapes[j]).area > 1e-7
     }
-    got = {(int(b), int(a)) for a, b in tally.overlapping(found)}
+    got = {(int(b), int(a)) for a, b in trajectories.find_overlaps(found)}
     for i, j in got ^ expected:  # a contact thinner than the polygons' own rounding may go either way
         assert shapes[i].distance(shapes[j]) < 1e-6
         assert shapes[i].intersection(shapes[j]).area < 1e-5
@@ -81,23 +91,23 @@ def test_overlaps_are_those_of_all_pairs(spread_m):
         for f in range(3)
         for i, (x, y) in enumerate(places.tolist())
     ]
-    found = boxes.from_bumpers(group_of(rows), SIZES, 1.0, "place")
+    found = vehicle_boxes.boxes_from_bumpers(group_of(rows), SIZES, 1.0, "place")
     a, b = np.triu_indices(found.frame.size, 1)
     a, b = a[found.frame[a] == found.frame[b]], b[found.frame[a] == found.frame[b]]
-    hit = tally._share_space(found, a, b)
+    hit = trajectories._boxes_overlap(found, a, b)
     expected = set(zip(a[hit].tolist(), b[hit].tolist(), strict=True))
-    got = [tuple(pair) for pair in tally.overlapping(found).tolist()]
+    got = [tuple(pair) for pair in trajectories.find_overlaps(found).tolist()]
     assert len(got) == len(set(got)) > 20
     assert set(got) == expected
 
 
 def test_standing_is_followed_across_groups():
-    counted = TrafficTally(6)
+    counted = TrafficStatistics(6)
     for frames in ((0, 1), (2, 3), (4, 5)):
         rows = [(f, "still", "car", 0, 0, 0, 0.0) for f in frames]
         rows += [(f, "goes", "car", 50, 0, 0, 5.0 if f == 4 else 0.0) for f in frames]
-        counted.add(boxes.from_bumpers(group_of(rows), SIZES, 1.0, "place"))
-    assert counted.stands_since == {"still": 0, "goes": 5}
+        counted.add(vehicle_boxes.boxes_from_bumpers(group_of(rows), SIZES, 1.0, "place"))
+    assert counted.standing_since == {"still": 0, "goes": 5}
     assert counted.longest_standing_frames == 5
     result = counted.to_json(0.5)
     assert result["vehicles"] == {"fewest": 2, "most": 2, "different": 2}

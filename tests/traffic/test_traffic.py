@@ -18,11 +18,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.artefacts import tables
-from pipeline.core.errors import InputError, RunError
-from pipeline.stages import traffic
-from pipeline.traffic import network, recording, sumo
-from pipeline.traffic.demand import trips as demand
+from egvs.artefacts import parquet
+from egvs.core.errors import InputError, RunError
+from egvs.stages import traffic
+from egvs.traffic import demand, network, recording, sumo
 from tests.stages import inputs_of, run_stage
 from tests.traffic.helpers import SMALL, car, drawn, netgenerate, scenario
 
@@ -49,7 +48,7 @@ def test_rows_are_sorted_and_tidy(recorded):
     assert set(table["pitch_rad"].to_pylist()) == {0.0}
     assert np.array_equal(table["z_m"].to_numpy(), table["height_m"].to_numpy() / 2)
     assert set(table["kind"].to_pylist()) <= {"passenger", "delivery", "truck", "bus"}
-    assert metadata["frames"] == 240 and metadata["seed"] == 1 and metadata["sumo"] == sumo.version()
+    assert metadata["frames"] == 240 and metadata["seed"] == 1 and metadata["sumo"] == sumo.sumo_version()
 
 
 def test_vehicles_stay_on_the_roads_and_do_not_jump(recorded):
@@ -86,11 +85,11 @@ def test_the_folder_can_be_moved_and_gives_the_same_traffic_as_a_finished_file(r
     _, table, _, out = recorded
     moved = tmp_path / "moved"
     shutil.copytree(out / "sumo", moved)
-    sumo.run("sumo", ["-c", "run.sumocfg", "--fcd-output", "all.xml.gz", "--precision", "8"], moved)
+    sumo.run_program("sumo", ["-c", "run.sumocfg", "--fcd-output", "all.xml.gz", "--precision", "8"], moved)
     values = {k: v for k, v in SMALL.items() if k in ("frames", "warmup_s")}
     finished = scenario(moved, fcd="all.xml.gz", **values)
     result = run_stage(traffic, finished, tmp_path / "out")
-    again, metadata = tables.read(tmp_path / "out" / "trajectories.parquet", "trajectories")
+    again, metadata = parquet.read_artefact(tmp_path / "out" / "trajectories.parquet", "trajectories")
     assert again.equals(table.cast(again.schema))
     assert metadata["sumo"] is None
     assert result["vehicles"]["most"] == 12 and "flags" not in result
@@ -102,10 +101,10 @@ def serve(folder, *flags):
     from sumolib.miscutils import getFreeSocketPort
 
     port = getFreeSocketPort()
-    command = [str(sumo.binary("sumo")), "-c", "run.sumocfg", *flags, "--remote-port", str(port)]
+    command = [str(sumo.sumo_binary("sumo")), "-c", "run.sumocfg", *flags, "--remote-port", str(port)]
     devnull = subprocess.DEVNULL
     process = subprocess.Popen(
-        command, cwd=folder, env=sumo.environment(), stdin=devnull, stdout=devnull, stderr=devnull
+        command, cwd=folder, env=sumo.sumo_environment(), stdin=devnull, stdout=devnull, stderr=devnull
     )
     return process, port
 
@@ -174,7 +173,7 @@ def test_a_sumo_that_falls_silent_is_told(town, recorded, tmp_path, monkeypatch)
         try:
             with (
                 pytest.raises(RunError, match=rf"SUMO at localhost:{port} ended .*, or did not answer for 0\.2 s"),
-                sumo.connected("localhost", port) as connection,
+                sumo.connect_traci("localhost", port) as connection,
             ):
                 process.send_signal(signal.SIGSTOP)
                 connection.simulationStep()
@@ -194,8 +193,8 @@ ROUTES = """<routes>
 
 
 def routes_for(town):
-    roads = network.read(town / "net.xml")
-    found = demand.pairs(roads, car(), drawn(min_trip_m=200), np.random.default_rng(0), "place")
+    roads = network.read_net_xml(town / "net.xml")
+    found = demand.origin_destination_pairs(roads, car(), drawn(min_trip_m=200), np.random.default_rng(0), "place")
     origin, target = roads.edges[found.origin[0]], roads.edges[found.target[0]]
 
     def reverse(edge):
@@ -217,7 +216,7 @@ def test_own_routes_get_their_sizes_from_sumo(town, tmp_path):
         "frame_period_s": 1,
     }
     result = run_stage(traffic, scenario(tmp_path, **keys, frames=300, warmup_s=10), tmp_path / "out")
-    table, _ = tables.read(tmp_path / "out" / "trajectories.parquet", "trajectories")
+    table, _ = parquet.read_artefact(tmp_path / "out" / "trajectories.parquet", "trajectories")
     sizes = {(r["kind"], r["length_m"], r["width_m"], r["height_m"]) for r in table.to_pylist()}
     assert sizes == {("trailer", 16.5, 2.55, 4.0), ("passenger", 3.0, 1.5, 1.4)}
     assert result["longest_standing_s"] > 200  # parked on purpose, which is no jam
@@ -282,8 +281,8 @@ def test_a_jam_without_end_fails_with_its_numbers(town, tmp_path):
 
 
 def test_patience_is_two_cycles_and_three_minutes_at_least():
-    assert recording.patience_s(70) == 180
-    assert recording.patience_s(120) == 240
+    assert recording.max_standing_s(70) == 180
+    assert recording.max_standing_s(120) == 240
 
 
 @pytest.mark.slow
@@ -315,10 +314,10 @@ EDGES = """<edges><edge id="ab" from="a" to="b" numLanes="2"/><edge id="bc" from
 def test_uphill_boxes_are_pitched_and_stand_on_the_road(tmp_path):
     (tmp_path / "n.nod.xml").write_text(NODES)
     (tmp_path / "e.edg.xml").write_text(EDGES)
-    sumo.run("netconvert", ["-n", "n.nod.xml", "-e", "e.edg.xml", "-o", "hill.net.xml"], tmp_path)
+    sumo.run_program("netconvert", ["-n", "n.nod.xml", "-e", "e.edg.xml", "-o", "hill.net.xml"], tmp_path)
     keys = SMALL | {"network": "hill.net.xml", "vehicles": 8, "frames": 120, "hold": "at_most"}
     run_stage(traffic, scenario(tmp_path, **keys), tmp_path / "out")
-    table, _ = tables.read(tmp_path / "out" / "trajectories.parquet", "trajectories")
+    table, _ = parquet.read_artefact(tmp_path / "out" / "trajectories.parquet", "trajectories")
     uphill = [r for r in table.to_pylist() if 20 < r["x_m"] < 380]
     assert len(uphill) > 50
     for r in uphill:
@@ -391,6 +390,6 @@ def test_inputs_depend_on_what_the_stage_reads_and_on_nothing_else(town, tmp_pat
 
 @pytest.mark.slow
 def test_importing_the_stage_loads_no_tool_of_sumo():
-    code = "import sys, pipeline.stages.traffic; print([m for m in ('sumolib', 'traci') if m in sys.modules])"
+    code = "import sys, egvs.stages.traffic; print([m for m in ('sumolib', 'traci') if m in sys.modules])"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "[]"

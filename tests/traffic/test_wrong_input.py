@@ -4,8 +4,8 @@ import shutil
 
 import pytest
 
-from pipeline.core.errors import InputError
-from pipeline.stages import traffic
+from egvs.core.errors import InputError
+from egvs.stages import traffic
 from tests.stages import run_stage
 from tests.traffic.helpers import car, scenario
 
@@ -82,9 +82,9 @@ BAD = {
         nothing,
         {"network": "net.xml", "kinds": [car(vclass="saucer").model_dump()]},
         InputError,
-        r"kind 'car' has the vClass 'saucer'",
+        r"kind 'car' has the unknown vClass 'saucer'",
     ),
-    "trips too long": (nothing, {"network": "net.xml", "min_trip_m": 5000}, InputError, r"to another that is 5000 m"),
+    "trips too long": (nothing, {"network": "net.xml", "min_trip_m": 5000}, InputError, r"no trip of at least 5000 m"),
     "routes off the network": (
         write("r.xml", CAR_ROUTE),
         {"network": "net.xml", "routes": ["r.xml"]},

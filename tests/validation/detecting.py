@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.core.errors import InputError
-from pipeline.validation.sweeps import Detections
+from egvs.core.errors import InputError
+from egvs.validation.sweeps import Detections
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class _MiddleAt:
         far = np.sqrt((at**2).sum(axis=1))
         new = far < self.view.empty_range_m[sweep.beam] - 0.5
         if not new.any():
-            return Detections.none()
+            return Detections.empty()
         centre = at[new].mean(axis=0) + np.asarray(self.view.pose.position_m)  # sensors of the tests stand upright
         return Detections(np.array([[*centre, self.size_m, 2.0, 1.5, 0.0]]), np.array([float(new.sum())]))
 

@@ -5,12 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from pipeline.artefacts import tables
-from pipeline.artefacts.traffic_frames import TrafficFrame
-from pipeline.core.grid import Roi
-from pipeline.validation import detection
-from pipeline.validation.site_findings import POINTS, FoundBoxes, FoundPoints
-from pipeline.validation.sweeps import Detections
+from egvs.artefacts import parquet
+from egvs.artefacts.traffic_frames import TrafficFrame
+from egvs.core.grid import Roi
+from egvs.validation import detection_metrics
+from egvs.validation.sweeps import POINT_COUNTS_NAME, DetectedBoxes, Detections, PointCounts
 
 ROI = Roi((0.0, 0.0, 0.0), (50.0, 50.0, 5.0))
 CAR, BUS = (10.0, 10.0, 0.8, 4.5, 1.8, 1.6, 0.0), (30.0, 20.0, 1.5, 12.0, 2.5, 3.0, 1.0)
@@ -28,13 +27,13 @@ FRAMES[5] = _frame(5, ("passenger", CAR), ("pedestrian", (1.0, 1.0, 0.9, 0.6, 0.
 
 
 def _points(*of_first):
-    return FoundPoints(tuple(np.array(its, dtype=np.int64) for its in [of_first, [], [], [], [], [0], [], [], [], []]))
+    return PointCounts(tuple(np.array(its, dtype=np.int64) for its in [of_first, [], [], [], [], [0], [], [], [], []]))
 
 
 def _boxes(first):
     boxes, scores = zip(*first, strict=True)
     found = Detections(np.array(boxes), np.array(scores))
-    return FoundBoxes((found, *[Detections.none()] * 9))
+    return DetectedBoxes((found, *[Detections.empty()] * 9))
 
 
 def _row(rows, detector, objects_of="vehicles"):
@@ -43,8 +42,8 @@ def _row(rows, detector, objects_of="vehicles"):
 
 
 def test_points_on_three_vehicles():
-    rows, doubts = detection.measured(FRAMES, ROI, {"a": {POINTS: _points(25, 3)}})
-    row = _row(rows, POINTS)
+    rows, doubts = detection_metrics.measure_detection(FRAMES, ROI, {"a": {POINT_COUNTS_NAME: _points(25, 3)}})
+    row = _row(rows, POINT_COUNTS_NAME)
     assert (row.site, row.frames, row.objects, dict(row.objects_with)) == ("a", 10, 3, {1: 2, 5: 1, 20: 1})
     value = {name: its.value for name, its in row.measures.items()}
     assert value["seen_1"] == pytest.approx(2 / 3) and value["seen_5"] == value["seen_20"] == pytest.approx(1 / 3)
@@ -54,21 +53,21 @@ def test_points_on_three_vehicles():
     np.testing.assert_allclose(row.measures["seen_1"].left_out, left_out)
     se = math.sqrt(0.9 * ((left_out - left_out.mean()) ** 2).sum())
     assert row.measures["seen_1"].se == pytest.approx(se)
-    assert all(math.isnan(value[name]) for name in detection.PRECISION) and doubts == []
+    assert all(math.isnan(value[name]) for name in detection_metrics.AP_MEASURES) and doubts == []
 
 
 def test_cars_and_seen_vehicles_alone():
-    rows, _ = detection.measured(FRAMES, ROI, {"a": {POINTS: _points(25, 3)}})
+    rows, _ = detection_metrics.measure_detection(FRAMES, ROI, {"a": {POINT_COUNTS_NAME: _points(25, 3)}})
     assert {row.objects_of: row.objects for row in rows} == {
         "vehicles": 3, "cars": 2, "points_1": 2, "points_5": 1, "points_20": 1,
     }  # fmt: skip
-    assert _row(rows, POINTS, "cars").measures["seen_1"].value == 0.5
-    assert _row(rows, POINTS, "points_5").measures["seen_20"].value == 1.0
+    assert _row(rows, POINT_COUNTS_NAME, "cars").measures["seen_1"].value == 0.5
+    assert _row(rows, POINT_COUNTS_NAME, "points_5").measures["seen_20"].value == 1.0
 
 
 def test_boxes_on_two_of_three_vehicles():
-    found = {POINTS: _points(25, 3), "d": _boxes([(CAR, 0.9), (BUS, 0.8), ((40.0, 40.0, *CAR[2:]), 0.5)])}
-    rows, _ = detection.measured(FRAMES, ROI, {"a": found})
+    found = {POINT_COUNTS_NAME: _points(25, 3), "d": _boxes([(CAR, 0.9), (BUS, 0.8), ((40.0, 40.0, *CAR[2:]), 0.5)])}
+    rows, _ = detection_metrics.measure_detection(FRAMES, ROI, {"a": found})
     value = {name: its.value for name, its in _row(rows, "d").measures.items()}
     assert value["recall_bev_iou70"] == value["recall_3d_iou50"] == pytest.approx(2 / 3)
     assert 26 / 40 <= value["ap_bev_r40_iou70"] <= 27 / 40  # precision 1 up to a recall of 2/3
@@ -78,25 +77,33 @@ def test_boxes_on_two_of_three_vehicles():
 
 
 def test_a_site_that_sees_no_vehicle_is_told():
-    boxes = FoundBoxes(tuple([Detections.none()] * 10))
-    rows, doubts = detection.measured(FRAMES, ROI, {"a": {POINTS: _points(0, 0), "d": boxes}})
-    assert _row(rows, POINTS).measures["seen_1"].value == _row(rows, POINTS).measures["log_points"].value == 0.0
+    boxes = DetectedBoxes(tuple([Detections.empty()] * 10))
+    rows, doubts = detection_metrics.measure_detection(
+        FRAMES, ROI, {"a": {POINT_COUNTS_NAME: _points(0, 0), "d": boxes}}
+    )
+    assert (
+        _row(rows, POINT_COUNTS_NAME).measures["seen_1"].value
+        == _row(rows, POINT_COUNTS_NAME).measures["log_points"].value
+        == 0.0
+    )
     assert _row(rows, "d").measures["ap_bev_r40_iou70"].value == 0.0  # they are there, and missed
     assert _row(rows, "d", "points_1").objects == 0
     assert math.isnan(_row(rows, "d", "points_1").measures["ap_bev_r40_iou70"].value)
-    assert math.isnan(_row(rows, POINTS, "points_1").measures["log_points"].value)
+    assert math.isnan(_row(rows, POINT_COUNTS_NAME, "points_1").measures["log_points"].value)
     first = "no vehicles with 1 points or more in 10 frames: there is no average precision; more frames"
     assert str(doubts[0]) == f"detector d, site a: {first}"
-    more = {name: {POINTS: _points(0, 0), "d": boxes} for name in "abc"}
-    told = list(map(str, detection.measured(FRAMES, ROI, more)[1]))
+    more = {name: {POINT_COUNTS_NAME: _points(0, 0), "d": boxes} for name in "abc"}
+    told = list(map(str, detection_metrics.measure_detection(FRAMES, ROI, more)[1]))
     assert told[0] == f"detector d, sites a, b, c: {first}" and len(told) == len(doubts)
 
 
 def test_rows_are_written_as_they_are(tmp_path):
-    rows, _ = detection.measured(FRAMES, ROI, {"a": {POINTS: _points(25, 3)}, "b": {POINTS: _points(0, 0)}})
-    about = {"schema": tables.schemas.VERSION, "inputs": "x", "frames": 10, "stages": {}}
-    detection.write(tmp_path / "detection.parquet", rows, about)
-    table, read = tables.read(tmp_path / "detection.parquet", "detection")
+    rows, _ = detection_metrics.measure_detection(
+        FRAMES, ROI, {"a": {POINT_COUNTS_NAME: _points(25, 3)}, "b": {POINT_COUNTS_NAME: _points(0, 0)}}
+    )
+    about = {"schema": parquet.SCHEMA_VERSION, "inputs": "x", "frames": 10, "stages": {}}
+    detection_metrics.write_detection(tmp_path / "detection.parquet", rows, about)
+    table, read = parquet.read_artefact(tmp_path / "detection.parquet", "detection")
     assert read == about and table.column("site").to_pylist() == ["a"] * 5 + ["b"] * 5
     first = table.to_pylist()[0]
     assert first["seen_1"] == rows[0].measures["seen_1"].value and first["seen_1_se"] == rows[0].measures["seen_1"].se

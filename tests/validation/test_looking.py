@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from pipeline import load
-from pipeline.core.errors import InputError, RunError
-from pipeline.validation import unseen_record
-from pipeline.validation.looking import Look, LookListener, look_from
-from pipeline.validation.site_findings import POINTS
+from egvs import load
+from egvs.core.errors import InputError, RunError
+from egvs.validation import held_out_traffic
+from egvs.validation.detector_runs import DetectionListener, SiteDetectionTask, run_detectors
+from egvs.validation.sweeps import POINT_COUNTS_NAME
 from tests.validation.detecting import Middle, Odd
 
 FRAMES = 10
@@ -23,10 +23,10 @@ FRAMES = 10
 
 @pytest.fixture
 def record(mini, tmp_path):
-    return unseen_record.prepare(load(mini), tmp_path / "unseen", FRAMES)
+    return held_out_traffic.prepare_held_out_traffic(load(mini), tmp_path / "unseen", FRAMES)
 
 
-class Heard(LookListener):
+class Heard(DetectionListener):
     """Remembers what it was told."""
 
     def __init__(self):
@@ -35,18 +35,18 @@ class Heard(LookListener):
     def begins(self, missing, frames, processes):
         self.missing = missing
 
-    def looked(self, site, detectors, cost):
+    def site_done(self, site, detectors, cost):
         self.done.append((site, list(detectors)))
 
 
 def _plain(found):
     """Findings that can be compared."""
-    points = {site: [its.tolist() for its in by[POINTS].points] for site, by in found.items()}
+    points = {site: [its.tolist() for its in by[POINT_COUNTS_NAME].points] for site, by in found.items()}
     others = {
         (site, name): [(its.boxes.tolist(), its.scores.tolist()) for its in what.frames]
         for site, by in found.items()
         for name, what in by.items()
-        if name != POINTS
+        if name != POINT_COUNTS_NAME
     }
     return points, others
 
@@ -55,35 +55,35 @@ def _plain(found):
 @pytest.mark.system
 def test_the_same_is_found_whatever_the_processes(record, monkeypatch):
     monkeypatch.setenv("EGVS_STORE", "")  # so that all is looked at both times
-    look, sites = Look(record, {"middle": Middle()}), record.scene.sites
-    one, two = (_plain(look_from(sites, look, jobs=jobs)) for jobs in (1, 2))
+    look, sites = SiteDetectionTask(record, {"middle": Middle()}), record.scene.sites
+    one, two = (_plain(run_detectors(sites, look, jobs=jobs)) for jobs in (1, 2))
     assert one == two
-    assert _plain(look_from(sites[::-1], look, jobs=1)) == one  # nor does the order
+    assert _plain(run_detectors(sites[::-1], look, jobs=1)) == one  # nor does the order
     assert sum(map(sum, one[0]["pole_a"])) > 20 and len(one[1]["pole_a", "middle"]) == FRAMES
     assert multiprocessing.active_children() == []
 
 
 def test_what_was_found_is_kept(record, monkeypatch):
-    look, sites, heard = Look(record, {"middle": Middle()}), record.scene.sites, Heard()
-    first = look_from(sites, look, jobs=1, listener=heard)
-    assert heard.done == [("pole_a", [POINTS, "middle"]), ("pole_b", [POINTS, "middle"])]
+    look, sites, heard = SiteDetectionTask(record, {"middle": Middle()}), record.scene.sites, Heard()
+    first = run_detectors(sites, look, jobs=1, listener=heard)
+    assert heard.done == [("pole_a", [POINT_COUNTS_NAME, "middle"]), ("pole_b", [POINT_COUNTS_NAME, "middle"])]
     with monkeypatch.context() as patch:
-        patch.setattr(Look, "at", lambda *_: pytest.fail("looked again"))
-        again = look_from(sites, look, jobs=1, listener=(kept := Heard()))
+        patch.setattr(SiteDetectionTask, "at", lambda *_: pytest.fail("looked again"))
+        again = run_detectors(sites, look, jobs=1, listener=(kept := Heard()))
     assert _plain(again) == _plain(first) and not any(kept.missing.values())
-    more = Look(record, {"middle": Middle(), "other": Middle(5.0)})
-    look_from(sites, more, jobs=1, listener=(heard := Heard()))
+    more = SiteDetectionTask(record, {"middle": Middle(), "other": Middle(5.0)})
+    run_detectors(sites, more, jobs=1, listener=(heard := Heard()))
     assert heard.done == [("pole_a", ["other"]), ("pole_b", ["other"])]
 
 
 def test_keys_change_with_all_that_findings_depend_on(mini, tmp_path, record):
     site = record.scene.sites[0]
 
-    def key(detector=None, at=site, what=POINTS, of=record):
-        return Look(of, {"middle": detector or Middle()}).key(at, what)
+    def key(detector=None, at=site, what=POINT_COUNTS_NAME, of=record):
+        return SiteDetectionTask(of, {"middle": detector or Middle()}).key(at, what)
 
     def of(name, *sets):
-        return unseen_record.prepare(load(mini, sets), tmp_path / name, FRAMES)
+        return held_out_traffic.prepare_held_out_traffic(load(mini, sets), tmp_path / name, FRAMES)
 
     points, boxes = key(), key(what="middle")
     assert points != boxes
@@ -112,7 +112,7 @@ def test_keys_change_with_all_that_findings_depend_on(mini, tmp_path, record):
     ("what", "error", "message"),
     [
         ("refuse", InputError, r"^model.onnx: no model; a model$"),
-        ("die", RunError, r"^a process that looked from a site was ended from outside; .* fewer --jobs need less"),
+        ("die", RunError, r"^a worker process was killed, .* Use fewer --jobs"),
         ("interrupt", KeyboardInterrupt, None),
     ],
 )
@@ -121,34 +121,34 @@ def test_what_ends_one_process_ends_all(record, tmp_path, what, error, message):
     (tmp_path / "pole_b").write_text(what)
     try:
         with pytest.raises(error, match=message):
-            look_from(record.scene.sites, Look(record, {"odd": Odd(folder=tmp_path)}), jobs=2)
+            run_detectors(record.scene.sites, SiteDetectionTask(record, {"odd": Odd(folder=tmp_path)}), jobs=2)
     finally:
         signal.signal(signal.SIGINT, before)
     assert multiprocessing.active_children() == []
 
 
 def test_an_interrupted_look_goes_on_from_what_was_found(record, tmp_path):
-    look = Look(record, {"odd": Odd(folder=tmp_path)})
+    look = SiteDetectionTask(record, {"odd": Odd(folder=tmp_path)})
     (tmp_path / "pole_b").write_text("refuse")
     with pytest.raises(InputError):
-        look_from(record.scene.sites, look, jobs=1)
+        run_detectors(record.scene.sites, look, jobs=1)
     (tmp_path / "pole_b").unlink()
-    look_from(record.scene.sites, look, jobs=1, listener=(heard := Heard()))
-    assert heard.done == [("pole_b", [POINTS, "odd"])]
+    run_detectors(record.scene.sites, look, jobs=1, listener=(heard := Heard()))
+    assert heard.done == [("pole_b", [POINT_COUNTS_NAME, "odd"])]
 
 
 ORPHANS = """
 import sys
 from pathlib import Path
-from pipeline import load
-from pipeline.validation import unseen_record
-from pipeline.validation.looking import Look, look_from
+from egvs import load
+from egvs.validation import held_out_traffic
+from egvs.validation.detector_runs import SiteDetectionTask, run_detectors
 from tests.validation.detecting import Odd
 
 if __name__ == "__main__":
     mini, folder = map(Path, sys.argv[1:])
-    record = unseen_record.prepare(load(mini), folder / "unseen", 10)
-    look_from(record.scene.sites, Look(record, {"odd": Odd(folder=folder)}), jobs=2)
+    record = held_out_traffic.prepare_held_out_traffic(load(mini), folder / "unseen", 10)
+    run_detectors(record.scene.sites, SiteDetectionTask(record, {"odd": Odd(folder=folder)}), jobs=2)
 """
 
 

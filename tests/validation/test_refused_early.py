@@ -4,11 +4,11 @@ import sys
 
 import pytest
 
-from pipeline import load
-from pipeline.core import plugins
-from pipeline.core.errors import InputError, MissingExtraError
-from pipeline.validation import training, unseen_record, unseen_traffic, validating
-from pipeline.validation.detectors import registry
+from egvs import load
+from egvs.core import plugins
+from egvs.core.errors import InputError, MissingExtraError
+from egvs.validation import held_out_traffic, training, validation_run
+from egvs.validation.detectors import base
 
 
 @pytest.fixture
@@ -18,7 +18,11 @@ def nothing_starts(monkeypatch):
     def started(*arguments, **_):
         raise AssertionError(f"work was started: {arguments}")
 
-    for module, name in ((validating, "checked"), (validating, "prepare"), (unseen_record, "bring")):
+    for module, name in (
+        (validation_run, "_check_scenario"),
+        (held_out_traffic, "prepare_held_out_traffic"),
+        (held_out_traffic, "ensure_stages"),
+    ):
         monkeypatch.setattr(module, name, started)
 
 
@@ -26,29 +30,33 @@ def nothing_starts(monkeypatch):
     ("detector", "library", "told"),
     [("cluster", "sklearn", "scikit-learn"), ("pointpillars", "onnxruntime", "onnxruntime")],
 )
-def test_a_detector_without_its_library(egvs, mini, tmp_path, monkeypatch, nothing_starts, detector, library, told):
+def test_a_detector_without_its_library(run_egvs, mini, tmp_path, monkeypatch, nothing_starts, detector, library, told):
     monkeypatch.setitem(sys.modules, library, None)
     arguments = ("--frames", "10", "--detector", f"points,{detector}", "--out", tmp_path / "out")
-    code, out, error = egvs("validate", mini, *arguments)
+    code, out, error = run_egvs("validate", mini, *arguments)
     right = "pip install 'egvs[validate]'"
     assert error == f"egvs: the detector {detector} needs {told}, which is not installed: {right}\n"
     assert code == 2 and out == "" and not (tmp_path / "out").exists()
 
 
 def test_every_detector_of_this_program_says_what_it_needs(monkeypatch):
-    own = {name for name in registry.names() if plugins.package_of(registry.GROUP, name) == plugins.OWN}
+    own = {
+        name
+        for name in base.detector_names()
+        if plugins.plugin_package(base.DETECTORS_GROUP, name) == plugins.PACKAGE_NAME
+    }
     for library in ("sklearn", "onnxruntime"):
         monkeypatch.setitem(sys.modules, library, None)
     for name in own:
         with pytest.raises(MissingExtraError, match=rf"^the detector {name} needs "):
-            registry.make(name)
+            base.make_detector(name)
 
 
-def test_training_without_its_libraries(egvs, mini, tmp_path, monkeypatch, nothing_starts):
+def test_training_without_its_libraries(run_egvs, mini, tmp_path, monkeypatch, nothing_starts):
     for library in ("torch", "onnxscript"):
         monkeypatch.setitem(sys.modules, library, None)
     monkeypatch.setattr(plugins, "find_spec", lambda name: sys.modules.get(name, "there"))
-    code, _, error = egvs("train", mini, "--out", tmp_path / "new" / "model.onnx")
+    code, _, error = run_egvs("train", mini, "--out", tmp_path / "new" / "model.onnx")
     right = "pip install 'egvs[train]'"
     assert error == f"egvs: training needs PyTorch, onnxscript, which are not installed: {right}\n"
     assert code == 2 and not (tmp_path / "new").exists()
@@ -57,13 +65,13 @@ def test_training_without_its_libraries(egvs, mini, tmp_path, monkeypatch, nothi
 @pytest.mark.parametrize(
     ("out", "message"),
     [
-        ("model.pt", "--out: '{}'; a file that ends in .onnx"),
-        ("model", "--out: '{}'; a file that ends in .onnx"),
+        ("model.pt", "--out: expected a file that ends in .onnx, got '{}'"),
+        ("model", "--out: expected a file that ends in .onnx, got '{}'"),
         ("folder.onnx", "{}: is a folder; a file"),
         ("file/model.onnx", "{}: cannot be written ("),
     ],
 )
-def test_a_model_that_could_not_be_written(egvs, mini, tmp_path, monkeypatch, nothing_starts, out, message):
+def test_a_model_that_could_not_be_written(run_egvs, mini, tmp_path, monkeypatch, nothing_starts, out, message):
     class Learner:
         """In place of PyTorch's, which need not be installed here."""
 
@@ -75,12 +83,12 @@ def test_a_model_that_could_not_be_written(egvs, mini, tmp_path, monkeypatch, no
         def train(*_, **__):
             raise AssertionError("training was started")
 
-    monkeypatch.setattr(plugins, "require", lambda *_: None)
+    monkeypatch.setattr(plugins, "require_libraries", lambda *_: None)
     monkeypatch.setattr(training, "train", Learner, raising=False)
     (tmp_path / "folder.onnx").mkdir()
     (tmp_path / "file").write_text("")
     before = sorted(tmp_path.rglob("*"))
-    code, _, error = egvs("train", mini, "--out", tmp_path / out)
+    code, _, error = run_egvs("train", mini, "--out", tmp_path / out)
     assert code == 2 and error.startswith("egvs: " + message.format(tmp_path / out)), error
     assert sorted(tmp_path.rglob("*")) == before
 
@@ -93,5 +101,8 @@ def test_more_frames_than_traffic_can_have(mini, frames, found):
     (mini / "net.net.xml").write_text("<net/>")
     (mini / "scenario.toml").write_text(text.replace("warmup_s = 0", "warmup_s = 300"))
     scenario = load(mini)
-    with pytest.raises(InputError, match=rf"^--frames: {frames}, at least 2 s apart: {found}: at most .*; fewer fr"):
-        unseen_traffic.scenario_of(scenario, frames)
+    with pytest.raises(
+        InputError,
+        match=rf"^--frames: {frames} frames at least 2 s apart are too many: {found}: at most .*Use fewer fr",
+    ):
+        held_out_traffic.held_out_scenario(scenario, frames)

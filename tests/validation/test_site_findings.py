@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from pipeline.core.errors import InputError
-from pipeline.validation.site_findings import FoundBoxes, FoundPoints
-from pipeline.validation.sweeps import Detections
+from egvs.core.errors import InputError
+from egvs.validation.sweeps import DetectedBoxes, Detections, PointCounts
 
 
 def _same(found, again):
@@ -18,22 +17,22 @@ def _same(found, again):
 
 @pytest.mark.parametrize("counts", [[2, 0, 1], [0, 0, 3], [3, 0, 0], [0, 0, 0], [1]])
 def test_points_come_back(tmp_path, counts):
-    found = FoundPoints(tuple(np.arange(count, dtype=np.int64) * 7 for count in counts))
+    found = PointCounts(tuple(np.arange(count, dtype=np.int64) * 7 for count in counts))
     found.write(tmp_path / "points.parquet", {"inputs": "x"})
-    again = FoundPoints.read(tmp_path / "points.parquet")
+    again = PointCounts.read(tmp_path / "points.parquet")
     assert [its.tolist() for its in again.points] == [its.tolist() for its in found.points]
 
 
 @pytest.mark.parametrize("counts", [[2, 0, 1], [0, 0, 3], [3, 0, 0], [0, 0, 0], [1]])
 def test_boxes_come_back(tmp_path, counts):
     random = np.random.default_rng(1)
-    found = FoundBoxes(tuple(Detections(random.normal(size=(n, 7)), random.uniform(size=n)) for n in counts))
+    found = DetectedBoxes(tuple(Detections(random.normal(size=(n, 7)), random.uniform(size=n)) for n in counts))
     found.write(tmp_path / "detections.parquet", {"inputs": "x"})
-    _same(found, FoundBoxes.read(tmp_path / "detections.parquet"))
+    _same(found, DetectedBoxes.read(tmp_path / "detections.parquet"))
 
 
 def test_the_same_findings_are_the_same_bytes(tmp_path):
-    found = FoundBoxes((Detections(np.ones((2, 7)), np.ones(2)), Detections.none()))
+    found = DetectedBoxes((Detections(np.ones((2, 7)), np.ones(2)), Detections.empty()))
     for name in "ab":
         found.write(tmp_path / name, {"inputs": "x"})
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
@@ -41,6 +40,6 @@ def test_the_same_findings_are_the_same_bytes(tmp_path):
 
 def test_other_files_are_refused(tmp_path):
     path = tmp_path / "points.parquet"
-    FoundBoxes((Detections.none(),)).write(path, {"inputs": "x"})
+    DetectedBoxes((Detections.empty(),)).write(path, {"inputs": "x"})
     with pytest.raises(InputError, match=r"points.parquet: column 'points' is missing"):
-        FoundPoints.read(path)
+        PointCounts.read(path)

@@ -2,15 +2,15 @@
 
 import numpy as np
 
-from pipeline import load
-from pipeline.validation import unseen_record
+from egvs import load
+from egvs.validation import held_out_traffic
 
 
 def test_a_record_is_made_once_and_its_frames_are_those_asked_for(mini, tmp_path):
     scenario = load(mini)
-    first = unseen_record.prepare(scenario, tmp_path / "a", 5)
+    first = held_out_traffic.prepare_held_out_traffic(scenario, tmp_path / "a", 5)
     made_at = first.trajectories.stat().st_mtime_ns
-    again = unseen_record.prepare(scenario, tmp_path / "b", 5)
+    again = held_out_traffic.prepare_held_out_traffic(scenario, tmp_path / "b", 5)
     assert again.trajectories.stat().st_mtime_ns == made_at  # the same file, from the store
     assert again.keys == first.keys and first.frames == 5
     frames = list(first.read())

@@ -6,15 +6,15 @@ import trimesh
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from pipeline.core.errors import InputError
-from pipeline.core.grid import Roi
-from pipeline.effects.scene_building import build_scene
-from pipeline.kernels import rays
-from pipeline.scenario import loading
-from pipeline.sensing.scanner import Scanner
-from pipeline.sensing.sensors import CATALOGUE
-from pipeline.world.casting import Caster, _cut, standing_on, with_planes
-from pipeline.world.mesh import World
+from egvs.core.errors import InputError
+from egvs.core.grid import Roi
+from egvs.kernels import ray_triangle
+from egvs.scenario import loading
+from egvs.sensors.scanner import Scanner
+from egvs.sensors.sensor import CATALOGUE
+from egvs.stages.inputs import build_scene
+from egvs.world.mesh import World
+from egvs.world.ray_casting import Caster, _split_large, touches_sensor, with_planes
 from tests.oracles import cast
 
 ROI = Roi((0.0, 0.0, 0.0), (100.0, 100.0, 10.0))
@@ -79,7 +79,9 @@ def test_float32_is_not_trusted_near_edges_and_at_shallow_angles(end, range_m, d
     ranges, found = np.empty(1), np.empty(1, np.int64)
     nearest, owner = np.zeros(1, np.int32), np.array([0, -1], np.int32)
     beam, met, ends, returned = np.zeros(1, np.uint32), np.empty(1, np.int64), np.empty((1, 3)), np.empty(1, np.bool_)
-    count = rays.settle(nearest, owner, triangles, planes, o, beam, d, range_m, ranges, met, found, ends, returned)
+    mesh, rays = ray_triangle.TriangleMesh(triangles, planes), ray_triangle.Rays(o, beam, d, range_m)
+    hits = ray_triangle.Hits(ranges, met, ends, returned)
+    count = ray_triangle.resolve_hits(nearest, owner, mesh, rays, hits, found)
     assert ranges[0] == pytest.approx(np.linalg.norm([*end, 0.5]), abs=1e-9)
     assert bool(count) == doubtful
 
@@ -325,10 +327,10 @@ def test_a_sensor_on_a_wall_is_not_blocked_by_it(degrees):
     for away in (-1e-9, -1e-13, 0.0, 1e-13, 1e-9):
         o = turn @ np.array([5.0 + away, 1.3, 0.7]) + centre
         assert np.isinf(caster(house).first_hits(o, directions)[0][outwards]).all()
-    assert standing_on(house - o).sum() in (1, 2)
+    assert touches_sensor(house - o).sum() in (1, 2)
     deep = turn @ np.array([4.99, 1.3, 0.7]) + centre
     assert np.isfinite(caster(house).first_hits(deep, directions)[0]).all()
-    assert not standing_on(house - deep).any()
+    assert not touches_sensor(house - deep).any()
 
 
 @pytest.mark.slow
@@ -437,7 +439,7 @@ def meets(o, ends, size):
         low = np.where(stays, 0.0, t[0]).max(axis=1, initial=0.0)
         high = np.where(stays, np.where((o >= 0.0) & (size - o >= 0.0), 1.0, -1.0), t[1]).min(axis=1, initial=1.0)
         x, y, z = ends.T
-        return (high - low) * np.sqrt(x * x + y * y + z * z) > rays.CHORD_M
+        return (high - low) * np.sqrt(x * x + y * y + z * z) > ray_triangle.CHORD_M
 
 
 @settings(max_examples=60)
@@ -453,22 +455,22 @@ def test_beams_that_can_meet_the_region_are_those_of_exact_quotients(seed, reach
     ends *= rng.choice([1.0, 0.0], ends.shape, p=[0.9, 0.1])
     ends[::50, 0], ends[1::50, 2] = 1e-300, -5e-324
     found = np.empty(len(ends), dtype=np.bool_)
-    rays.can_meet(o, ends, size, found)
+    ray_triangle.can_meet_box(o, ends, size, found)
     np.testing.assert_array_equal(found, meets(o, ends, size))
 
 
 def test_a_chord_that_rounding_makes_too_short_is_measured_by_quotients():
     """Through a box no thicker than CHORD_M: which beams share a longer piece with it, rounding alone says."""
-    rng, size, o = np.random.default_rng(9), np.array([rays.CHORD_M, 20.0, 5.0]), np.array([0.0, 10.0, 2.5])
+    rng, size, o = np.random.default_rng(9), np.array([ray_triangle.CHORD_M, 20.0, 5.0]), np.array([0.0, 10.0, 2.5])
     away = np.array([1.0, 0.0, 0.0]) + rng.uniform(-1e-8, 1e-8, (20_000, 3)) * [0.0, 1.0, 1.0]
     ends = away * rng.uniform(1.0, 300.0, (20_000, 1))
     true = meets(o, ends, size)
     per = 1.0 / ends[:, 0]
     chord = size[0] * per * np.sqrt((ends**2).sum(axis=1))
-    assert (true != (chord > rays.CHORD_M)).mean() > 0.01  # so products alone would not do
+    assert (true != (chord > ray_triangle.CHORD_M)).mean() > 0.01  # so products alone would not do
     found = np.empty(len(ends), dtype=np.bool_)
     for n in range(2000):  # alone: one in doubt has those beside it measured too
-        rays.can_meet(o, ends[n : n + 1], size, found[n : n + 1])
+        ray_triangle.can_meet_box(o, ends[n : n + 1], size, found[n : n + 1])
     np.testing.assert_array_equal(found[:2000], true[:2000])
 
 
@@ -477,8 +479,8 @@ def test_what_is_taken_is_what_can_meet():
     size, d = np.array([40.0, 20.0, 5.0]), random_directions(np.random.default_rng(3), 20_011)
     for o in ([20.0, 10.0, 2.0], [20.0, 10.0, 9.0], [-3.0, 5.0, 4.0], [300.0, 5.0, 40.0]):
         beam, found = np.empty(len(d), dtype=np.uint32), np.empty(len(d), dtype=np.bool_)
-        count = rays.take(np.array(o), d, size, 60.0, beam)
-        rays.can_meet(np.array(o), d, size, found, 60.0)
+        count = ray_triangle.select_beams(np.array(o), d, size, 60.0, beam)
+        ray_triangle.can_meet_box(np.array(o), d, size, found, 60.0)
         np.testing.assert_array_equal(beam[:count], np.flatnonzero(found))
         np.testing.assert_array_equal(found, meets(np.array(o), d * 60.0, size))
 
@@ -492,7 +494,7 @@ def fan(slivers, reach, turn_deg):
 
 def test_slivers_are_cut_into_pieces_that_are_them():
     whole = np.concatenate([fan(12, 180.0, 31.0), quad((0, 0, 0), (9, 0, 0), (9, 9, 0), (0, 9, 0))])
-    pieces, owner = _cut(whole)
+    pieces, owner = _split_large(whole)
     assert len(whole) < len(pieces) <= 2 * len(whole)
     assert (owner[-2:] != len(whole) - 1).all() and (owner == len(whole) - 1).sum() == 1  # the quad stays as it is
     area = np.linalg.norm(np.cross(pieces[:, 1] - pieces[:, 0], pieces[:, 2] - pieces[:, 0]), axis=1)
@@ -513,7 +515,7 @@ def along_plane(points, triangles):
 def test_a_fan_of_slivers_leaks_nowhere(turn_deg, height_m):
     """Beams at the cuts, at the sides, and at anything, steep and nearly along the plane, against brute force."""
     rng, slivers = np.random.default_rng(5), fan(60, 150.0, turn_deg)
-    pieces, _ = _cut(slivers)
+    pieces, _ = _split_large(slivers)
     assert len(pieces) > 100
     sides = 0.5 * (pieces + np.roll(pieces, 1, axis=1)).reshape(-1, 3)
     share = rng.dirichlet([1, 1, 1], len(slivers) * 40)

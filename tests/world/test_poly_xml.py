@@ -13,20 +13,19 @@ import numpy as np
 import pytest
 import shapely
 
-from pipeline.core.errors import InputError
-from pipeline.core.grid import Roi
-from pipeline.core.sumo_home import sumo_home
-from pipeline.formats import osm
-from pipeline.formats.crs import WorldFrame
-from pipeline.formats.georeference import Georeference
-from pipeline.scenario.loading import from_values
-from pipeline.traffic.network import location_of
-from pipeline.world import static_world
-from pipeline.world.footprints import FootprintFile
-from pipeline.world.mesh import World
-from pipeline.world.poly_xml import read_poly_xml
-from pipeline.world.solid_types import SolidTypes
-from pipeline.world.world_frame import located
+from egvs.core.errors import InputError
+from egvs.core.grid import Roi
+from egvs.core.runtime import sumo_home
+from egvs.formats import osm
+from egvs.formats.georeference import Georeference, WorldFrame
+from egvs.scenario.loading import scenario_from_dict
+from egvs.traffic.network import read_location
+from egvs.world import static_world
+from egvs.world.footprints import FootprintFile
+from egvs.world.geolocation import network_world_frame
+from egvs.world.map_features import SolidTypes
+from egvs.world.mesh import World
+from egvs.world.sumo_polygons import read_poly_xml
 
 SMALL = Path(__file__).parents[1] / "importers" / "data" / "small.osm"
 SQUARE = "0,0 4,0 4,4 0,4"
@@ -97,7 +96,7 @@ def test_a_type_that_is_solid(tmp_path: Path, kind: str, expected: tuple[str, fl
 def test_a_type_that_is_none_is_counted(tmp_path: Path, kind: str) -> None:
     file = read(tmp_path, poly("building", "9,9 10,9 10,10"), poly(kind), poly(kind, "7,7 8,8", fill="0"))
     assert len(file.footprints) == 1
-    assert file.left_out == {f"polygons of type {kind}": 2}
+    assert file.ignored == {f"polygons of type {kind}": 2}
     assert not file.warnings
 
 
@@ -115,7 +114,7 @@ def test_every_type_of_polyconvert_is_in_the_table() -> None:
 def test_a_type_that_no_table_names_is_left_out_and_warned_of(tmp_path: Path) -> None:
     file = read(tmp_path, poly("building"), poly("sculpture"), poly("sculpture"), poly(None), poly("mine.own"))
     assert len(file.footprints) == 1
-    assert file.left_out == {
+    assert file.ignored == {
         "polygons of type sculpture": 2,
         "polygons of type (none)": 1,
         "polygons of type mine.own": 1,
@@ -130,7 +129,7 @@ def test_a_type_that_no_table_names_is_left_out_and_warned_of(tmp_path: Path) ->
 
 def test_a_file_without_anything_solid_is_warned_of(tmp_path: Path) -> None:
     file = read(tmp_path, poly("parking"), poly("landuse"))
-    assert [w.found for w in file.warnings] == ["none of its 2 polygons is solid"]
+    assert [w.problem for w in file.warnings] == ["none of its 2 polygons is solid"]
 
 
 def test_a_shape_that_is_not_solid_need_not_be_sound(tmp_path: Path) -> None:
@@ -142,10 +141,10 @@ def test_an_outline_that_crosses_itself_stops_no_file(tmp_path: Path) -> None:
     square = poly("building", "10,0 14,0 14,4 10,4")
     file = read(tmp_path, poly("building", "0,0 4,4 4,0 0,4"), poly("building", "0,0 4,0 8,0"), square)
     assert [footprint.polygon.area for footprint in file.footprints] == [4.0, 4.0, 16.0]
-    assert file.mended["rings that cross themselves, each part that they enclose kept"] == 1
-    assert file.left_out["outlines that enclose nothing of type building"] == 1
+    assert file.repaired["rings that cross themselves, each part that they enclose kept"] == 1
+    assert file.ignored["outlines that enclose nothing of type building"] == 1
     (warning,) = file.warnings
-    assert warning.found == "outlines that cross themselves: 1 (x); each part that they enclose is kept"
+    assert warning.problem == "outlines that cross themselves: 1 (x); each part that they enclose is kept"
 
 
 # ---- the user's own table
@@ -190,7 +189,7 @@ def load(folder: Path, **settings: Any) -> Any:
         "sites": {"file": "sites.csv"},
         "statics": {"ground": False, **settings},
     }
-    return from_values(values, folder, "scenario.toml")
+    return scenario_from_dict(values, folder, "scenario.toml")
 
 
 def test_types_without_quotes_mean_the_same(tmp_path: Path) -> None:
@@ -212,13 +211,13 @@ def test_the_stage_counts_and_warns(tmp_path: Path) -> None:
         f"<additional>{poly('building')}{poly('parking')}{poly('odd')}</additional>", encoding="utf-8"
     )
     settings = {"polygons": ["s.poly.xml"], "polygon_height_m": 4.0}
-    world, counts = static_world.build(load(tmp_path, **settings))
+    world, counts = static_world.build_world(load(tmp_path, **settings))
     assert volumes(world) == pytest.approx([64.0])
     told = counts.to_json()
     assert told["built"] == {"building": 1}
     assert told["left_out"] == {"polygons of type odd": 1, "polygons of type parking": 1}
     assert [warning["rule"] for warning in told["warnings"]] == ["polygon types"]
-    _, quiet = static_world.build(load(tmp_path, **settings, polygon_types={"odd": "ignore"}))
+    _, quiet = static_world.build_world(load(tmp_path, **settings, polygon_types={"odd": "ignore"}))
     assert "warnings" not in quiet.to_json()
 
 
@@ -255,13 +254,13 @@ def test_heights(
 ) -> None:
     file = read(tmp_path, poly(kind, tags=tags, **attributes))
     assert [(f.base_m, f.height_m) for f in file.footprints] == [pytest.approx(base_top)]
-    assert not file.mended
+    assert not file.repaired
 
 
 def test_a_tag_that_cannot_be_read_is_counted(tmp_path: Path) -> None:
     file = read(tmp_path, poly("building", tags={"height": "tall", "building:levels": "2"}))
     assert [f.height_m for f in file.footprints] == [6.0]
-    assert file.mended == {"height that cannot be read, taken as not there": 1}
+    assert file.repaired == {"height that cannot be read, taken as not there": 1}
 
 
 @pytest.mark.parametrize("height", ["tall", "0", "-3", "nan", "inf"])
@@ -287,9 +286,9 @@ def test_a_wall_is_a_strip_and_a_closed_outline_an_area(tmp_path: Path) -> None:
 
 def test_an_open_outline_of_a_building_is_left_out_and_warned_of(tmp_path: Path) -> None:
     file = read(tmp_path, poly("fence"), poly("building.school", "0,0 4,0 4,4", fill="0"))
-    assert file.left_out == {"open lines of type building.school": 1}
-    assert [w.found for w in file.warnings] == ["outlines of type building.school (1) are not closed: left out"]
-    assert "--osm.merge-relations" in file.warnings[0].cure
+    assert file.ignored == {"open lines of type building.school": 1}
+    assert [w.problem for w in file.warnings] == ["outlines of type building.school (1) are not closed: left out"]
+    assert "--osm.merge-relations" in file.warnings[0].hint
 
 
 def test_a_courtyard_is_cut_out_of_what_surrounds_it(tmp_path: Path) -> None:
@@ -300,7 +299,7 @@ def test_a_courtyard_is_cut_out_of_what_surrounds_it(tmp_path: Path) -> None:
         poly("inner", far),
     )  # fmt: skip
     assert [area for *_, area in extents(file)] == [300.0, 4.0, 4.0]  # the last is a hole in a wood: it stays
-    assert file.mended == {"courtyards cut out": 1, "heights taken as 9 m": 2}
+    assert file.repaired == {"courtyards cut out": 1, "heights taken as 9 m": 2}
 
 
 @pytest.mark.parametrize("color", ["white", "255,255,255"])
@@ -319,7 +318,7 @@ def test_a_solid_inside_another_is_warned_of(tmp_path: Path) -> None:
     """Without --osm.merge-relations, polyconvert fills courtyards."""
     file = read(tmp_path, poly("building", "0,0 20,0 20,20 0,20"), poly("building", "5,5 15,5 15,15 5,15"))
     assert len(file.footprints) == 2
-    assert [w.found for w in file.warnings] == [
+    assert [w.problem for w in file.warnings] == [
         "solids inside another of their kind and height: 1; they may be courtyards that are filled"
     ]
     tower = poly("building", "5,5 15,5 15,15 5,15", height="30")
@@ -341,7 +340,7 @@ def test_trees_and_poles_among_the_points(tmp_path: Path) -> None:
         ("l", "highway", 0.0, 6.0),
     ]
     assert file.footprints[0].polygon.centroid.coords[0] == pytest.approx((5, 6))
-    assert file.left_out == {"points of type shop": 1, "points of type building": 1, "points of type natural": 1}
+    assert file.ignored == {"points of type shop": 1, "points of type building": 1, "points of type natural": 1}
 
 
 def test_the_users_table_goes_for_points_too(tmp_path: Path) -> None:
@@ -352,14 +351,14 @@ def test_the_users_table_goes_for_points_too(tmp_path: Path) -> None:
     table = {"highway.street_lamp": 4.5, "power": "ignore", "barrier.bollard": "ignore", "man_made.mast": "solid"}
     file = read(tmp_path, *points, types=table)
     assert [(f.name, f.height_m) for f in file.footprints] == [("0", 4.5), ("3", 15.0)]
-    assert file.left_out == {"points of type power": 1, "points of type barrier": 1}
+    assert file.ignored == {"points of type power": 1, "points of type barrier": 1}
 
 
 def test_what_stands_there_twice_is_built_once(tmp_path: Path) -> None:
     """With full types, polyconvert writes a tower as a building and as a tower."""
     file = read(tmp_path, poly("building.yes"), poly("man_made.tower"), poly("historic.yes"))
     assert len(file.footprints) == 1
-    assert file.mended == {"solids that are there twice": 1, "heights taken as 9 m": 1}
+    assert file.repaired == {"solids that are there twice": 1, "heights taken as 9 m": 1}
 
 
 @pytest.mark.parametrize(
@@ -379,7 +378,7 @@ def test_shapes_that_are_none_are_refused(tmp_path: Path, shape: str, message: s
 
 def test_a_tunnelled_garage_is_left_out(tmp_path: Path) -> None:
     file = read(tmp_path, poly("fence"), poly("building.garage", tags={"location": "underground"}))
-    assert file.left_out == {"underground polygons of type building.garage": 1}
+    assert file.ignored == {"underground polygons of type building.garage": 1}
 
 
 # ---- where shapes are
@@ -440,7 +439,7 @@ def test_what_polyconvert_makes_of_a_map(tmp_path: Path) -> None:
     ):  # fmt: skip
         command = [home / "bin" / name, "--osm-files", "m.osm", *flags]
         subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, env=environment)
-    world = Georeference(located(location_of(tmp_path / "n.net.xml")), HERE, "scenario.toml")
+    world = Georeference(network_world_frame(read_location(tmp_path / "n.net.xml")), HERE, "scenario.toml")
     assert world.frame is not None
     file = read_poly_xml(tmp_path / "p.poly.xml", SolidTypes(), 9.0, world)
     found = {f.name: (f.base_m, f.height_m) for f in file.footprints}
@@ -451,12 +450,12 @@ def test_what_polyconvert_makes_of_a_map(tmp_path: Path) -> None:
     assert {name: found[name] for name in expected} == {name: pytest.approx(v) for name, v in expected.items()}
     areas = {f.name: f.polygon.area for f in file.footprints}
     assert areas["3001"] == pytest.approx(40 * 40 - 20 * 20, rel=1e-2)
-    assert file.left_out["underground polygons of type building.garage"] == 1
-    assert not any("of type" in w.found and "solid" in w.found for w in file.warnings)
+    assert file.ignored["underground polygons of type building.garage"] == 1
+    assert not any("of type" in w.problem and "solid" in w.problem for w in file.warnings)
     import sumolib
 
     net = sumolib.net.readNet(str(tmp_path / "n.net.xml"))
-    extract = osm.read(SMALL)
+    extract = osm.read_osm(SMALL)
     corners = shapely.MultiPoint(next(f for f in file.footprints if f.name == "2001").polygon.exterior.coords)
     for node in extract.ways[2001].nodes:
         lat_deg, lon_deg = extract.nodes[node]

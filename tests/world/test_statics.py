@@ -13,15 +13,14 @@ import pyproj
 import pytest
 import trimesh
 
-from pipeline.core.errors import InputError
-from pipeline.core.findings import FindingsError
-from pipeline.effects import scene_resolving
-from pipeline.formats.crs import WorldFrame
-from pipeline.scenario import loading
-from pipeline.scenario.loading import from_values
-from pipeline.sensing.scanner import Scanner
-from pipeline.world import static_world
-from pipeline.world.mesh import World, read_ply, write_ply
+from egvs.core.errors import DiagnosticsError, InputError
+from egvs.formats.georeference import WorldFrame
+from egvs.scenario import loading
+from egvs.scenario.loading import scenario_from_dict
+from egvs.sensors.scanner import Scanner
+from egvs.stages import inputs
+from egvs.world import static_world
+from egvs.world.mesh import World, read_ply, write_ply
 from tests.conftest import collection, feature
 
 SQUARE = [[0, 0], [4, 0], [4, 4], [0, 4], [0, 0]]
@@ -40,13 +39,13 @@ def load(folder, **settings):
         "sites": {"file": "sites.csv", "sensor": "VLP-16"},
         "statics": {"ground": False, **settings},
     }
-    return from_values(values, folder, "scenario.toml")
+    return scenario_from_dict(values, folder, "scenario.toml")
 
 
 def built(folder, *features):
     """The world and the counts of a GeoJSON file."""
     (folder / "s.geojson").write_text(collection(*features))
-    return static_world.build(load(folder, footprints=["s.geojson"]))
+    return static_world.build_world(load(folder, footprints=["s.geojson"]))
 
 
 def volumes(world):
@@ -59,7 +58,7 @@ def volumes(world):
 def mesh_of(folder, mesh, **settings):
     """The world and the counts of a mesh file."""
     mesh.export(folder / "m.ply")
-    return static_world.build(load(folder, meshes=[{"file": "m.ply", **settings}]))
+    return static_world.build_world(load(folder, meshes=[{"file": "m.ply", **settings}]))
 
 
 @pytest.mark.parametrize(
@@ -81,8 +80,8 @@ def test_a_prism_is_closed_faces_outwards_and_has_its_volume(tmp_path, rings, ar
     assert volumes(world) == pytest.approx([area * 4.5], rel=1e-9)
     assert world.triangles_m[..., 2].min() == 2.5
     assert world.triangles_m[..., 2].max() == 7.0
-    assert not counts.mended
-    assert not counts.left_out
+    assert not counts.repaired
+    assert not counts.ignored
 
 
 def test_points_are_discs_and_lines_are_strips(tmp_path):
@@ -127,7 +126,7 @@ def test_points_are_discs_and_lines_are_strips(tmp_path):
 )
 def test_dirt_with_one_meaning_is_mended_and_counted(tmp_path, features, mended, area):
     world, counts = built(tmp_path, *features)
-    assert dict(counts.mended) == mended
+    assert dict(counts.repaired) == mended
     assert world.closed.all()
     assert sorted(volumes(world)) == pytest.approx(sorted(5 * a for a in area), rel=1e-12)
 
@@ -185,16 +184,16 @@ def test_poly_xml(tmp_path):
         '<additional><poly id="a" type="building" fill="1" shape="{a}"><param key="height" value="3"/></poly>'
         '<poly id="c" type="building" fill="0" shape="{c}"/><poi id="p" x="0" y="0"/></additional>'.format(**shapes)
     )
-    world, counts = static_world.build(load(tmp_path, polygons=["s.poly.xml"]))
+    world, counts = static_world.build_world(load(tmp_path, polygons=["s.poly.xml"]))
     assert volumes(world) == pytest.approx([48], rel=1e-12)
-    assert sum(counts.left_out.values()) == 2
+    assert sum(counts.ignored.values()) == 2
     crossed, broken = (f'<poly id="x" type="building" fill="1" shape="{shapes[name]}"/>' for name in "bd")
     (tmp_path / "s.poly.xml").write_text(f"<additional>{crossed}</additional>")
-    world, counts = static_world.build(load(tmp_path, polygons=["s.poly.xml"]))
+    world, counts = static_world.build_world(load(tmp_path, polygons=["s.poly.xml"]))
     assert volumes(world) == pytest.approx([4 * 9, 4 * 9], rel=1e-12)
     (tmp_path / "s.poly.xml").write_text(f"<additional>{broken}</additional>")
     with pytest.raises(InputError, match="poly x"):
-        static_world.build(load(tmp_path, polygons=["s.poly.xml"]))
+        static_world.build_world(load(tmp_path, polygons=["s.poly.xml"]))
 
 
 BOX = trimesh.creation.box((4, 6, 8))
@@ -207,7 +206,7 @@ def test_a_mesh_is_taken_apart_into_closed_pieces(tmp_path):
     assert world.closed.all()
     assert world.triangles_m.min(axis=(0, 1)).tolist() == [98, 197, 296]
     assert counts.built == {"city": 2}
-    assert not counts.mended
+    assert not counts.repaired
 
 
 def test_an_inverted_solid_is_still_a_solid(tmp_path):
@@ -232,7 +231,7 @@ def test_doubled_and_degenerate_triangles_are_dropped_and_counted(tmp_path):
     faces = np.concatenate([BOX.faces, BOX.faces[:3], BOX.faces[:2, [0, 0, 1]]])
     world, counts = mesh_of(tmp_path, trimesh.Trimesh(BOX.vertices, faces, process=False))
     assert world.closed.all()
-    assert dict(counts.mended) == {"degenerate or doubled triangles dropped": 5}
+    assert dict(counts.repaired) == {"degenerate or doubled triangles dropped": 5}
 
 
 def test_a_soup_of_separate_triangles_is_sewn(tmp_path):
@@ -246,25 +245,25 @@ def test_a_soup_of_separate_triangles_is_sewn(tmp_path):
 def test_a_vertex_that_is_no_number_is_refused(tmp_path, value):
     (tmp_path / "m.obj").write_text(f"v 0 0 0\nv 1 0 0\nv 0 {value} 0\nf 1 2 3\n")
     with pytest.raises(InputError, match=r"m\.obj: vertex 2"):
-        static_world.build(load(tmp_path, meshes=[{"file": "m.obj"}]))
+        static_world.build_world(load(tmp_path, meshes=[{"file": "m.obj"}]))
 
 
 def test_a_mesh_without_triangles_is_refused(tmp_path):
     (tmp_path / "m.obj").write_text("v 0 0 0\nv 1 0 0\n")
     with pytest.raises(InputError, match=r"m\.obj"):
-        static_world.build(load(tmp_path, meshes=[{"file": "m.obj"}]))
+        static_world.build_world(load(tmp_path, meshes=[{"file": "m.obj"}]))
 
 
 def test_a_mesh_of_nothing_but_degenerate_triangles_is_refused(tmp_path):
     (tmp_path / "m.obj").write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 1 2\nf 1 2 3\n")
     with pytest.raises(InputError, match=r"m\.obj"):
-        static_world.build(load(tmp_path, meshes=[{"file": "m.obj"}]))
+        static_world.build_world(load(tmp_path, meshes=[{"file": "m.obj"}]))
 
 
 def test_ground_reaches_beyond_everything(tmp_path):
     (tmp_path / "s.geojson").write_text(collection(polygon([[p[0] + 300, p[1]] for p in SQUARE])))
     loaded = load(tmp_path, footprints=["s.geojson"], ground=True)
-    world, _ = static_world.build(loaded)
+    world, _ = static_world.build_world(loaded)
     ground = world.triangles_m[world.solid_of_face == 1]
     assert (ground[..., 2] == 0).all()
     assert ground[..., 0].max() == 304 + static_world.GROUND_MARGIN_M
@@ -334,12 +333,12 @@ def checked_at(folder, *sites, features, ground=True):
         "site,x_m,y_m,z_m\n" + "".join(f"s{i},{x!r},{y!r},{z!r}\n" for i, (x, y, z) in enumerate(sites))
     )
     loaded = load(folder, footprints=["s.geojson"], ground=ground)
-    return checked(loaded, static_world.build(loaded)[0])
+    return checked(loaded, static_world.build_world(loaded)[0])
 
 
 def checked(loaded, world):
     """The scene, once all of its sites are checked."""
-    scene = scene_resolving.resolve(loaded, world)
+    scene = inputs.resolve_scene(loaded, world)
     Scanner(scene).check(scene.sites)
     return scene
 
@@ -378,7 +377,7 @@ def test_free_places(tmp_path, site):
 @pytest.mark.parametrize(
     ("site", "message"),
     [
-        ((12.0, 12.0, 3.0), r"site s0: .* stands inside court \(building\)"),
+        ((12.0, 12.0, 3.0), r"site s0: .* is inside court \(building\)"),
         ((10.001, 20.0, 3.0), "inside court"),
         ((12.5, 20.0, 11.999), "inside court"),
         ((12.5, 12.5, 6.0), "inside court"),  # above a diagonal of the triangulation
@@ -386,7 +385,7 @@ def test_free_places(tmp_path, site):
         ((-15.0, -15.0, 4.00001), "inside crown"),
         ((0.0, 0.0, 0.0), "not above the ground"),
         ((0.0, 0.0, -1.0), "not above the ground"),
-        ((200.0, 20.0, 3.0), r"stands 140\.0 m from the region of interest"),
+        ((200.0, 20.0, 3.0), r"the site is 140\.0 m from the region of interest"),
     ],
 )
 def test_impossible_places(tmp_path, site, message):
@@ -440,12 +439,12 @@ def test_closed_means_each_side_met_by_its_opposite():
 
 def test_shipped_statics_are_closed_and_clean():
     for name in ("nishishinjuku", "ingolstadt", "roundabout"):
-        world, counts = static_world.build(loading.load(f"scenarios/{name}"))
+        world, counts = static_world.build_world(loading.load(f"scenarios/{name}"))
         kinds = [kind for _, kind in world.solids]
         assert [k for k, closed in zip(kinds, world.closed, strict=True) if not closed] == ["ground"]
         assert (world.signs[world.closed] == 1).all()
-        assert not counts.mended
-        assert not counts.left_out
+        assert not counts.repaired
+        assert not counts.ignored
         features = json.loads((Path("scenarios") / name / "statics.geojson").read_text())["features"]
         assert sum(counts.built.values()) >= len(features)
 
@@ -464,7 +463,7 @@ def located(folder, **settings):
         "sites": {"file": "sites.csv", "sensor": "VLP-16"},
         "statics": {"ground": False, **settings},
     }
-    return static_world.build(from_values(values, folder, "scenario.toml"))
+    return static_world.build_world(scenario_from_dict(values, folder, "scenario.toml"))
 
 
 def test_features_in_degrees_are_counted_and_stand_where_metres_put_them(tmp_path):
@@ -476,7 +475,7 @@ def test_features_in_degrees_are_counted_and_stand_where_metres_put_them(tmp_pat
     (tmp_path / "s.geojson").write_text(collection(*degrees))
     world, counts = located(tmp_path, footprints=["s.geojson"])
     assert np.array_equal(world.vertices_m, built(tmp_path, *metres)[0].vertices_m)
-    assert counts.mended == {"features in degrees, brought into the world frame": 2}
+    assert counts.repaired == {"features in degrees, brought into the world frame": 2}
     assert world.solids[0] == ("s_0", "footprint")
 
 
@@ -486,7 +485,7 @@ def test_lines_that_rounding_has_left_beside_a_polygon_are_counted(tmp_path):
     both = {"type": "GeometryCollection", "geometries": [{"type": "Polygon", "coordinates": [SQUARE]}, thin]}
     world, counts = built(tmp_path, feature(both, height_m=3))
     assert volumes(world) == pytest.approx([48], rel=1e-12)
-    assert counts.mended == {"lines and points beside polygons, left out": 1}
+    assert counts.repaired == {"lines and points beside polygons, left out": 1}
 
 
 def test_rings_that_rounded_degrees_make_cross_are_mended_and_others_are_not(tmp_path):
@@ -494,7 +493,7 @@ def test_rings_that_rounded_degrees_make_cross_are_mended_and_others_are_not(tmp
     notched = [[0, 0], [4, 0], [4, 4], [2.01, 4], [2.0, -0.02], [1.99, 4], [0, 4], [0, 0]]
     (tmp_path / "s.geojson").write_text(collection(polygon(FRAME.to_degrees(np.array(notched)).tolist())))
     world, counts = located(tmp_path, footprints=["s.geojson"])
-    assert counts.mended["rings that rounded degrees made cross"] == 1
+    assert counts.repaired["rings that rounded degrees made cross"] == 1
     assert volumes(world).sum() == pytest.approx(80, rel=0.01)
     with pytest.raises(InputError, match="is not a sound polygon"):
         built(tmp_path, polygon(notched))
@@ -546,7 +545,7 @@ def test_a_mesh_that_lies_elsewhere_is_refused(tmp_path):
 def test_all_wrong_features_of_a_file_are_told_at_once(tmp_path: Path) -> None:
     """Twenty by name, then how many more; what ``egvs new`` notes beside a height is no misspelt height."""
     wrong = [polygon(SQUARE, name=f"w{number}", height_m=None, height_from="levels") for number in range(23)]
-    with pytest.raises(FindingsError) as caught:
+    with pytest.raises(DiagnosticsError) as caught:
         built(tmp_path, polygon(SQUARE), polygon(SQUARE, height_m="tall", name="t"), *wrong)
     told = [str(finding) for finding in caught.value.findings]
     assert len(told) == 21

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.core.errors import InputError
-from pipeline.core.sumo_home import sumo_home
-from pipeline.formats import osm
-from pipeline.scenario.loading import from_values
-from pipeline.scenario.models import Scenario
-from pipeline.traffic import network, sumo_folder
-from pipeline.traffic.network import Location
-from pipeline.world import world_frame
+from egvs.core.errors import InputError
+from egvs.core.runtime import sumo_home
+from egvs.formats import osm
+from egvs.scenario.loading import scenario_from_dict
+from egvs.scenario.model import Scenario
+from egvs.traffic import network, sumo_folder
+from egvs.traffic.network import Location
+from egvs.world import geolocation
 
 SMALL = Path(__file__).parents[1] / "importers" / "data" / "small.osm"
 REAL = Path(__file__).parents[3] / "shared" / "real" / "bad_hersfeld.osm"
@@ -27,7 +27,9 @@ INGOLSTADT = "tools/game/fkk_in/ingolstadt.net.xml.gz"
 
 def load(folder: Path, traffic: dict[str, Any], center: tuple[float, float] = (0, 0), **values: Any) -> Scenario:
     roi = {"center_m": [*center, 2.5], "size_m": [60, 60, 5]}
-    return from_values({"roi": roi, "traffic": traffic, "sites": {"file": "s.csv"}, **values}, folder, "scenario.toml")
+    return scenario_from_dict(
+        {"roi": roi, "traffic": traffic, "sites": {"file": "s.csv"}, **values}, folder, "scenario.toml"
+    )
 
 
 def with_location(folder: Path, projection: str, offset: str = "-550000.00,-5634000.00") -> dict[str, Any]:
@@ -47,10 +49,10 @@ UTM = "+proj=utm +zone=32 +ellps=WGS84 +datum=WGS84 +units=m +no_defs"
     not REAL.is_file(), reason="bad_hersfeld.osm is not beside the checkout (shared/real)"))])  # fmt: skip
 def test_a_junction_is_where_its_node_is_on_the_map(tmp_path: Path, map_file: Path) -> None:
     sumo_folder.convert_osm(map_file, tmp_path / "n.net.xml")
-    world = world_frame.of(load(tmp_path, {"network": "n.net.xml"}))
+    world = geolocation.scenario_georeference(load(tmp_path, {"network": "n.net.xml"}))
     assert world.frame is not None
-    nodes = osm.read(map_file).nodes
-    known = [j for j in network.read(tmp_path / "n.net.xml").junctions if j.id.isdigit() and int(j.id) in nodes]
+    nodes = osm.read_osm(map_file).nodes
+    known = [j for j in network.read_net_xml(tmp_path / "n.net.xml").junctions if j.id.isdigit() and int(j.id) in nodes]
     assert len(known) > 5
     junctions = np.array([j.at_m for j in known])
     lon_lat_deg = np.array([nodes[int(j.id)] for j in known])[:, ::-1]
@@ -67,15 +69,17 @@ def test_a_map_as_network_lies_where_netconvert_will_put_it(tmp_path: Path) -> N
     sumo_folder.convert_osm(SMALL, tmp_path / "n.net.xml")
     (tmp_path / "m.osm.xml").write_bytes(SMALL.read_bytes())
     by_net, by_map = (load(tmp_path, {"network": name}) for name in ("n.net.xml", "m.osm.xml"))
-    assert world_frame.of(by_map).frame == world_frame.of(by_net).frame is not None
-    assert world_frame.key(by_map)["world_frame"].keys() == {"map", "sumo"}
+    assert (
+        geolocation.scenario_georeference(by_map).frame == geolocation.scenario_georeference(by_net).frame is not None
+    )
+    assert geolocation.world_frame_settings(by_map)["world_frame"].keys() == {"map", "sumo"}
 
 
 def test_a_real_network_knows_its_town(tmp_path: Path) -> None:
     """Against sumolib, which inverts the same location with its own code."""
     import sumolib
 
-    world = world_frame.of(load(tmp_path, {"network": f"$SUMO_HOME/{INGOLSTADT}"}, (5770, 5665)))
+    world = geolocation.scenario_georeference(load(tmp_path, {"network": f"$SUMO_HOME/{INGOLSTADT}"}, (5770, 5665)))
     found = world.lon_lat_deg(np.array([[5770.0, 5665.0], [5525.68, 5517.09]]))
     assert found is not None
     net = sumolib.net.readNet(str(sumo_home() / INGOLSTADT))
@@ -86,28 +90,30 @@ def test_a_real_network_knows_its_town(tmp_path: Path) -> None:
 def test_a_network_that_was_drawn_lies_nowhere(tmp_path: Path) -> None:
     for projection in ("!", "", "-", "."):
         scene = load(tmp_path, with_location(tmp_path, projection))
-        assert world_frame.of(scene).frame is None
-        assert ("world_frame" in world_frame.key(scene)) == (projection in ("-", "."))
+        assert geolocation.scenario_georeference(scene).frame is None
+        assert ("world_frame" in geolocation.world_frame_settings(scene)) == (projection in ("-", "."))
 
 
 def test_a_network_that_is_missing_is_told_by_who_needs_it(tmp_path: Path) -> None:
     """Statics, scans and scores can be made again where only they are kept."""
     for traffic in ({"network": "gone.net.xml"}, {"sumocfg": "gone.sumocfg"}):
         scene = load(tmp_path, traffic)
-        assert world_frame.of(scene).frame is None
-        assert world_frame.key(scene) == {}
+        assert geolocation.scenario_georeference(scene).frame is None
+        assert geolocation.world_frame_settings(scene) == {}
 
 
 def test_a_scenario_may_say_it_itself(tmp_path: Path) -> None:
     crs = {"epsg": 32632, "offset_m": [-550000, -5634000]}
     scene = load(tmp_path, {"fcd": "f.csv"}, (700, 1200), crs=crs)
     by_net = load(tmp_path, with_location(tmp_path, UTM), (700, 1200))
-    stated, own = (world_frame.of(s).lon_lat_deg(np.array([[700.0, 1200.0]])) for s in (scene, by_net))
+    stated, own = (
+        geolocation.scenario_georeference(s).lon_lat_deg(np.array([[700.0, 1200.0]])) for s in (scene, by_net)
+    )
     assert np.array_equal(stated, own)
-    assert world_frame.key(scene) == {"world_frame": {"crs": [32632, -550000, -5634000]}}
-    assert world_frame.key(by_net) == {"world_frame": {"location": [UTM, -550000, -5634000]}}
-    assert world_frame.key(load(tmp_path, {"fcd": "f.csv"})) == {}
-    world_frame.of(load(tmp_path, with_location(tmp_path, UTM), (700, 1200), crs=crs))
+    assert geolocation.world_frame_settings(scene) == {"world_frame": {"crs": [32632, -550000, -5634000]}}
+    assert geolocation.world_frame_settings(by_net) == {"world_frame": {"location": [UTM, -550000, -5634000]}}
+    assert geolocation.world_frame_settings(load(tmp_path, {"fcd": "f.csv"})) == {}
+    geolocation.scenario_georeference(load(tmp_path, with_location(tmp_path, UTM), (700, 1200), crs=crs))
 
 
 @pytest.mark.parametrize(
@@ -128,15 +134,17 @@ def test_a_scenario_may_say_it_itself(tmp_path: Path) -> None:
 )  # fmt: skip
 def test_what_contradicts_itself_is_refused(tmp_path: Path, crs: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        world_frame.of(load(tmp_path, with_location(tmp_path, UTM), (700, 1200), crs=crs))
+        geolocation.scenario_georeference(load(tmp_path, with_location(tmp_path, UTM), (700, 1200), crs=crs))
 
 
 def test_a_network_that_draws_lengths_too_long_is_refused(tmp_path: Path) -> None:
     """Vehicles keep their size, streets do not: at 51 degrees Web Mercator draws them 1.6 times as long."""
     scene = load(tmp_path, with_location(tmp_path, "EPSG:3857", "-1081000,-6594000"), (700, 1200))
     with pytest.raises(InputError, match=r"the network: its <location> \(EPSG:3857\) draws lengths 1.58 times as long"):
-        world_frame.of(scene)
-    world_frame.of(load(tmp_path, with_location(tmp_path, UTM, "0,0"), (700, 1200)))  # a forgotten offset is none
+        geolocation.scenario_georeference(scene)
+    geolocation.scenario_georeference(
+        load(tmp_path, with_location(tmp_path, UTM, "0,0"), (700, 1200))
+    )  # a forgotten offset is none
 
 
 def test_an_offset_needs_its_projection(tmp_path: Path) -> None:
@@ -148,10 +156,10 @@ def test_an_offset_needs_its_projection(tmp_path: Path) -> None:
 def test_a_damaged_location_is_told(tmp_path: Path) -> None:
     scene = load(tmp_path, with_location(tmp_path, UTM, "here"))
     with pytest.raises(InputError, match=r"n.net.xml: <location> is not as SUMO writes it"):
-        world_frame.of(scene)
+        geolocation.scenario_georeference(scene)
 
 
 def test_what_sumo_says_in_words_of_its_own_is_no_frame() -> None:
-    assert world_frame.located(None) is None
-    assert world_frame.located(Location("-", (0.0, 0.0))) is None
-    assert world_frame.located(Location(UTM, (1.0, 2.0))) is not None
+    assert geolocation.network_world_frame(None) is None
+    assert geolocation.network_world_frame(Location("-", (0.0, 0.0))) is None
+    assert geolocation.network_world_frame(Location(UTM, (1.0, 2.0))) is not None

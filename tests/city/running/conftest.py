@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from pipeline.city.running import clusters
-from pipeline.city.running.jobs import Job
+from egvs.city import scheduler
+from egvs.city.tasks import Job
 from tests.conftest import write_mini
 
 
@@ -46,4 +46,4 @@ def here(client: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     def connected(_where: str) -> Iterator[Any]:
         yield client
 
-    monkeypatch.setattr(clusters, "connected", connected)
+    monkeypatch.setattr(scheduler, "connect", connected)

@@ -8,25 +8,25 @@ from pathlib import Path
 import pyogrio
 import pytest
 
-from pipeline.city import city_place, city_run
-from pipeline.city.model import City
-from pipeline.core.errors import InputError
-from pipeline.export.exporting import export
+from egvs.city import city_run
+from egvs.city.model import City
+from egvs.core.errors import InputError
+from egvs.export.export import export_run
 
 pytestmark = pytest.mark.usefixtures("here")
 
 
 @pytest.mark.slow
 def test_a_citys_run_is_exported(city: City, tmp_path: Path) -> None:
-    placed = city_place.place(city, tmp_path / "out", count=2)
-    (path,) = export(tmp_path / "out", "gpkg").paths
+    placed = city_run.place_city(city, tmp_path / "out", count=2)
+    (path,) = export_run(tmp_path / "out", "gpkg").paths
     assert path.name == "town.gpkg"
     layers = {name: pyogrio.read_dataframe(path, layer=name) for name in ("junctions", "plan", "sites")}
     assert layers["junctions"]["junction"].tolist() == ["west", "east"]
     assert layers["junctions"].geometry.x.tolist() == [20.0, 520.0]
     assert layers["plan"]["site"].tolist() == [sensor.site for sensor in placed.plan.sensors]
     assert len(layers["sites"]) == 4
-    written = export(tmp_path / "out", "csv").paths
+    written = export_run(tmp_path / "out", "csv").paths
     assert [path.stem for path in written] == ["junctions", "plan", "sites"]
     with written[0].open(encoding="utf-8-sig") as file:
         assert [row["rank"] for row in csv.DictReader(file)] == ["1", "2"]
@@ -34,17 +34,17 @@ def test_a_citys_run_is_exported(city: City, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_what_cannot_be_exported_of_a_city(city: City, tmp_path: Path) -> None:
-    out = city_run.run(city, tmp_path / "out").out
+    out = city_run.run_city(city, tmp_path / "out").out
     with pytest.raises(InputError, match=r"--to geotiff: .* is a city's run; a junction's"):
-        export(out, "geotiff")
-    city_place.place(city, out, count=1)
-    ran = city_run.run(city, out, sets=["roi.voxel_m=1"])
+        export_run(out, "geotiff")
+    city_run.place_city(city, out, count=1)
+    ran = city_run.run_city(city, out, sets=["roi.voxel_m=1"])
     assert "plan.parquet" not in {path.name for path in ran.files}
-    done = export(out, "geojson")
+    done = export_run(out, "geojson")
     assert [path.stem for path in done.paths] == ["junctions", "sites"]
     assert done.notes == (
         "the plan is left out: it was made of other junctions or settings; egvs city place makes it anew",
     )
     (out / "junctions" / "west" / "scores.parquet").unlink()
     with pytest.raises(InputError, match=r"scores\.parquet"):
-        export(out, "geojson")
+        export_run(out, "geojson")

@@ -8,13 +8,13 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-import pipeline
-from pipeline.city import city_place, city_run, model
-from pipeline.city.city_place import overlaps
-from pipeline.city.model import City
-from pipeline.city.running.jobs import Job
-from pipeline.core.errors import InputError
-from pipeline.placement.joint_score import JointScore
+import egvs
+from egvs.city import city_run, model
+from egvs.city.city_run import overlap_warnings
+from egvs.city.model import City
+from egvs.city.tasks import Job
+from egvs.core.errors import InputError
+from egvs.placement.plan import JointScore
 
 pytestmark = pytest.mark.usefixtures("here")
 
@@ -23,7 +23,7 @@ def every_set(city: City, folder: Path) -> dict[tuple[str, str], float]:
     """The joint score of every set of sites of each junction, as (junction, names)."""
     worth = {}
     for junction in city.junctions:
-        scenario = pipeline.load(junction.scenario_folder(city))
+        scenario = egvs.load(junction.scenario_folder(city))
         joint = JointScore.of(scenario, folder / junction.id)
         for count in range(len(joint.candidates) + 1):
             for names in combinations(joint.candidates, count):
@@ -36,7 +36,7 @@ def every_set(city: City, folder: Path) -> dict[tuple[str, str], float]:
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_no_choice_of_sites_is_better(city: City, tmp_path: Path, count: int) -> None:
-    placed = city_place.place(city, tmp_path / "out", count=count)
+    placed = city_run.place_city(city, tmp_path / "out", count=count)
     worth = every_set(city, tmp_path / "alone")
     best = max(
         a + b
@@ -58,31 +58,31 @@ def test_no_choice_of_sites_is_better(city: City, tmp_path: Path, count: int) ->
 
 @pytest.mark.slow
 def test_a_plan_stands_on_the_page_until_its_junctions_change(city: City, tmp_path: Path) -> None:
-    city_place.place(city, tmp_path / "out", count=2)
+    city_run.place_city(city, tmp_path / "out", count=2)
     page = tmp_path / "out" / "city.html"
     planned = page.read_bytes()
-    city_run.run(city, tmp_path / "out")
+    city_run.run_city(city, tmp_path / "out")
     assert page.read_bytes() == planned
-    city_run.run(city, tmp_path / "out", sets=["roi.voxel_m=1"])
+    city_run.run_city(city, tmp_path / "out", sets=["roi.voxel_m=1"])
     assert "The plan:" not in page.read_text()
 
 
 @pytest.mark.slow
 def test_a_budget_needs_costs_and_is_kept(city: City, tmp_path: Path) -> None:
-    with pytest.raises(Exception, match="nothing says what pole_a costs"):
-        city_place.place(city, tmp_path / "out", budget=20.0)
+    with pytest.raises(Exception, match="the cost of site pole_a is unknown"):
+        city_run.place_city(city, tmp_path / "out", budget=20.0)
     costs = ['costs.sensor={"small"=8}', "costs.pole=4"]
-    placed = city_place.place(city, tmp_path / "out", budget=25.0, sets=costs)
+    placed = city_run.place_city(city, tmp_path / "out", budget=25.0, sets=costs)
     assert [sensor.cost for sensor in placed.plan.sensors] == [12.0, 12.0]
     assert placed.plan.cost == 24.0
-    assert not city_place.place(city, tmp_path / "out", budget=11.0, sets=costs).plan.sensors
+    assert not city_run.place_city(city, tmp_path / "out", budget=11.0, sets=costs).plan.sensors
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("score", ["expected_detections", "coverage"])
 def test_shares_count_by_the_vehicles_that_are_there(city: City, tmp_path: Path, score: str) -> None:
-    placed = city_place.place(city, tmp_path / "out", count=1, sets=[f'score.rank_by="{score}"'])
-    first, (sensor,) = placed.ran.results[0], placed.plan.sensors
+    placed = city_run.place_city(city, tmp_path / "out", count=1, sets=[f'score.rank_by="{score}"'])
+    first, (sensor,) = placed.city_run.results[0], placed.plan.sensors
     assert first.gain == first.score * first.vehicles > 0
     assert (sensor.junction, sensor.site) == (first.junction.id, first.best.site)
     assert sensor.gain == pytest.approx(first.gain, rel=1e-12)
@@ -101,15 +101,15 @@ def test_shares_count_by_the_vehicles_that_are_there(city: City, tmp_path: Path,
 )
 def test_what_cannot_be_asked(city: City, tmp_path: Path, asked: dict[str, object], message: str) -> None:
     with pytest.raises(InputError) as refused:
-        city_place.place(city, tmp_path / "out", **asked)  # type: ignore[arg-type]
+        city_run.place_city(city, tmp_path / "out", **asked)  # type: ignore[arg-type]
     assert message in str(refused.value)
 
 
 def test_regions_that_overlap_are_told(city: City) -> None:
     jobs = [Job(j.id, j.scenario_folder(city), Path("out")) for j in city.junctions]
-    assert not list(overlaps(jobs))
+    assert not list(overlap_warnings(jobs))
     path = city.folder / "junctions" / "east" / "scenario.toml"
     path.write_text(path.read_text().replace("center_m = [520,", "center_m = [50,"))
-    (found,) = overlaps(jobs)
+    (found,) = overlap_warnings(jobs)
     assert "the regions of west and east overlap" in str(found)
-    assert model.load(city.folder).name == "town"
+    assert model.load_city(city.folder).name == "town"

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.core.errors import InputError
-from pipeline.scoring.blindspots.spots import SiteSeen
-from pipeline.scoring.scorer import SiteScore
-from pipeline.sensing.sites import Pose, ScannedSite
-from pipeline.stages.shared import scored_parts
-from pipeline.stages.shared.site_scoring import ScoredSite
-from pipeline.stages.shared.target_scores import SiteTargets
+from egvs.city import tasks
+from egvs.core.errors import InputError
+from egvs.scoring.blindspots import SpotVisibility
+from egvs.scoring.scorer import SiteScore
+from egvs.scoring.target_scores import SiteTargetScores
+from egvs.sensors.sites import Pose, ScannedSite
+from egvs.stages.site_scoring import ScoredSite
 
 
 def site(name: str, rng: np.random.Generator, *, full: bool) -> ScoredSite:
@@ -25,8 +25,8 @@ def site(name: str, rng: np.random.Generator, *, full: bool) -> ScoredSite:
     if not full:
         return ScoredSite(where, worth, None, None, None)
     worth = SiteScore(worth.egvs, worth.entropy_seen, worth.left_out, worth.shares, (worth, worth))
-    seen = SiteSeen(rng.integers(0, 9, 5), rng.random(5), np.array([np.nan, np.inf, 0.0, 0.1, -0.0]))
-    targets = SiteTargets({"seen_well": np.array([np.nan, 0.1])}, ({"seen_well": float("nan")},), seen)
+    seen = SpotVisibility(rng.integers(0, 9, 5), rng.random(5), np.array([np.nan, np.inf, 0.0, 0.1, -0.0]))
+    targets = SiteTargetScores({"seen_well": np.array([np.nan, 0.1])}, ({"seen_well": float("nan")},), seen)
     index = {key: rng.integers(0, 9, 3).astype(np.int32) for key in ("ix", "iy", "iz")}
     return ScoredSite(where, worth, targets, None, {**index, "hits": rng.random(3)})
 
@@ -40,8 +40,8 @@ def same(a: object, b: object) -> bool:
 def test_what_is_written_is_read(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     sites = [site("a", rng, full=True), site("b", rng, full=False), site("c", rng, full=True)]
-    scored_parts.write(tmp_path / "part.npz", sites)
-    found = list(scored_parts.read(tmp_path / "part.npz"))
+    tasks.write_part(tmp_path / "part.npz", sites)
+    found = list(tasks.read_part(tmp_path / "part.npz"))
     assert same([s.site for s in found], [s.site for s in sites])
     for there, here in zip(found, sites, strict=True):
         assert same((there.score, there.targets), (here.score, here.targets))
@@ -52,7 +52,7 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
 
 def test_the_same_sites_are_the_same_bytes(tmp_path: Path) -> None:
     for name in ("one.npz", "two.npz"):
-        scored_parts.write(tmp_path / name, [site("a", np.random.default_rng(3), full=True)])
+        tasks.write_part(tmp_path / name, [site("a", np.random.default_rng(3), full=True)])
     assert (tmp_path / "one.npz").read_bytes() == (tmp_path / "two.npz").read_bytes()
 
 
@@ -60,4 +60,4 @@ def test_the_same_sites_are_the_same_bytes(tmp_path: Path) -> None:
 def test_what_is_no_part_is_refused(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "part.npz").write_bytes(content)
     with pytest.raises(InputError, match="is no part of a score"):
-        list(scored_parts.read(tmp_path / "part.npz"))
+        list(tasks.read_part(tmp_path / "part.npz"))

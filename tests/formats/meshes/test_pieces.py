@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.formats.meshes.pieces import are_closed, pieces_of
+from egvs.formats.meshes import are_closed, mesh_components
 
 BOX = trimesh.creation.box((1, 1, 1))
 
@@ -22,7 +22,7 @@ def slowly(mesh: trimesh.Trimesh) -> list[tuple[list[int], bool]]:
 
 
 def quickly(mesh: trimesh.Trimesh) -> list[tuple[list[int], bool]]:
-    piece = pieces_of(mesh.face_adjacency, len(mesh.faces))
+    piece = mesh_components(mesh.face_adjacency, len(mesh.faces))
     closed = are_closed(np.asarray(mesh.faces), piece)
     return [(np.flatnonzero(piece == number).tolist(), bool(closed[number])) for number in range(len(closed))]
 

@@ -11,13 +11,13 @@ import pyarrow.parquet as pq
 import pytest
 import shapely
 
-import pipeline
-from pipeline.placement import placing
-from pipeline.placement.placing import Placement
-from pipeline.placement.refining import refining
-from pipeline.sensing.sites import Pose
-from pipeline.sensing.sites import of as sites_of
-from pipeline.traffic import network, sumo_folder
+import egvs
+from egvs.placement import plan as placement_plan
+from egvs.placement import refinement
+from egvs.placement.plan import Placement
+from egvs.sensors.sites import Pose
+from egvs.sensors.sites import candidate_sites as sites_of
+from egvs.traffic import network, sumo_folder
 from tests.checks.conftest import net_xml
 from tests.conftest import BUILDING
 
@@ -28,7 +28,7 @@ FEW = "placement.refine.evaluations=60"
 def plan(folder: Path, *settings: str, jobs: int = 1, out: str = "run") -> Placement:
     """A plan whose sensors move, by few poses."""
     sets = ["placement.count=2", FEW, *settings]
-    return placing.place(pipeline.load(folder, sets), folder / out, jobs=jobs)
+    return placement_plan.place(egvs.load(folder, sets), folder / out, jobs=jobs)
 
 
 def with_sites(folder: Path, poses: dict[str, Pose]) -> None:
@@ -58,30 +58,30 @@ def test_a_plan_is_never_worth_less_than_it_was(mini: Path, settings: tuple[str,
     placed = plan(mini, *settings)
     assert placed.moves is not None
     point = placed.solution.point
-    assert placed.moves.before == point.worth.joint
-    assert placed.moves.value_before == point.worth.value
+    assert placed.moves.before == point.plan_value.joint
+    assert placed.moves.value_before == point.plan_value.value
     assert placed.moves.value > placed.moves.value_before
-    if point.worth.value == point.worth.joint:
+    if point.plan_value.value == point.plan_value.joint:
         assert (placed.moves.value, placed.joint > placed.moves.before) == (placed.joint, True)
-    assert placed.picks[-1].score == placed.joint
+    assert placed.sensors[-1].score == placed.joint
     assert all(zone.seen >= zone.share for zone in placed.zones)
-    assert {pick.site.name for pick in placed.picks} == set(placed.curve_sites[-1])
+    assert {pick.site.name for pick in placed.sensors} == set(placed.curve_sites[-1])
 
 
 @pytest.mark.slow
 def test_the_score_is_that_of_candidates_that_hang_so(mini: Path) -> None:
     """Bit for bit: a scenario whose sites are the moved poses has the same plan of the same score without moving, and
     so has one with a sensor put back."""
-    first = {site.name: site.pose for site in sites_of(pipeline.load(mini))}
+    first = {site.name: site.pose for site in sites_of(egvs.load(mini))}
     placed = plan(mini, "placement.refine.radius_m=2", "placement.refine.heights_m=[2, 5]")
-    moved = {pick.site.name: pick.site.pose for pick in placed.picks}
+    moved = {pick.site.name: pick.site.pose for pick in placed.sensors}
     assert moved.keys() == first.keys()
     whole = _unmoved(mini, moved)
     assert whole.joint == placed.joint
-    assert [(pick.site.name, pick.gain, pick.loss) for pick in whole.picks] == [
-        (pick.site.name, pick.gain, pick.loss) for pick in placed.picks
+    assert [(pick.site.name, pick.gain, pick.loss) for pick in whole.sensors] == [
+        (pick.site.name, pick.gain, pick.loss) for pick in placed.sensors
     ]
-    for pick in placed.picks:
+    for pick in placed.sensors:
         name = pick.site.name
         assert placed.joint - _unmoved(mini, moved | {name: first[name]}).joint == pick.gain_by_refining > 0
         assert pick.moved_m == pytest.approx(math.dist(moved[name].position_m, first[name].position_m))
@@ -90,7 +90,7 @@ def test_the_score_is_that_of_candidates_that_hang_so(mini: Path) -> None:
 def _unmoved(folder: Path, poses: dict[str, Pose]) -> Placement:
     kept = (folder / "sites.csv").read_text()
     with_sites(folder, poses)
-    placed = placing.place(pipeline.load(folder, [f"placement.count={len(poses)}"]), folder / "again", jobs=1)
+    placed = placement_plan.place(egvs.load(folder, [f"placement.count={len(poses)}"]), folder / "again", jobs=1)
     (folder / "sites.csv").write_text(kept)
     return placed
 
@@ -102,8 +102,8 @@ def test_from_the_worst_corner_it_finds_what_a_fine_grid_finds(mini: Path) -> No
     heights, pitches = [2, 3, 4, 5, 6], list(range(-30, 11))
     grid = {f"{z:g}/{p}".replace("/", "_"): Pose(10, 12, z, 0.0, p) for z in heights for p in pitches}
     with_sites(mini, grid)
-    every = pipeline.load(mini, ["score.standard_error=false", "scan.keep=false"])
-    pipeline.run(every, mini / "grid", jobs=1)
+    every = egvs.load(mini, ["score.standard_error=false", "scan.keep=false"])
+    egvs.run(every, mini / "grid", jobs=1)
     scores = dict(zip(grid, pq.read_table(mini / "grid" / "scores.parquet").column("egvs").to_pylist(), strict=True))
     worst = min((f"{z:g}_{p}" for z in (2, 6) for p in (-30, 10)), key=lambda name: scores[name])
     assert scores[worst] < 0.8 * max(scores.values())
@@ -121,7 +121,7 @@ def test_poses_that_cannot_be_are_counted_and_never_taken(mini: Path) -> None:
     placed = plan(mini, f"placement.refine.within_m=[{polygon}]", "placement.refine.heights_m=[0.5, 5]")
     assert placed.moves is not None and placed.moves.impossible > 0
     house = shapely.Polygon(BUILDING[0])
-    for pick in placed.picks:
+    for pick in placed.sensors:
         assert not house.contains(shapely.Point(pick.site.pose.x_m, pick.site.pose.y_m))
 
 
@@ -131,11 +131,11 @@ def test_no_pole_moves_into_a_lane(mini: Path, monkeypatch: pytest.MonkeyPatch) 
     with_sites(mini, {"a": Pose(10, 4.2, 3.0)})
     settings = "placement.count=1", "placement.refine.within_m=[[[9, 0], [11, 0], [11, 4.4], [9, 4.4]]]"
     anywhere = plan(mini, *settings)
-    monkeypatch.setattr(sumo_folder, "roads", lambda _: network.read(mini / "net.net.xml"))
+    monkeypatch.setattr(sumo_folder, "read_network", lambda _: network.read_net_xml(mini / "net.net.xml"))
     beside = plan(mini, *settings)
     assert anywhere.moves is not None and anywhere.moves.impossible == 0
     assert beside.moves is not None and beside.moves.impossible > 0.1 * beside.moves.tried
-    assert beside.picks[0].site.pose.y_m > 3.0
+    assert beside.sensors[0].site.pose.y_m > 3.0
 
 
 def test_a_budget_holds_while_sensors_move(mini: Path) -> None:
@@ -144,7 +144,7 @@ def test_a_budget_holds_while_sensors_move(mini: Path) -> None:
     settings = "placement.count=1", "placement.refine.heights_m=[6, 9]", "costs.metre=100"
     scarce, ample = (plan(mini, *settings, f"placement.budget={budget}") for budget in (750, 9000))
     assert 700 < scarce.cost <= 750 < ample.cost
-    assert scarce.cost == pytest.approx(100 * scarce.picks[0].site.pose.z_m)
+    assert scarce.cost == pytest.approx(100 * scarce.sensors[0].site.pose.z_m)
     assert scarce.moves is not None and ample.moves is not None
     assert scarce.moves.before == ample.moves.before < scarce.joint < ample.joint
 
@@ -155,7 +155,7 @@ def test_a_candidate_that_sees_nothing_is_refused_before_it_moves(mini: Path) ->
     text = (mini / "scenario.toml").read_text()
     narrow = text.replace("channels = 8", "channels = 1").replace("[-15, 5]", "[80, 80]")
     (mini / "scenario.toml").write_text(narrow)
-    with pytest.raises(pipeline.InputError, match=r"all candidates together have a joint score .egvs. of 0"):
+    with pytest.raises(egvs.InputError, match=r"the joint score .egvs. of all candidates is 0"):
         plan(mini, "placement.count=1")
 
 
@@ -166,13 +166,13 @@ def test_sensors_do_not_meet(mini: Path, setting: str, least_m: float) -> None:
     with_sites(mini, {"a": Pose(19, 11, 3.0), "b": Pose(21.5, 11, 3.0)})
     polygon = "[[18, 8], [23, 8], [23, 12], [18, 12]]"
     placed = plan(mini, f"placement.refine.within_m=[{polygon}]", setting)
-    assert math.dist(*(pick.site.pose.position_m for pick in placed.picks)) >= least_m
+    assert math.dist(*(pick.site.pose.position_m for pick in placed.sensors)) >= least_m
     assert placed.moves is not None and placed.moves.impossible > 0
 
 
 def test_the_forced_one_stays_and_costs_nothing(mini: Path) -> None:
     placed = plan(mini, "placement.forced=['pole_a']", "placement.refine.radius_m=2", "costs.pole=5")
-    forced, other = placed.picks
+    forced, other = placed.sensors
     assert forced.is_forced and forced.site.pose == Pose(10, 12, 3) and (forced.moved_m, forced.cost) == (0.0, 0.0)
     assert other.moved_m > 0.0 and other.cost == 5.0
 
@@ -187,35 +187,35 @@ def test_the_same_bytes_twice_and_on_two_threads(mini: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_command_tells_what_moving_gained(mini: Path, egvs) -> None:
+def test_the_command_tells_what_moving_gained(mini: Path, run_egvs) -> None:
     out = mini / "run"
-    assert egvs("run", mini, "--out", out)[0] == 0
-    code, told, _ = egvs("place", mini, "--count", 2, "--refine", "--out", out, "--set", FEW)
+    assert run_egvs("run", mini, "--out", out)[0] == 0
+    code, told, _ = run_egvs("place", mini, "--count", 2, "--refine", "--out", out, "--set", FEW)
     assert code == 0
     moved = (
         "Its sensors have moved from where the candidates hang (<code>--refine</code>): as candidates they have 2,650"
     )
     assert moved in (out / "report.html").read_text()
-    assert "moved: egvs 2650.3 before, " in told
-    assert "what is proved holds for candidates as they are given" in told
+    assert "refined: egvs 2650.3 before, " in told
+    assert "the proof applies to the candidates at their original poses" in told
     assert "gained by moving" in told
     table = pq.read_table(out / "placement.parquet")
     assert min(table.column("gain_by_refining").to_pylist()) > 0.0
     assert table.column("moved_m").to_pylist() == [0.0, 0.0]
-    assert "what was asked for" not in told
-    code, told, _ = egvs("place", mini, "--count", 2, "--refine", "--out", out, "--set", FEW, "--set",
+    assert "; objective " not in told
+    code, told, _ = run_egvs("place", mini, "--count", 2, "--refine", "--out", out, "--set", FEW, "--set",
                          "placement.survives=1")  # fmt: skip
-    assert code == 0 and "; what was asked for " in told
-    code, told, _ = egvs("place", mini, "--count", 2, "--out", out)
+    assert code == 0 and "; objective " in told
+    code, told, _ = run_egvs("place", mini, "--count", 2, "--out", out)
     assert code == 0 and "moved" not in told
     assert "moved_m" not in pq.read_table(out / "placement.parquet").column_names
 
 
-def test_nothing_that_may_move_is_refused_and_leaves_no_plan(mini: Path, egvs) -> None:
-    code, _, told = egvs("place", mini, "--count", 2, "--refine", "--out", mini / "run", "--set",
+def test_nothing_that_may_move_is_refused_and_leaves_no_plan(mini: Path, run_egvs) -> None:
+    code, _, told = run_egvs("place", mini, "--count", 2, "--refine", "--out", mini / "run", "--set",
                          "placement.forced=['pole_a', 'pole_b']")  # fmt: skip
     assert code == 2
-    assert "placement.refine: no sensor of the plan may move at all" in told
+    assert "placement.refine: no sensor of the plan can move" in told
     assert not (mini / "run" / "placement.parquet").exists()
 
 
@@ -223,4 +223,4 @@ def test_a_turn_asks_for_no_more_poses_than_it_may(mini: Path) -> None:
     placed = plan(mini)
     assert placed.moves is not None
     assert placed.moves.tried <= 60 * placed.moves.turns
-    assert refining.WORTHWHILE > 0.0
+    assert refinement.MIN_IMPROVEMENT > 0.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.placement.refining.searching import search
+from egvs.placement.refinement import minimise
 
 LOWEST = np.array([0.95, 0.3, 1.0])
 ENDS: tuple[list[float | None], list[float | None]] = ([None, 0.0, 0.0], [None, 1.0, 1.0])
@@ -24,7 +24,7 @@ def asked(axes: int, evaluations: int, start: float = 0.5, seed: int = 0) -> tup
         return losses[-1]
 
     ends = ENDS[0][:axes], ENDS[1][:axes]
-    search(of, np.full(axes, start), ends, evaluations, np.random.default_rng(seed))
+    minimise(of, np.full(axes, start), ends, evaluations, np.random.default_rng(seed))
     return np.concatenate(points), np.concatenate(losses)
 
 
@@ -51,7 +51,7 @@ def global_state() -> str:
 
 def test_losses_that_are_all_alike_end_it() -> None:
     calls = []
-    search(
+    minimise(
         lambda some: calls.append(len(some)) or np.full(len(some), 1e6),  # type: ignore[func-returns-value]
         np.full(2, 0.5),
         ([0.0, 0.0], [1.0, 1.0]),

@@ -8,11 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.kernels.placement.together import CAPPED, LOGARITHM, SATURATING
-from pipeline.placement.solving.problem import Demand, Problem
-from pipeline.placement.solving.rules import Rules
-from pipeline.placement.solving.sight import Row, Sight
-from pipeline.placement.solving.terms import Term
+from egvs.kernels.submodular import CAPPED, LOGARITHM, SATURATING
+from egvs.placement.problem import CoverageTerm, Demand, PlanRules, Problem, VisibilityMatrix, VisibilityRow
 
 
 @dataclass(frozen=True)
@@ -24,14 +21,20 @@ class Instance:
     """(candidates, cells) int64."""
 
 
-def sight_of(hits: np.ndarray, most: int = 2**62) -> Sight:
+def sight_of(hits: np.ndarray, most: int = 2**62) -> VisibilityMatrix:
     """From hits (candidates, cells)."""
-    return Sight.of((Row.of(row, most) for row in hits), hits.shape[1])
+    return VisibilityMatrix.of((VisibilityRow.of(row, most) for row in hits), hits.shape[1])
 
 
 def term_of(
-    name: str, sight: Sight, weight: np.ndarray, *, curve: int = CAPPED, scale: float = 3.0, each_once: bool = False
-) -> Term:
+    name: str,
+    sight: VisibilityMatrix,
+    weight: np.ndarray,
+    *,
+    curve: int = CAPPED,
+    scale: float = 3.0,
+    each_once: bool = False,
+) -> CoverageTerm:
     """A sum whose exact value is :func:`math.fsum`'s."""
     most = int(np.bincount(sight.cells, sight.amounts).max(initial=0))
     worths = np.array([worth(curve, scale, total) for total in range(most + 1)])
@@ -39,7 +42,7 @@ def term_of(
     def exact(totals: np.ndarray) -> float:
         return math.fsum((weight * worths[totals]).tolist())
 
-    return Term(name, sight, weight, curve, scale, each_once, exact)
+    return CoverageTerm(name, sight, weight, curve, scale, each_once, exact)
 
 
 def worth(curve: int, scale: float, total: int) -> float:
@@ -75,7 +78,7 @@ def drawn(seed: int) -> Instance:
     budget = float(rng.integers(6, 20)) if rng.random() < 0.4 else np.inf
     near = float(rng.choice([0.0, 0.0, 0.35]))
     at = np.column_stack([rng.random((n, 2)), np.full(n, 3.0)])
-    rules = Rules(
+    rules = PlanRules(
         count=int(rng.integers(max(1, len(forced)), 5)), budget=budget, cost=cost, pole_cost=pole_cost, pole=pole,
         forced=forced, excluded=excluded, most_per_pole=int(rng.choice([1, 2, n])), position_m=at,
         least_distance_m=near,
@@ -109,7 +112,7 @@ def drawn_degenerate(seed: int) -> Instance:
     cost = rng.choice([0.0, 0.1, 0.2, 0.3, 0.7], n)
     pole_cost = np.minimum(cost, rng.choice([0.0, 0.1, 0.2], n))
     cost[list(forced)] = pole_cost[list(forced)] = 0.0
-    rules = Rules(
+    rules = PlanRules(
         count=int(rng.integers(max(1, len(forced)), n + 4)), budget=float(rng.choice([np.inf, 0.1 + 0.2, 0.3, 0.9])),
         cost=cost, pole_cost=pole_cost, pole=rng.integers(0, n, n), forced=forced, excluded=excluded,
         most_per_pole=int(rng.choice([1, 2, n])), position_m=rng.integers(0, 3, (n, 3)).astype(float),
@@ -121,7 +124,7 @@ def drawn_degenerate(seed: int) -> Instance:
     return Instance(Problem(mix, objective, demands, rules, int(rng.random() < 0.2)), hits)
 
 
-def _seen_by(sight: Sight, zone: np.ndarray, sensors: int) -> Term:
+def _seen_by(sight: VisibilityMatrix, zone: np.ndarray, sensors: int) -> CoverageTerm:
     """The share of a zone's cells that so many see; its weights are those of a sum that is never below it."""
     term = term_of("zone", sight, zone / (zone.sum() * sensors), scale=float(sensors), each_once=True)
     return replace(term, exact=lambda totals: float(zone[totals >= sensors].sum() / zone.sum()))
@@ -136,7 +139,7 @@ def every_plan(problem: Problem):
                 yield plan
 
 
-def _keeps(rules: Rules, plan: tuple[int, ...]) -> bool:
+def _keeps(rules: PlanRules, plan: tuple[int, ...]) -> bool:
     if not set(rules.forced) <= set(plan) or any(rules.excluded[i] for i in plan):
         return False
     on_pole: dict[int, list[int]] = {}
@@ -158,7 +161,7 @@ def _keeps(rules: Rules, plan: tuple[int, ...]) -> bool:
 def value_of(problem: Problem, plan: tuple[int, ...], hits: np.ndarray) -> tuple[bool, float]:
     """Whether a plan meets the demands, and its value, by the definitions."""
 
-    def of(term: Term, those: tuple[int, ...]) -> float:
+    def of(term: CoverageTerm, those: tuple[int, ...]) -> float:
         rows = hits[list(those)] > 0 if term.each_once else hits[list(those)]
         return term.exact(rows.sum(axis=0).astype(int))
 

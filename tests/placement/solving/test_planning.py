@@ -8,9 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.placement.solving import exact, planning
-from pipeline.placement.solving.problem import Demand, Problem
-from pipeline.placement.solving.rules import Rules
+from egvs.placement import branch_and_bound, solver
+from egvs.placement.problem import Demand, PlanRules, Problem
 from tests.placement.solving.instances import drawn, drawn_degenerate, every_plan, sight_of, term_of, value_of
 
 
@@ -32,27 +31,27 @@ def test_no_plan_is_better_than_the_one_that_is_proved_and_no_bound_is_exceeded(
     """2,000 problems of every kind: the exact plan is the best to the last bit, and no certificate is wrong."""
     for seed in range(start, start + 100):
         its = drawn(seed)
-        if not its.problem.rules.keeps(its.problem.rules.forced):
+        if not its.problem.rules.allows(its.problem.rules.forced):
             continue  # refused before a plan is looked for
         best = best_of_all(its)
-        solution = planning.best(its.problem, search_all=False, time_limit_s=0.0, heard=unheard)
-        bounds = planning.bounds_of(its.problem, solution.point.worth)
-        proved = exact.search(its.problem, solution.point.plan, bounds, time_limit_s=60.0)
-        assert proved.is_whole, seed
-        for plan, worth in ((solution.order, solution.point.worth), (proved.plan, proved.worth)):
+        solution = solver.best_plan(its.problem, search_all=False, time_limit_s=0.0, on_progress=unheard)
+        bounds = solver.term_bounds(its.problem, solution.point.plan_value)
+        proved = branch_and_bound.search_all_plans(its.problem, solution.point.plan, bounds, time_limit_s=60.0)
+        assert proved.is_complete, seed
+        for plan, worth in ((solution.order, solution.point.plan_value), (proved.plan, proved.plan_value)):
             met, value = value_of(its.problem, plan, its.hits)
-            assert its.problem.rules.keeps(plan), seed
+            assert its.problem.rules.allows(plan), seed
             assert worth.value == value, seed
             assert met == (worth.met >= 0.0), seed
         if best is None:
-            assert proved.worth.met < 0.0, seed
+            assert proved.plan_value.met < 0.0, seed
             continue
-        assert proved.worth.met >= 0.0, seed
-        assert proved.worth.value == best, seed
+        assert proved.plan_value.met >= 0.0, seed
+        assert proved.plan_value.value == best, seed
         assert solution.point.bound >= best, seed
         assert solution.point.certificate <= 1.0, seed
         if its.problem.is_plain and np.isinf(its.problem.rules.budget) and its.problem.rules.most_per_pole >= 7:
-            assert solution.point.worth.value >= (1 - 1 / math.e) * best * (1 - 1e-12), seed
+            assert solution.point.plan_value.value >= (1 - 1 / math.e) * best * (1 - 1e-12), seed
 
 
 def test_the_fewest_that_reach_a_share_are_the_fewest() -> None:
@@ -61,12 +60,14 @@ def test_the_fewest_that_reach_a_share_are_the_fewest() -> None:
     for seed in range(150):
         its = drawn(seed)
         problem = its.problem
-        if not problem.is_plain or not problem.rules.keeps(problem.rules.forced):
+        if not problem.is_plain or not problem.rules.allows(problem.rules.forced):
             continue
-        together = problem.together(problem.candidates.tolist()).value(problem.joint)
+        together = problem.coverage_state(problem.candidates.tolist()).value(problem.joint)
         asked = Demand(problem.joint, 0.7 * together)
-        found = planning.fewest(
-            type(problem)(problem.joint, problem.objective, (asked,), problem.rules), time_limit_s=30.0, heard=unheard
+        found = solver.smallest_plan(
+            type(problem)(problem.joint, problem.objective, (asked,), problem.rules),
+            time_limit_s=30.0,
+            on_progress=unheard,
         )
         reaching = [
             len(p) for p in every_plan(problem) if value_of(problem, p, its.hits)[1] >= asked.least * (1 - 1e-12)
@@ -83,9 +84,9 @@ def test_the_fewest_that_reach_a_share_are_the_fewest() -> None:
 def test_a_search_that_runs_out_of_time_proves_what_it_says() -> None:
     for seed in range(60):
         its = drawn(seed)
-        if its.problem.demands or not its.problem.rules.keeps(its.problem.rules.forced):
+        if its.problem.demands or not its.problem.rules.allows(its.problem.rules.forced):
             continue
-        found = planning.best(its.problem, search_all=True, time_limit_s=0.0, heard=unheard)
+        found = solver.best_plan(its.problem, search_all=True, time_limit_s=0.0, on_progress=unheard)
         best = best_of_all(its)
         assert best is not None
         assert found.point.bound >= best, seed
@@ -97,15 +98,17 @@ def test_degenerate_problems_are_solved_and_every_point_of_the_curve_holds(start
     """The plan is the best one, whether the search ends or not no bound is exceeded, and no larger plan is worse."""
     for seed in range(start, start + 50):
         its = drawn_degenerate(seed)
-        if not its.problem.rules.keeps(its.problem.rules.forced):
+        if not its.problem.rules.allows(its.problem.rules.forced):
             continue
         plans = [(len(plan), *value_of(its.problem, plan, its.hits)) for plan in every_plan(its.problem)]
         for limit_s in (0.0, 60.0):
-            found = planning.best(its.problem, search_all=True, time_limit_s=limit_s, heard=unheard)
-            worth = found.point.worth
-            assert its.problem.rules.keeps(found.order), seed
+            found = solver.best_plan(its.problem, search_all=True, time_limit_s=limit_s, on_progress=unheard)
+            worth = found.point.plan_value
+            assert its.problem.rules.allows(found.order), seed
             assert (worth.met >= 0.0, worth.value) == value_of(its.problem, found.order, its.hits), seed
-            assert all(one.worth <= more.worth for one, more in zip(found.curve, found.curve[1:], strict=False)), seed
+            assert all(
+                one.plan_value <= more.plan_value for one, more in zip(found.curve, found.curve[1:], strict=False)
+            ), seed
             for point in found.curve:
                 assert len(point.plan) <= point.count, seed
                 values = [value for size, met, value in plans if met and size <= point.count]
@@ -118,22 +121,22 @@ def test_the_fewest_of_degenerate_problems() -> None:
     for seed in range(100):
         its = drawn_degenerate(seed)
         problem = its.problem
-        if problem.demands or not problem.rules.keeps(problem.rules.forced):
+        if problem.demands or not problem.rules.allows(problem.rules.forced):
             continue
-        together = problem.together(problem.candidates.tolist()).value(problem.joint)
+        together = problem.coverage_state(problem.candidates.tolist()).value(problem.joint)
         for share in (0.3, 1.0):
             asked = replace(problem, demands=(Demand(problem.joint, share * together),))
             enough = [len(plan) for plan in every_plan(asked) if value_of(asked, plan, its.hits)[0]]
-            found = planning.fewest(asked, time_limit_s=30.0, heard=unheard)
+            found = solver.smallest_plan(asked, time_limit_s=30.0, on_progress=unheard)
             assert (found is None) == (not enough), seed
             assert found is None or (found.fewest_is_proved and len(found.order) <= max(1, min(enough))), seed
 
 
-def rules_for(count: int, cost: list[float], budget: float = np.inf) -> Rules:
+def rules_for(count: int, cost: list[float], budget: float = np.inf) -> PlanRules:
     """Of candidates with a pole each."""
     n, price = len(cost), np.array(cost)
     blank = np.zeros((n, 3))
-    return Rules(count, budget, price, 0 * price, np.arange(n), (), np.zeros(n, dtype=bool), n, blank, 0.0)
+    return PlanRules(count, budget, price, 0 * price, np.arange(n), (), np.zeros(n, dtype=bool), n, blank, 0.0)
 
 
 @pytest.mark.slow
@@ -143,8 +146,8 @@ def test_many_cheap_ones_are_found_beside_a_dear_one_that_sees_more() -> None:
     hits[0, :3], hits[range(1, 21), range(3, 23)] = 1, 1
     term = term_of("", sight_of(hits), np.ones(23), scale=1.0)
     problem = Problem(term, (term,), (), rules_for(21, [20.0, *[1.0] * 20], 20.0))
-    found = planning.best(problem, search_all=False, time_limit_s=0.0, heard=unheard)
-    assert (found.point.worth.value, found.point.count, len(found.curve)) == (20.0, 20, 20)
+    found = solver.best_plan(problem, search_all=False, time_limit_s=0.0, on_progress=unheard)
+    assert (found.point.plan_value.value, found.point.count, len(found.curve)) == (20.0, 20, 20)
 
 
 def test_a_second_sensor_is_put_up_for_a_zone_that_two_must_see_though_the_score_gains_nothing() -> None:
@@ -154,8 +157,8 @@ def test_a_second_sensor_is_put_up_for_a_zone_that_two_must_see_though_the_score
     zone = term_of("zone", sight, np.full(4, 1 / 12), scale=3.0, each_once=True)
     zone = replace(zone, exact=lambda totals: float((totals >= 3).mean()))
     problem = Problem(term, (term,), (Demand(zone, 1.0),), rules_for(5, [0.0] * 5))
-    found = planning.best(problem, search_all=False, time_limit_s=0.0, heard=unheard)
-    assert (found.order, found.point.worth.met) == ((0, 1, 2), 0.0)
+    found = solver.best_plan(problem, search_all=False, time_limit_s=0.0, on_progress=unheard)
+    assert (found.order, found.point.plan_value.met) == ((0, 1, 2), 0.0)
 
 
 def test_of_one_sensor_the_best_is_proved_without_a_search() -> None:
@@ -166,7 +169,7 @@ def test_of_one_sensor_the_best_is_proved_without_a_search() -> None:
         problem = its.problem.with_count(1)
         if not problem.is_plain or problem.rules.forced or np.isfinite(problem.rules.budget):
             continue
-        found = planning.best(problem, search_all=False, time_limit_s=0.0, heard=unheard)
+        found = solver.best_plan(problem, search_all=False, time_limit_s=0.0, on_progress=unheard)
         assert found.point.certificate == 1.0, seed
         assert found.is_best
         proved += 1

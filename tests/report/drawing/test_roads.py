@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.core.grid import Grid
-from pipeline.report.drawing import maps
-from pipeline.report.drawing.map_frame import MapSite
-from pipeline.report.drawing.maps import Backdrop
-from pipeline.report.drawing.roads import Roads, network_file, roads_within
+from egvs.core.grid import Grid
+from egvs.report import maps
+from egvs.report.basemap import Roads, network_file, roads_within
+from egvs.report.maps import Backdrop
+from egvs.report.svg_figures import MapSite
 
 NETWORK = """<net version="1.20">
     <edge id=":b_0" function="internal"><lane id=":b_0_0" index="0" length="8" shape="46,-1.6 54,-1.6"/></edge>

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pipeline.core.grid import Grid
-from pipeline.traffic import network
-from pipeline.traffic.network import Network
+from egvs.core.grid import Grid
+from egvs.traffic import network
+from egvs.traffic.network import Network
 
 GRID = Grid((0.0, -20.0, 0.0), 1.0, (60, 40, 5))
 """60 m to the east from 0, 40 m to the north from -20; the junction is at its middle, 30 to 36 m to the east."""
@@ -49,4 +49,4 @@ def read(folder: Path, text: str = NETWORK) -> Network:
     """The network, through its file."""
     path = folder / "made.net.xml"
     path.write_text(text)
-    return network.read(path)
+    return network.read_net_xml(path)

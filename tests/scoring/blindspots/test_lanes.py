@@ -10,7 +10,7 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.scoring.blindspots.lanes import SAME_WAY_RAD, MiddleLine, fronts_m, lanes_of
+from egvs.scoring.road_locations import SAME_WAY_RAD, MiddleLine, fronts_m, match_lanes
 
 
 def line(*points, width_m=3.2) -> MiddleLine:
@@ -28,37 +28,37 @@ def test_the_front_is_half_a_length_ahead():
 def test_a_vehicle_is_on_the_lane_whose_middle_is_nearest():
     lanes = [EAST, EAST_TOO, WEST]
     at = np.array([(10, 0.3), (10, 2.9), (10, 1.59), (10, 1.61), (10, -1.5), (10, -1.7)])
-    assert lanes_of(at, np.zeros(6), lanes).tolist() == [0, 1, 0, 1, 0, -1]
+    assert match_lanes(at, np.zeros(6), lanes).tolist() == [0, 1, 0, 1, 0, -1]
 
 
 def test_it_leads_the_same_way():
     at = np.full((4, 2), (10.0, 6.4))
     yaw = np.array([math.pi, -math.pi, math.pi - 0.9 * SAME_WAY_RAD, 0.0])
-    assert lanes_of(at, yaw, [EAST, EAST_TOO, WEST]).tolist() == [2, 2, 2, -1]
+    assert match_lanes(at, yaw, [EAST, EAST_TOO, WEST]).tolist() == [2, 2, 2, -1]
 
 
 def test_where_ways_cross_the_heading_tells():
     lanes = [line((0, 0), (10, 0)), line((5, -5), (5, 5))]
-    assert lanes_of(np.full((2, 2), (5.0, 0.0)), np.array([0.1, math.pi / 2]), lanes).tolist() == [0, 1]
+    assert match_lanes(np.full((2, 2), (5.0, 0.0)), np.array([0.1, math.pi / 2]), lanes).tolist() == [0, 1]
 
 
 def test_of_two_that_are_as_near_it_is_the_first():
-    assert lanes_of(np.array([[3.0, 0.0]]), np.zeros(1), [EAST, EAST]).tolist() == [0]
+    assert match_lanes(np.array([[3.0, 0.0]]), np.zeros(1), [EAST, EAST]).tolist() == [0]
 
 
 def test_a_point_that_comes_twice_in_a_line_has_no_heading():
-    assert lanes_of(np.array([[5.0, 1.0]]), np.zeros(1), [line((0, 0), (5, 0), (5, 0), (10, 0))]).tolist() == [0]
+    assert match_lanes(np.array([[5.0, 1.0]]), np.zeros(1), [line((0, 0), (5, 0), (5, 0), (10, 0))]).tolist() == [0]
 
 
 def test_round_the_outside_of_a_bend_either_piece_leads_the_way():
     bend = line((0, 0), (10, 0), (10, 10))
     at, yaw = np.full((3, 2), (10.5, -0.5)), np.array([0.0, math.pi / 2, math.pi])
-    assert lanes_of(at, yaw, [bend]).tolist() == [0, 0, -1]
+    assert match_lanes(at, yaw, [bend]).tolist() == [0, 0, -1]
 
 
 def test_nobody_and_no_lanes():
-    assert lanes_of(np.empty((0, 2)), np.empty(0), [EAST]).shape == (0,)
-    assert lanes_of(np.array([[1.0, 0.0]]), np.zeros(1), []).tolist() == [-1]
+    assert match_lanes(np.empty((0, 2)), np.empty(0), [EAST]).shape == (0,)
+    assert match_lanes(np.array([[1.0, 0.0]]), np.zeros(1), []).tolist() == [-1]
 
 
 def slowly(at, yaw, lanes):
@@ -84,4 +84,4 @@ def test_against_shapely(seed):
         MiddleLine(np.cumsum(rng.uniform(-6, 12, (rng.integers(2, 6), 2)), axis=0), rng.uniform(2, 4)) for _ in range(6)
     ]
     at, yaw = rng.uniform(-5, 25, (40, 2)), rng.uniform(-7, 7, 40)
-    assert lanes_of(at, yaw, lanes).tolist() == [slowly(*one, lanes) for one in zip(at, yaw, strict=True)]
+    assert match_lanes(at, yaw, lanes).tolist() == [slowly(*one, lanes) for one in zip(at, yaw, strict=True)]

@@ -12,10 +12,10 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.grid import Grid
-from pipeline.scoring.blindspots.road_places import RoadPlaces
-from pipeline.scoring.blindspots.spots import Spots, cells_of
-from pipeline.scoring.targets.record import TargetRecord
+from egvs.core.grid import Grid
+from egvs.scoring.blindspots import VehicleSpots, cells_of
+from egvs.scoring.road_locations import RoadLocations
+from egvs.scoring.targets import TargetRecord
 from tests.scoring.blindspots.roads import GRID, read
 from tests.scoring.targets.scenes import frame
 
@@ -27,15 +27,15 @@ def car(x, y, yaw=0.0):
     return (x - 2.0 * math.cos(yaw), y - 2.0 * math.sin(yaw), 0.75, *CAR, yaw)
 
 
-def spots_of(record, roads=None, weight=None, period=None) -> Spots:
+def spots_of(record, roads=None, weight=None, period=None) -> VehicleSpots:
     weight = np.ones(len(record)) if weight is None else np.array(weight)
     period = np.zeros(len(record), dtype=np.int64) if period is None else np.array(period)
-    return Spots.of(record, roads, weight, period)
+    return VehicleSpots.of(record, roads, weight, period)
 
 
-def by_place(spots: Spots, counts) -> dict[tuple[str, str], int]:
+def by_place(spots: VehicleSpots, counts) -> dict[tuple[str, str], int]:
     """Counts of the places that are no squares."""
-    names = [(place.by, place.name) for place in spots.places]
+    names = [(place.by, place.name) for place in spots.locations]
     return dict(zip(names, np.asarray(counts)[: len(names)].tolist(), strict=True))
 
 
@@ -44,8 +44,8 @@ def test_a_hidden_lane_by_hand(tmp_path: Path) -> None:
     first = frame([car(25, -1.6), car(20, -1.6), car(25, -4.8), car(32, -4.8)], vehicles=("a", "b", "c", "d"))
     later = frame([car(29, -1.6), car(20, 10), car(41, -4.8)], number=9, vehicles=("b", "e", "c"))
     record = TargetRecord.of([first, later], GRID)
-    spots = spots_of(record, RoadPlaces.of(read(tmp_path), GRID.roi))
-    found = spots.by(np.array([19.0, 20.0, 25.0, 1000.0, 0.0, 21.0, 20.0]))
+    spots = spots_of(record, RoadLocations.of(read(tmp_path), GRID.roi))
+    found = spots.visibility(np.array([19.0, 20.0, 25.0, 1000.0, 0.0, 21.0, 20.0]))
     assert by_place(spots, spots.vehicle_frames) == {
         ("all", ""): 7,
         ("no lane", ""): 1,
@@ -80,7 +80,7 @@ def test_a_hidden_lane_by_hand(tmp_path: Path) -> None:
         ("crossing", ":j_c0_0"): 1,
     }
     assert found.share.tolist() == (found.seen / spots.vehicle_frames).tolist()
-    left = [place.name for place in spots.places].index("near_2")
+    left = [place.name for place in spots.locations].index("near_2")
     assert spots.at_m[left].tolist() == pytest.approx([(23 + 18 + 27) / 3, -1.6])
 
 
@@ -91,7 +91,7 @@ def test_squares_by_hand() -> None:
     assert spots.cells.tolist() == [[10, 2], [11, 2], [12, 2], [13, 2]]
     assert spots.vehicle_frames.tolist() == [2, 2, 2, 2, 2] and spots.vehicles.tolist() == [2, 2, 2, 2, 2]
     assert spots.at_m[1:].tolist() == [[10.5, -17.5], [11.5, -17.5], [12.5, -17.5], [13.5, -17.5]]
-    assert [place.by for place in spots.places] == ["all"]
+    assert [place.by for place in spots.locations] == ["all"]
 
 
 def test_a_vehicle_that_covers_no_middle_is_where_its_own_is() -> None:
@@ -141,7 +141,7 @@ def test_counts_against_plain_python(seed):
     points, weight = rng.integers(0, 40, len(record)).astype(np.float64), rng.uniform(0.5, 3, len(record))
     period = (record.frame > 0).astype(np.int64)
     spots = spots_of(record, weight=weight, period=period)
-    found = spots.by(points)
+    found = spots.visibility(points)
     who, counted, well, weighed = defaultdict(set), defaultdict(int), defaultdict(int), defaultdict(list)
     for i in range(len(record)):
         for cell in slow_cells(record.boxes[i], small.roi):
@@ -149,7 +149,7 @@ def test_counts_against_plain_python(seed):
             counted[cell] += 1
             well[cell] += int(points[i] >= 20)
             weighed[cell] += [(record.vehicle[i], record.frame[i] > 0, weight[i], points[i] >= 20)]
-    first = len(spots.places)
+    first = len(spots.locations)
     assert first == (1 if len(record) else 0)
     cells = list(map(tuple, spots.cells.tolist()))
     assert cells == sorted(counted)
@@ -179,9 +179,9 @@ def test_the_standard_error_is_that_of_vehicles_looked_at_once_or_always_alike()
     often = TargetRecord.of([frame(cars, number=number) for number in range(7)], GRID)
     points = np.where(np.arange(10) < 4, 0.0, 50.0)
     for record, its in ((once, points), (often, np.tile(points, 7))):
-        found = spots_of(record).by(its)
+        found = spots_of(record).visibility(its)
         assert (found.share[0], found.se[0]) == pytest.approx((0.6, math.sqrt(0.6 * 0.4 / 9)))
-    assert np.isnan(spots_of(once).by(points).se[1:]).all()  # one car over each square
+    assert np.isnan(spots_of(once).visibility(points).se[1:]).all()  # one car over each square
 
 
 def test_cars_of_one_name_in_two_periods_are_two() -> None:
@@ -194,13 +194,13 @@ def test_cars_of_one_name_in_two_periods_are_two() -> None:
 def test_weights_count_in_shares() -> None:
     record = TargetRecord.of([frame([car(20, 10), car(40, 10)])], GRID)
     spots = spots_of(record, weight=[3.0, 1.0])
-    found = spots.by(np.array([20.0, 0.0]))
+    found = spots.visibility(np.array([20.0, 0.0]))
     assert (found.seen[0], found.share[0], spots.weights[0]) == (1, 0.75, 4.0)
 
 
 def test_a_rear_part_is_where_its_own_front_is(tmp_path: Path) -> None:
     train = frame([car(34, -4.8), car(29.5, -4.8)], vehicles=("bus", "bus"), part=[0, 1])
-    spots = spots_of(TargetRecord.of([train], GRID), RoadPlaces.of(read(tmp_path), GRID.roi))
+    spots = spots_of(TargetRecord.of([train], GRID), RoadLocations.of(read(tmp_path), GRID.roi))
     found = by_place(spots, spots.vehicle_frames)
     assert (found["turn", "near:straight"], found["lane", "near_1"], found["all", ""]) == (1, 1, 2)
     assert by_place(spots, spots.vehicles)["all", ""] == 1
@@ -209,12 +209,16 @@ def test_a_rear_part_is_where_its_own_front_is(tmp_path: Path) -> None:
 def test_people_whom_a_score_counts_are_no_vehicles(tmp_path: Path) -> None:
     walk = (38.0, -4.8, 0.9, 0.5, 0.5, 1.8, 1.6)
     mixed = frame([walk, car(41, -4.8), walk], ("pedestrian", "passenger", "bicycle"), vehicles=("a", "b", "c"))
-    roads = RoadPlaces.of(read(tmp_path), GRID.roi)
+    roads = RoadLocations.of(read(tmp_path), GRID.roi)
     both = spots_of(TargetRecord.of([mixed], GRID, people=("pedestrian", "bicycle")), roads)
     alone = spots_of(TargetRecord.of([mixed], GRID), roads)
     assert by_place(both, both.vehicle_frames) == by_place(alone, alone.vehicle_frames)
     assert both.cells.tolist() == alone.cells.tolist()
-    assert both.by(np.array([50.0, 0.0, 50.0])).seen.sum() == 0 < both.by(np.array([0.0, 20.0, 0.0])).seen.sum()
+    assert (
+        both.visibility(np.array([50.0, 0.0, 50.0])).seen.sum()
+        == 0
+        < both.visibility(np.array([0.0, 20.0, 0.0])).seen.sum()
+    )
 
 
 def test_crossings_against_shapely(tmp_path: Path) -> None:
@@ -226,7 +230,7 @@ def test_crossings_against_shapely(tmp_path: Path) -> None:
     ]
     boxes += [car(36.0, -4.8), car(36.001, -4.8)]
     record = TargetRecord.of([frame(boxes)], GRID)
-    spots = spots_of(record, RoadPlaces.of(read(tmp_path), GRID.roi))
+    spots = spots_of(record, RoadLocations.of(read(tmp_path), GRID.roi))
     area, on = shapely.box(36, -8, 40, 1), 0
     for x, y, _, length, width, _, yaw in record.boxes:
         half, turn = shapely.box(-length / 2, -width / 2, length / 2, width / 2), (math.cos(yaw), math.sin(yaw))
@@ -242,5 +246,5 @@ def test_crossings_against_shapely(tmp_path: Path) -> None:
 
 def test_nobody(tmp_path: Path) -> None:
     record = TargetRecord.of([frame([])], GRID)
-    spots = spots_of(record, RoadPlaces.of(read(tmp_path), GRID.roi))
-    assert len(spots) == 0 and spots.by(np.empty(0)).share.shape == (0,)
+    spots = spots_of(record, RoadLocations.of(read(tmp_path), GRID.roi))
+    assert len(spots) == 0 and spots.visibility(np.empty(0)).share.shape == (0,)

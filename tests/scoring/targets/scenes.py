@@ -13,16 +13,15 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.artefacts.traffic_frames import TrafficFrame
-from pipeline.core.grid import Grid
-from pipeline.scoring.targets.record import TargetRecord
-from pipeline.scoring.targets.seen import SeenTargets, see
-from pipeline.scoring.visibility import Beams
-from pipeline.sensing import sensors
-from pipeline.sensing.sites import Pose
+from egvs.artefacts.traffic_frames import TrafficFrame
+from egvs.core.grid import Grid
+from egvs.scoring.targets import TargetRecord, VisibleTargets, visible_targets
+from egvs.scoring.visibility import Beams
+from egvs.sensors import sensor
+from egvs.sensors.sites import Pose
 
 GRID = Grid((100.0, 200.0, 0.0), 1.0, (40, 20, 5))
-SENSOR = sensors.CATALOGUE["VLP-16"]
+SENSOR = sensor.CATALOGUE["VLP-16"]
 SHRINK_M = 1e-4 + 1e-9
 
 Noticed = Callable[[NDArray[np.float64]], NDArray[np.float64]]
@@ -44,9 +43,9 @@ def beams_to(at, ends, weight=None) -> Beams:
     return Beams(Pose(*at), SENSOR, np.array(ends, dtype=np.float64).reshape(-1, 3), given)
 
 
-def seen(frames: Sequence[TrafficFrame], beams: Beams, noticed: Noticed | None = None) -> SeenTargets:
+def seen(frames: Sequence[TrafficFrame], beams: Beams, noticed: Noticed | None = None) -> VisibleTargets:
     """What is seen in the grid of these tests."""
-    return see(TargetRecord.of(frames, GRID), beams, noticed)
+    return visible_targets(TargetRecord.of(frames, GRID), beams, noticed)
 
 
 def axes_of(yaw: float, pitch: float) -> NDArray[np.float64]:
@@ -107,7 +106,7 @@ def seen_slowly(frames: Sequence[TrafficFrame], beams: Beams, noticed: Noticed |
     found: dict[str, list[float]] = {name: [] for name in COLUMNS}
     for one in frames:
         for row, column in _of_frame(one, beams, noticed or (lambda r: np.ones(len(r)))).items():
-            if row in one.wanted(GRID.roi).tolist():
+            if row in one.target_rows(GRID.roi).tolist():
                 for name, value in column.items():
                     found[name].append(value)
     return found

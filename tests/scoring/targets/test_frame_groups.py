@@ -7,12 +7,10 @@ import math
 import numpy as np
 import pytest
 
-import pipeline
-from pipeline.artefacts.periods import PeriodBlocks
-from pipeline.scoring.targets.frame_groups import FrameGroups
-from pipeline.scoring.targets.record import TargetRecord
-from pipeline.scoring.targets.scores import mean
-from pipeline.scoring.uncertainty import Estimate
+import egvs
+from egvs.artefacts.tpog import PeriodBlocks
+from egvs.scoring.standard_errors import ScoreUncertainty
+from egvs.scoring.targets import FrameGroups, TargetRecord, weighted_mean
 from tests.conftest import write_mini
 from tests.scoring.targets.scenes import GRID, frame
 
@@ -33,7 +31,7 @@ def test_a_group_is_left_out_of_both_sums():
     values = np.arange(13.0) ** 2
     found = FrameGroups.of([period(8, 2)], [8], record)
     means = found.means(values)
-    assert means.shape == (5,) and means[0] == mean(values) and found.weight.tolist() == [1.0] * 13
+    assert means.shape == (5,) and means[0] == weighted_mean(values) and found.weight.tolist() == [1.0] * 13
     for group in range(4):
         left = record.frame // 2 != group
         assert means[1 + group] == pytest.approx(values[left].mean())
@@ -44,7 +42,7 @@ def test_weights_of_vehicles_count_in_both_sums():
     values, weight = np.arange(6.0), np.array([1.0, 0.0, 2.0, 1.0, 3.0, 0.5])
     means = FrameGroups.of([period(4, 2)], [4], record).means(values, weight)
     left = record.frame >= 2
-    assert means[0] == mean(values, weight)
+    assert means[0] == weighted_mean(values, weight)
     assert means[1] == pytest.approx(np.average(values[left], weights=weight[left]))
 
 
@@ -74,7 +72,7 @@ def test_a_mix_counts_frames_as_often_as_it_takes_them_and_keeps_each_records_we
     assert means[0] == pytest.approx((night + day) / (6 + 12))
     assert means[1] == pytest.approx((2 * 2.0 * 11.0 + day) / (2 * 4 + 12))  # the other half of the night, twice
     assert means[4] == pytest.approx((night + 2 * 3.0 * 20.0) / (6 + 6))
-    estimate = Estimate.of(means[None], found.groups)
+    estimate = ScoreUncertainty.of(means[None], found.groups)
     assert len(estimate.strata) == 2 and estimate.se[0] > 0
 
 
@@ -83,7 +81,7 @@ def test_the_standard_error_of_a_plain_mean_is_that_of_its_groups():
     rng = np.random.default_rng(2)
     values = rng.normal(size=200)
     found = FrameGroups.of([period(200, 20)], [200], record_of([1] * 200))
-    estimate = Estimate.of(found.means(values)[None], found.groups)
+    estimate = ScoreUncertainty.of(found.means(values)[None], found.groups)
     groups = values.reshape(10, 20).mean(axis=1)
     assert estimate.se[0] == pytest.approx(groups.std(ddof=1) / math.sqrt(10), rel=0.01)
     assert estimate.bias[0] == pytest.approx(0.0, abs=1e-9)
@@ -99,25 +97,25 @@ def test_the_standard_error_is_as_large_as_the_error_is():
         record = record_of(vehicles)
         values = np.exp(-0.1 * vehicles[record.frame]) + 0.1 * rng.normal(size=len(record))
         found = FrameGroups.of(groups, [200], record)
-        estimate = Estimate.of(found.means(values)[None], found.groups)
+        estimate = ScoreUncertainty.of(found.means(values)[None], found.groups)
         errors.append(estimate.se[0])
         scores.append(estimate.scores[0])
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.std(scores), rel=0.2)
 
 
 def test_of_a_run(tmp_path):
-    scenario = pipeline.load(write_mini(tmp_path / "mini"), ["tpog.blocks=4"])
-    pipeline.run(scenario, tmp_path / "run", jobs=1)
+    scenario = egvs.load(write_mini(tmp_path / "mini"), ["tpog.blocks=4"])
+    egvs.run(scenario, tmp_path / "run", jobs=1)
     tpog, trajectories = tmp_path / "run" / "tpog.parquet", tmp_path / "run" / "trajectories.parquet"
     record = TargetRecord.read(trajectories, scenario.roi.grid)
     found = FrameGroups.read(tpog, trajectories, record)
     assert found is not None and len(record.numbers) == 40
     values = np.arange(float(len(record)))
     means = found.means(values)
-    assert means[0] == mean(values) and len(means) == 5
+    assert means[0] == weighted_mean(values) and len(means) == 5
     assert means[1] == pytest.approx(values[record.numbers[record.frame] >= 10].mean())
-    one = pipeline.load(tmp_path / "mini", ["tpog.blocks=1"])
-    pipeline.run(one, tmp_path / "one", jobs=1)
+    one = egvs.load(tmp_path / "mini", ["tpog.blocks=1"])
+    egvs.run(one, tmp_path / "one", jobs=1)
     assert (
         FrameGroups.read(tmp_path / "one" / "tpog.parquet", tmp_path / "one" / "trajectories.parquet", record) is None
     )
@@ -125,8 +123,8 @@ def test_of_a_run(tmp_path):
 
 def test_of_a_run_with_periods(tmp_path):
     halves = '[{name="a", length_s=12, weight=3}, {name="b", begin_s=12, length_s=8}]'
-    scenario = pipeline.load(write_mini(tmp_path / "mini"), [f"traffic.periods={halves}", "tpog.blocks=4"])
-    pipeline.run(scenario, tmp_path / "run", jobs=1)
+    scenario = egvs.load(write_mini(tmp_path / "mini"), [f"traffic.periods={halves}", "tpog.blocks=4"])
+    egvs.run(scenario, tmp_path / "run", jobs=1)
     tpog, trajectories = tmp_path / "run" / "tpog.parquet", tmp_path / "run" / "trajectories.parquet"
     record = TargetRecord.read(trajectories, scenario.roi.grid)
     found = FrameGroups.read(tpog, trajectories, record)

@@ -10,9 +10,9 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.artefacts import schemas, tables
-from pipeline.core.errors import InputError
-from pipeline.scoring.targets.record import FRAMES, TargetRecord
+from egvs.artefacts import parquet
+from egvs.core.errors import InputError
+from egvs.scoring.targets import REPLAYED_FRAMES, TargetRecord
 from tests.scoring.targets.scenes import GRID, axes_of, frame, random_boxes
 
 CAR = (4.0, 2.0, 1.5)
@@ -96,7 +96,7 @@ def test_gaps_are_shapelys(seed):
     gaps = []
     for one in frames:
         prints = [footprint(box, pitch) for box, pitch in zip(one.boxes, one.pitch_rad, strict=True)]
-        for row in one.wanted(GRID.roi):
+        for row in one.target_rows(GRID.roi):
             others = [p for i, p in enumerate(prints) if i != row and one.kinds[i] == "bus"]
             gaps.append(min((prints[row].distance(p) for p in others), default=math.inf))
     np.testing.assert_allclose(record.gap_m, gaps, atol=1e-9)
@@ -109,9 +109,9 @@ def test_frames_are_spread_over_the_record(tmp_path):
         for name, value in zip(columns, (number, "v", 0, "bus", 110.0, 205.0, 1.0, 0.0, 0.0, *CAR), strict=True):
             columns[name].append(value)
     path = tmp_path / "trajectories.parquet"
-    tables.write(path, "trajectories", columns, {"schema": schemas.VERSION, "frames": 600})
+    parquet.write_artefact(path, "trajectories", columns, {"schema": parquet.SCHEMA_VERSION, "frames": 600})
     record = TargetRecord.read(path, GRID)
-    assert len(record.numbers) == FRAMES == 250 and record.numbers[[0, -1]].tolist() == [1, 598]
+    assert len(record.numbers) == REPLAYED_FRAMES == 250 and record.numbers[[0, -1]].tolist() == [1, 598]
     assert len(record) == (record.numbers % 2 == 0).sum()
     assert TargetRecord.read(path, GRID, 3).numbers.tolist() == [100, 300, 500]
     assert len(TargetRecord.read(path, GRID, 0).numbers) == 600

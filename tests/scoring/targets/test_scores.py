@@ -8,15 +8,8 @@ import math
 import numpy as np
 import pytest
 
-from pipeline.scoring.targets.record import TargetRecord
-from pipeline.scoring.targets.scores import (
-    SEEN_WELL_POINTS,
-    log_points,
-    mean,
-    points_on_target,
-    seen_well,
-    well,
-)
+from egvs.scoring.target_scores import log_points, points_on_target, saturating_gain, seen_well
+from egvs.scoring.targets import SEEN_WELL_POINTS, TargetRecord, weighted_mean
 from tests.scoring.targets.scenes import GRID, beams_to, frame, seen
 
 
@@ -31,7 +24,7 @@ def test_scores_by_hand():
     assert points_on_target(its) == pytest.approx((math.log(21) + math.log(61)) / 3)
     assert SEEN_WELL_POINTS == 20.0
     assert seen_well(its) == pytest.approx((0 + (1 - math.exp(-1)) + (1 - math.exp(-3))) / 3)
-    assert points_on_target(its, well) == seen_well(its)
+    assert points_on_target(its, saturating_gain) == seen_well(its)
     assert points_on_target(its, np.sqrt) == pytest.approx((math.sqrt(20) + math.sqrt(60)) / 3)
 
 
@@ -44,10 +37,10 @@ def test_weights_say_how_much_a_vehicle_counts():
 
 def test_without_vehicles_there_is_no_score():
     assert math.isnan(points_on_target(with_points())) and math.isnan(seen_well(with_points()))
-    assert math.isnan(seen_well(with_points(5), np.zeros(1))) and math.isnan(mean(np.empty(0)))
+    assert math.isnan(seen_well(with_points(5), np.zeros(1))) and math.isnan(weighted_mean(np.empty(0)))
 
 
-@pytest.mark.parametrize("gain", [log_points, well])
+@pytest.mark.parametrize("gain", [log_points, saturating_gain])
 def test_a_gain_begins_at_0_rises_and_is_concave(gain):
     worth = gain(np.arange(200.0))
     assert worth[0] == 0.0
@@ -55,12 +48,12 @@ def test_a_gain_begins_at_0_rises_and_is_concave(gain):
 
 
 def test_the_share_seen_well_stays_below_1_and_tells_small_numbers_apart():
-    assert well(np.array([1e9])) == 1.0 and 0.0 < well(np.array([1e-12]))[0] < 1e-12
+    assert saturating_gain(np.array([1e9])) == 1.0 and 0.0 < saturating_gain(np.array([1e-12]))[0] < 1e-12
 
 
 def test_the_order_of_vehicles_is_nothing():
     points = np.random.default_rng(5).exponential(30.0, 1000)
-    assert mean(log_points(points)) == mean(log_points(points[::-1]))
+    assert weighted_mean(log_points(points)) == weighted_mean(log_points(points[::-1]))
 
 
 def test_a_record_says_how_long_it_is():

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import pipeline
-from pipeline.scoring.targets import seen as module
-from pipeline.scoring.visibility import Beams
-from pipeline.sensing import sensors
-from pipeline.sensing.sites import Pose
+import egvs
+from egvs.scoring import targets
+from egvs.scoring.visibility import Beams
+from egvs.sensors import sensor
+from egvs.sensors.sites import Pose
 from tests.conftest import write_mini
 from tests.scoring.targets.scenes import COLUMNS, GRID, SENSOR, beams_to, frame, random_boxes, seen, seen_slowly
 
@@ -170,7 +170,7 @@ def test_the_order_of_beams_is_nothing_and_lists_that_are_short_are_filled_again
     for name in COLUMNS[:6]:
         np.testing.assert_array_equal(getattr(seen(frames, beams), name), getattr(seen(frames, turned), name))
     whole = seen(frames, beams, lambda r: 1.0 / r)
-    monkeypatch.setattr(module, "_ROOM", 1)  # a list of one frame
+    monkeypatch.setattr(targets, "_MAX_HITS", 1)  # a list of one frame
     again = seen(frames, beams, lambda r: 1.0 / r)
     np.testing.assert_array_equal(whole.points, again.points)
     np.testing.assert_array_equal(whole.width_share, again.width_share)
@@ -186,10 +186,10 @@ def test_a_chance_of_one_is_no_effect():
 
 def test_what_effects_of_a_scene_notice(tmp_path):
     folder = write_mini(tmp_path / "mini")
-    plain = pipeline.build_scene(pipeline.load(folder))
-    assert module.noticed_in(plain, sensors.CATALOGUE["VLP-16"]) is None
-    lossy = pipeline.build_scene(pipeline.load(folder, ["effects.dropout.share=0.25"]))
-    noticed = module.noticed_in(lossy, sensors.CATALOGUE["VLP-16"])
+    plain = egvs.build_scene(egvs.load(folder))
+    assert targets.detection_probability(plain, sensor.CATALOGUE["VLP-16"]) is None
+    lossy = egvs.build_scene(egvs.load(folder, ["effects.dropout.share=0.25"]))
+    noticed = targets.detection_probability(lossy, sensor.CATALOGUE["VLP-16"])
     assert noticed is not None and noticed(np.array([1.0, 50.0])).tolist() == [0.75, 0.75]
 
 
@@ -198,8 +198,8 @@ def test_a_scene_far_from_the_worlds_zero_is_seen_alike():
     here = seen(frames, beams)
     moved = [frame(its.boxes + np.array([2.0**19, 2.0**22, 0, 0, 0, 0, 0]), its.kinds, its.pitch_rad) for its in frames]
     x, y, z = beams.pose.position_m
-    there = module.see(
-        module.TargetRecord.of(moved, type(GRID)((100.0 + 2.0**19, 200.0 + 2.0**22, 0.0), 1.0, GRID.shape)),
+    there = targets.visible_targets(
+        targets.TargetRecord.of(moved, type(GRID)((100.0 + 2.0**19, 200.0 + 2.0**22, 0.0), 1.0, GRID.shape)),
         Beams(Pose(x + 2.0**19, y + 2.0**22, z), SENSOR, beams.ends_m),
     )
     np.testing.assert_allclose(there.points, here.points)

@@ -8,19 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import pipeline
-from pipeline.artefacts import tables
-from pipeline.artefacts.readers import read_scores, read_scores_by_period
-from pipeline.core.findings import warnings_of
-from pipeline.scenario import loading
-from pipeline.scenario.score import WeightsModel
-from pipeline.scoring.targets.named import WORTHS
-from pipeline.scoring.targets.record import TargetRecord
-from pipeline.scoring.targets.scores import well
-from pipeline.scoring.targets.seen import see
-from pipeline.scoring.targets.weights import people_of, weights_of
-from pipeline.scoring.visibility import Beams
-from pipeline.sensing.scanner import Scanner
+import egvs
+from egvs.artefacts import parquet
+from egvs.artefacts.readers import read_scores, read_scores_by_period
+from egvs.core.errors import collect_warnings
+from egvs.scenario import loading
+from egvs.scenario.score_config import WeightsConfig
+from egvs.scoring.target_scores import TARGET_SCORES, saturating_gain
+from egvs.scoring.targets import TargetRecord, target_weights, visible_targets, weighted_people
+from egvs.scoring.visibility import Beams
+from egvs.sensors.scanner import Scanner
 from tests.scoring.targets.scenes import GRID, beams_to, frame
 
 SQUARE = [[110.0, 205.0], [120.0, 205.0], [120.0, 215.0], [110.0, 215.0]]
@@ -36,37 +33,37 @@ def record_of(people=()) -> TargetRecord:
 
 def test_a_vehicle_counts_by_its_kind_and_by_every_zone_that_holds_it() -> None:
     overlap = {"polygon_m": [[114.0, 200.0], [119.0, 200.0], [119.0, 220.0], [114.0, 220.0]], "weight": 5.0}
-    wanted = WeightsModel.of({"kinds": {"bus": 3.0, "pedestrian": 2.0}, "zones": {
+    wanted = WeightsConfig.of({"kinds": {"bus": 3.0, "pedestrian": 2.0}, "zones": {
         "crosswalk": {"polygon_m": SQUARE, "weight": 0.5}, "stop": overlap,
     }})  # fmt: skip
-    record = record_of(people_of(wanted))
-    assert weights_of(wanted, record).tolist() == [3.0, 0.5 * 5.0, 0.5, 2.0 * 0.5 * 5.0, 2.0]
+    record = record_of(weighted_people(wanted))
+    assert target_weights(wanted, record).tolist() == [3.0, 0.5 * 5.0, 0.5, 2.0 * 0.5 * 5.0, 2.0]
     assert record.are_people.tolist() == [False, False, False, True, True]
 
 
 def test_people_are_to_be_seen_only_where_they_have_a_weight() -> None:
     assert len(record_of()) == 3
     assert not record_of().are_people.any()
-    assert people_of(WeightsModel.of({"kinds": {"bus": 3.0}})) == frozenset()
-    assert len(record_of(people_of(WeightsModel.of({"kinds": {"pedestrian": 0.0}})))) == 5
-    assert weights_of(WeightsModel(), record_of()).tolist() == [1.0] * 3
-    assert not len(weights_of(WeightsModel(), TargetRecord.of([], GRID)))
+    assert weighted_people(WeightsConfig.of({"kinds": {"bus": 3.0}})) == frozenset()
+    assert len(record_of(weighted_people(WeightsConfig.of({"kinds": {"pedestrian": 0.0}})))) == 5
+    assert target_weights(WeightsConfig(), record_of()).tolist() == [1.0] * 3
+    assert not len(target_weights(WeightsConfig(), TargetRecord.of([], GRID)))
 
 
 def test_people_are_found_as_well_as_they_are_seen() -> None:
     """No chance of detection is calibrated for them."""
     record = record_of({"pedestrian"})
     ends = [[x - 101.0 + 3.0 * (x - 101.0), 4 * (y - 206.0), 0.0] for x, y in record.boxes[:, :2] for _ in range(30)]
-    seen = see(record, beams_to((101.0, 206.0, 1.0), ends))
-    found = WORTHS["expected_detections"](seen)
+    seen = visible_targets(record, beams_to((101.0, 206.0, 1.0), ends))
+    found = TARGET_SCORES["expected_detections"](seen)
     assert seen.points[3] > 0
-    assert found[record.are_people].tolist() == well(seen.points)[record.are_people].tolist()
-    cars = WORTHS["expected_detections"](see(record_of(), beams_to((101.0, 206.0, 1.0), ends)))
+    assert found[record.are_people].tolist() == saturating_gain(seen.points)[record.are_people].tolist()
+    cars = TARGET_SCORES["expected_detections"](visible_targets(record_of(), beams_to((101.0, 206.0, 1.0), ends)))
     assert found[:3].tolist() == cars.tolist()
 
 
 def run(folder: Path, out: Path, *overrides: str) -> dict[str, dict[str, float]]:
-    pipeline.run(loading.load(folder, [SCORES, *overrides]), out, jobs=2)
+    egvs.run(loading.load(folder, [SCORES, *overrides]), out, jobs=2)
     return {row["site"]: row for row in read_scores(out / "scores.parquet").to_pylist()}
 
 
@@ -79,10 +76,10 @@ def test_scores_of_a_run_are_weighted_means_and_so_are_their_errors(mini: Path, 
     scenario = loading.load(mini)
     record = TargetRecord.read(tmp_path / "run" / "trajectories.parquet", scenario.roi.grid)
     weight = np.where(record.boxes[:, 0] <= 16.0, 4.0, 1.0)
-    block, scanner, ratios = record.numbers[record.frame] // 10, Scanner(pipeline.build_scene(scenario)), []
+    block, scanner, ratios = record.numbers[record.frame] // 10, Scanner(egvs.build_scene(scenario)), []
     for site in scanner.scene.sites:
-        seen = see(record, Beams.of(scanner.scan_site(site)))
-        for name, worth in WORTHS.items():
+        seen = visible_targets(record, Beams.of(scanner.scan_site(site)))
+        for name, worth in TARGET_SCORES.items():
             values = worth(seen)
             assert rows[site.name][name] == pytest.approx(np.average(values, weights=weight), rel=1e-12)
             assert plain[site.name][name] == pytest.approx(values.mean(), rel=1e-12)
@@ -98,15 +95,15 @@ def test_a_weight_of_one_for_all_changes_nothing(mini: Path, tmp_path: Path) -> 
     assert {site: set(row.items()) for site, row in one.items()} == {s: set(row.items()) for s, row in plain.items()}
 
 
-def test_weights_are_told(mini: Path, tmp_path: Path, egvs) -> None:  # type: ignore[no-untyped-def]
+def test_weights_are_told(mini: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
     weights = ("--set", WEST, "--set", "score.weights.kinds.passenger=2")
-    code, printed, told = egvs("run", mini, "--out", tmp_path, "--set", "score.rank_by=seen_well", *weights)
+    code, printed, told = run_egvs("run", mini, "--out", tmp_path, "--set", "score.rank_by=seen_well", *weights)
     assert code == 0
     assert "weights passenger 2, zone west 4" in told
-    assert "of vehicles well, which are weighted" in printed
+    assert "(weighted by class)" in printed
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "They are weighted: passenger 2, zone west 4; what is not named counts 1." in page
-    about = tables.read_metadata(tmp_path / "scores.parquet", "scores")
+    about = parquet.read_metadata(tmp_path / "scores.parquet", "scores")
     assert about["weights"]["kinds"] == {"passenger": 2.0}
 
 
@@ -120,28 +117,28 @@ def test_periods_are_weighted_each_by_itself(mini: Path, tmp_path: Path) -> None
     scenario = loading.load(mini)
     record = TargetRecord.read(tmp_path / "run" / "trajectories.parquet", scenario.roi.grid)
     weight = np.where(record.boxes[:, 0] <= 16.0, 4.0, 1.0)
-    scanner, late = Scanner(pipeline.build_scene(scenario)), record.numbers[record.frame] >= 24
+    scanner, late = Scanner(egvs.build_scene(scenario)), record.numbers[record.frame] >= 24
     for site in scanner.scene.sites:
-        worth = well(see(record, Beams.of(scanner.scan_site(site))).points)
+        worth = saturating_gain(visible_targets(record, Beams.of(scanner.scan_site(site))).points)
         for name, its in (("a", ~late), ("b", late)):
             assert apart[name, site.name] == pytest.approx(np.average(worth[its], weights=weight[its]), rel=1e-12)
 
 
 def test_weights_that_hold_for_nobody_are_told(mini: Path, tmp_path: Path) -> None:
     far = "score.weights.zones.far={weight=4, polygon_m=[[90, 90], [91, 90], [91, 91]]}"
-    record = pipeline.run(loading.load(mini, [far, "score.weights.kinds.bus=2"]), tmp_path, jobs=1)
-    told = [(it.place, it.found) for it in warnings_of([record.stages["score"].summary]) if it.rule == "weights"]
+    record = egvs.run(loading.load(mini, [far, "score.weights.kinds.bus=2"]), tmp_path, jobs=1)
+    told = [(it.where, it.problem) for it in collect_warnings([record.stages["score"].summary]) if it.rule == "weights"]
     kinds, zones = ("scenario.toml: score.weights.kinds.bus", "scenario.toml: score.weights.zones.far")
-    frames = "in the 40 frames looked at"
+    frames = "in the 40 frames examined"
     assert told == [
         (kinds, f"no bus has its centre in the region of interest {frames}"),
-        (zones, f"no vehicle has its centre in it {frames}"),
+        (zones, f"no vehicle has its centre in the zone {frames}"),
     ]
 
 
-def test_where_no_vehicle_counts_none_can_rank(mini: Path, tmp_path: Path, egvs) -> None:  # type: ignore[no-untyped-def]
+def test_where_no_vehicle_counts_none_can_rank(mini: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
     none = ("--set", "score.weights.kinds.passenger=0", "--set", "score.rank_by=seen_well")
-    code, _, told = egvs("run", mini, "--out", tmp_path, *none)
+    code, _, told = run_egvs("run", mini, "--out", tmp_path, *none)
     assert code == 2
     assert "score.rank_by = 'seen_well': no vehicle that counts by [score.weights] has its centre in the region" in told
 
@@ -158,7 +155,7 @@ def test_where_no_vehicle_counts_none_can_rank(mini: Path, tmp_path: Path, egvs)
         ("score.weights.zone={}", "did you mean zones?"),
     ],
 )  # fmt: skip
-def test_wrong_weights_are_refused(mini: Path, egvs, override: str, message: str) -> None:  # type: ignore[no-untyped-def]
-    code, _, told = egvs("check", mini, "--set", override)
+def test_wrong_weights_are_refused(mini: Path, run_egvs, override: str, message: str) -> None:  # type: ignore[no-untyped-def]
+    code, _, told = run_egvs("check", mini, "--set", override)
     assert code == 2
     assert message in told, told

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from pipeline.formats import safe_xml
+from egvs.formats import xml
 from tests.traffic.helpers import scenario
 
 SHORT = {"frames": 3, "warmup_s": 1.0, "step_s": 1.0, "frame_period_s": 1.0}
@@ -11,8 +11,8 @@ KEPT = "not SUMO's"
 
 def first_lane(net: Path) -> tuple[str, str, str]:
     """An edge, its first lane, and a signal of a network."""
-    edge = next(e for e in safe_xml.children(net, "net") if e.tag == "edge" and not e.get("id", "").startswith(":"))
-    signal = next(e.get("id", "") for e in safe_xml.children(net, "net") if e.tag == "tlLogic")
+    edge = next(e for e in xml.iter_elements(net, "net") if e.tag == "edge" and not e.get("id", "").startswith(":"))
+    signal = next(e.get("id", "") for e in xml.iter_elements(net, "net") if e.tag == "tlLogic")
     return edge.get("id", ""), f"{edge.get('id', '')}_0", signal
 
 

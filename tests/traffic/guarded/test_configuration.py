@@ -4,9 +4,8 @@ from xml.etree.ElementTree import parse
 
 import pytest
 
-from pipeline.core.errors import InputError
-from pipeline.traffic import sumo
-from pipeline.traffic.guarded import configuration
+from egvs.core.errors import InputError
+from egvs.traffic import sumo, user_files
 
 SCHEMA = "{http://www.w3.org/2001/XMLSchema}"
 
@@ -15,31 +14,33 @@ SCHEMA = "{http://www.w3.org/2001/XMLSchema}"
 def options(tmp_path_factory):
     """Every option of SUMO with its type, as SUMO itself says."""
     folder = tmp_path_factory.mktemp("schema")
-    sumo.run("sumo", ["--save-schema", "sumo.xsd"], folder)
+    sumo.run_program("sumo", ["--save-schema", "sumo.xsd"], folder)
     found = {e.get("name"): e.get("type", "") for e in parse(folder / "sumo.xsd").iter(f"{SCHEMA}element")}
     return {name: kind for name, kind in found.items() if kind.endswith("OptionType")}
 
 
 def test_no_option_that_names_a_file_is_taken_over(options):
     named = {name for name, kind in options.items() if kind == "fileOptionType"}
-    assert len(named) > 40 and named >= set(configuration.FILES)
-    assert not named & configuration.TAKEN
-    assert not [name for name in configuration.TAKEN if name.endswith(("file", "files", "output", "path", "prefix"))]
+    assert len(named) > 40 and named >= set(user_files.FILE_OPTIONS)
+    assert not named & user_files.ACCEPTED_OPTIONS
+    assert not [
+        name for name in user_files.ACCEPTED_OPTIONS if name.endswith(("file", "files", "output", "path", "prefix"))
+    ]
 
 
 def test_every_option_taken_over_is_one_of_sumos(options):
-    assert configuration.TAKEN - options.keys() == set()
+    assert user_files.ACCEPTED_OPTIONS - options.keys() == set()
 
 
 def read(folder, text):
     (folder / "net.xml").touch()
     (folder / "c.sumocfg").write_text(f'<configuration><net-file value="net.xml"/>{text}</configuration>')
-    return configuration.read(folder / "c.sumocfg")
+    return user_files.read_sumocfg(folder / "c.sumocfg")
 
 
 def test_every_option_is_taken_over_left_out_or_an_error(options, tmp_path):
     refused = set()
-    for name in sorted(options.keys() - set(configuration.FILES)):
+    for name in sorted(options.keys() - set(user_files.FILE_OPTIONS)):
         try:
             read(tmp_path, f'<{name} value="0"/>')
         except InputError as error:

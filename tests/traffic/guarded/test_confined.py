@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.core.errors import RunError
-from pipeline.traffic import sumo
-from pipeline.traffic.guarded import confined
+from egvs.core.errors import RunError
+from egvs.traffic import sandbox, sumo
 
 LINUX = sys.platform.startswith("linux")
 
@@ -32,11 +31,11 @@ def test_sumo_cannot_write_outside_its_folder(tmp_path, monkeypatch):
     own, foreign = tmp_path / "own", tmp_path / "foreign"
     own.mkdir()
     foreign.write_text("kept")
-    monkeypatch.setattr(sumo, "environment", lambda: dict(os.environ))
+    monkeypatch.setattr(sumo, "sumo_environment", lambda: dict(os.environ))
     for attempt in (f"echo x > {foreign}", "echo x > ../new", f"rm {foreign}", f"mv {foreign} here", "mkdir ../new"):
         fake_sumo(tmp_path, monkeypatch, f"echo mine > mine && echo gone > /dev/null || exit 3\n{attempt} || exit 9")
         with pytest.raises(RunError, match=r"sumo ended with exit code [29]"):
-            sumo.run("sumo", [], own)
+            sumo.run_program("sumo", [], own)
         assert ((own / "mine").read_text(), foreign.read_text()) == ("mine\n", "kept")
         assert not (tmp_path / "new").exists()
 
@@ -57,8 +56,8 @@ def test_a_tool_of_sumos_cannot_write_outside_its_folder_either(tmp_path, monkey
 PARENT = """
 import sys
 from pathlib import Path
-from pipeline.traffic import sumo
-sumo.run("sumo", [], Path(sys.argv[1]))
+from egvs.traffic import sumo
+sumo.run_program("sumo", [], Path(sys.argv[1]))
 """
 
 
@@ -75,8 +74,8 @@ def test_sumo_ends_with_a_killed_parent(tmp_path, monkeypatch):
 
 WATCHED = """
 import sys
-from pipeline.traffic.guarded import confined
-sys.exit(confined.watched(sys.argv[1:]))
+from egvs.traffic import sandbox
+sys.exit(sandbox.run_watched(sys.argv[1:]))
 """
 
 
@@ -97,4 +96,4 @@ def test_a_watched_programs_exit_code_is_told():
 
 
 def test_the_launcher_needs_nothing_of_the_program():
-    assert "pipeline" not in Path(confined.__file__).read_text().split('"""', 2)[2]
+    assert "egvs" not in Path(sandbox.__file__).read_text().split('"""', 2)[2]

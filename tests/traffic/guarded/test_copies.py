@@ -5,15 +5,15 @@ from xml.etree.ElementTree import parse
 
 import pytest
 
-from pipeline.core.errors import InputError
-from pipeline.formats import safe_xml
-from pipeline.traffic.guarded import copies
+from egvs.core.errors import InputError
+from egvs.formats import xml
+from egvs.traffic import user_files
 
 TEXT = '<?xml version="1.0" encoding="{}"?>\n<!-- note --><routes a="1"><route id="通り" edges="a  b"/></routes>\n'
 
 
 def told(path):
-    return [(e.tag, e.attrib, [c.attrib for c in e]) for e in safe_xml.children(path, "")]
+    return [(e.tag, e.attrib, [c.attrib for c in e]) for e in xml.iter_elements(path, "")]
 
 
 def test_a_harmless_file_is_copied_byte_for_byte_and_unzipped(tmp_path):
@@ -21,7 +21,7 @@ def test_a_harmless_file_is_copied_byte_for_byte_and_unzipped(tmp_path):
     (tmp_path / "a.xml").write_bytes(data)
     (tmp_path / "b.xml.gz").write_bytes(gzip.compress(data))
     for name in ("a.xml", "b.xml.gz"):
-        assert copies.copy(tmp_path / name, tmp_path / "copy.xml") == []
+        assert user_files.copy_checked(tmp_path / name, tmp_path / "copy.xml") == []
         assert (tmp_path / "copy.xml").read_bytes() == data
 
 
@@ -29,7 +29,7 @@ def test_a_harmless_file_is_copied_byte_for_byte_and_unzipped(tmp_path):
 def test_another_encoding_becomes_utf8(tmp_path, encoding):
     data = TEXT.format(encoding).replace("通り", "é").encode(encoding)
     (tmp_path / "a.xml").write_bytes(data)
-    copies.copy(tmp_path / "a.xml", tmp_path / "copy.xml")
+    user_files.copy_checked(tmp_path / "a.xml", tmp_path / "copy.xml")
     assert (tmp_path / "copy.xml").read_bytes().decode() == '<routes a="1">\n<route id="é" edges="a  b" /></routes>\n'
 
 
@@ -39,7 +39,7 @@ def test_a_rewritten_file_says_the_same_but_for_its_outputs(tmp_path):
         '<param key="x.file" value="f"/></additional>'
     )
     (tmp_path / "a.xml").write_text(text)
-    assert copies.copy(tmp_path / "a.xml", tmp_path / "copy.xml") == [
+    assert user_files.copy_checked(tmp_path / "a.xml", tmp_path / "copy.xml") == [
         "a.xml: SUMO's outputs that it asks for are not written: 1 of <b>, 1 of <param>"
     ]
     assert told(tmp_path / "copy.xml") == [
@@ -51,7 +51,7 @@ def test_a_rewritten_file_says_the_same_but_for_its_outputs(tmp_path):
 
 
 def test_names_that_sumo_would_read_as_more_are_changed():
-    assert copies.safe_name("a,b;${HOME}.rou.xml") == "a_b__{HOME}.rou.xml"
+    assert user_files.safe_name("a,b;${HOME}.rou.xml") == "a_b__{HOME}.rou.xml"
 
 
 FURTHER = {
@@ -67,21 +67,21 @@ FURTHER = {
 def test_what_would_have_sumo_read_a_further_file_is_refused(tmp_path, text):
     (tmp_path / "a.xml").write_text(f"<additional>{text}</additional>")
     with pytest.raises(InputError, match=r"has SUMO read a further file; its content in this file itself"):
-        copies.copy(tmp_path / "a.xml", tmp_path / "copy.xml")
+        user_files.copy_checked(tmp_path / "a.xml", tmp_path / "copy.xml")
     assert not (tmp_path / "copy.xml").exists()
     (tmp_path / "a.xml").write_text(
         '<additional><variableSpeedSign id="v"><step time="0" speed="9"/></variableSpeedSign></additional>'
     )
-    assert copies.copy(tmp_path / "a.xml", tmp_path / "copy.xml") == []
+    assert user_files.copy_checked(tmp_path / "a.xml", tmp_path / "copy.xml") == []
 
 
 def test_what_was_checked_is_not_parsed_again_unless_it_is_another(tmp_path, monkeypatch):
     path = tmp_path / "a.xml"
     path.write_text('<routes><a x="1"/></routes>')
-    copies.check(path)
+    user_files.check_copyable(path)
     with monkeypatch.context() as patch:
-        patch.setattr(copies, "_guarded", None)
-        assert copies.copy(path, tmp_path / "copy.xml") == []
+        patch.setattr(user_files, "_checked_elements", None)
+        assert user_files.copy_checked(path, tmp_path / "copy.xml") == []
     path.write_text('<routes><include href="f"/></routes>')
     with pytest.raises(InputError, match="has SUMO read a further file"):
-        copies.check(path)
+        user_files.check_copyable(path)

@@ -2,8 +2,8 @@
 
 import pytest
 
-from pipeline.core.errors import InputError
-from pipeline.stages import traffic
+from egvs.core.errors import InputError
+from egvs.stages import traffic
 from tests.stages import run_stage
 from tests.traffic.guarded.lanes import KEPT, SHORT, configured, first_lane
 from tests.traffic.helpers import car, scenario

@@ -2,9 +2,9 @@
 
 import pytest
 
-from pipeline.core.errors import RunError
-from pipeline.stages import traffic
-from pipeline.traffic import sumo
+from egvs.core.errors import RunError
+from egvs.stages import traffic
+from egvs.traffic import sumo
 from tests.stages import run_stage
 from tests.traffic.guarded.lanes import configured
 from tests.traffic.helpers import SMALL, scenario
@@ -14,7 +14,7 @@ from tests.traffic.helpers import SMALL, scenario
 def test_a_full_disk_is_told(town, tmp_path, monkeypatch, blocks):
     """A limit on the size of files stands in for a full disk: SUMO ends with 0 on both."""
     limited = tmp_path / "sumo-limited"
-    limited.write_text(f"#!/bin/sh\ntrap '' XFSZ\nulimit -f {blocks}\n{sumo.binary('sumo')} \"$@\"\nexit 0\n")
+    limited.write_text(f"#!/bin/sh\ntrap '' XFSZ\nulimit -f {blocks}\n{sumo.sumo_binary('sumo')} \"$@\"\nexit 0\n")
     limited.chmod(0o755)
     monkeypatch.setenv("SUMO_BINARY", str(limited))
     with pytest.raises(RunError, match=r"fcd\.csv: SUMO did not write it to its end; is the disk full\? \([\d,]+ MB"):
@@ -62,19 +62,19 @@ def test_frames_that_are_missing_at_the_end_are_told(town, tmp_path, monkeypatch
 
 def damaged(monkeypatch, name, damage):
     """Have a file of SUMO's damaged as soon as SUMO has ended."""
-    run = sumo.run
+    run = sumo.run_program
 
     def cut(program, arguments, folder, *more):
         printed = run(program, arguments, folder, *more)
         damage(folder / name)
         return printed
 
-    monkeypatch.setattr(sumo, "run", cut)
+    monkeypatch.setattr(sumo, "run_program", cut)
 
 
 def test_a_network_that_netconvert_did_not_write_to_its_end_is_told(tmp_path, monkeypatch):
-    monkeypatch.setattr(sumo, "run", lambda *_: (tmp_path / "a.net.xml").write_text("<net>\n <edge"))
+    monkeypatch.setattr(sumo, "run_program", lambda *_: (tmp_path / "a.net.xml").write_text("<net>\n <edge"))
     with pytest.raises(RunError, match=r"a\.net\.xml: SUMO did not write it to its end; is the disk full\?"):
-        sumo.netconvert([], tmp_path, "a.net.xml")
-    monkeypatch.setattr(sumo, "run", lambda *_: (tmp_path / "a.net.xml").write_text("<net>\n</net>\n"))
-    sumo.netconvert([], tmp_path, "a.net.xml")
+        sumo.run_netconvert([], tmp_path, "a.net.xml")
+    monkeypatch.setattr(sumo, "run_program", lambda *_: (tmp_path / "a.net.xml").write_text("<net>\n</net>\n"))
+    sumo.run_netconvert([], tmp_path, "a.net.xml")

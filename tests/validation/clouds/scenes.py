@@ -6,13 +6,13 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-import pipeline
-from pipeline.artefacts.traffic_frames import TrafficFrame
-from pipeline.scenario.sensors import SensorModel
-from pipeline.sensing import sensors
-from pipeline.sensing.scene import Scene
-from pipeline.validation.clouds import bodies
-from pipeline.world.mesh import World
+import egvs
+from egvs.artefacts.traffic_frames import TrafficFrame
+from egvs.scenario.sensor_config import SensorConfig
+from egvs.sensors import sensor
+from egvs.sensors.scene import Scene
+from egvs.validation import cloud_simulation
+from egvs.world.mesh import World
 from tests.oracles import cast
 
 KINDS = ("passenger", "taxi", "delivery", "truck", "bus", "pedestrian", "bicycle")
@@ -57,10 +57,10 @@ def moved(scene, by_m):
 
 def placed(frame, position_m):
     """Triangles of all bodies of a frame, seen from the sensor along the world's axes, and the box of each."""
-    shapes, corners, owner = bodies.own(), [], []
+    shapes, corners, owner = cloud_simulation.builtin_bodies(), [], []
     several = frame.several_parts()
     for b, box in enumerate(frame.boxes):
-        kind = bodies.kind_of(frame.kinds[b], box[3:6].tolist(), int(frame.part[b]), bool(several[b]))
+        kind = cloud_simulation.body_kind(frame.kinds[b], box[3:6].tolist(), int(frame.part[b]), bool(several[b]))
         unit = np.concatenate([part.triangles for part in shapes[kind]])
         turn = Rotation.from_euler("ZY", [box[6], -frame.pitch_rad[b]])
         metres = turn.apply((unit * box[3:6]).reshape(-1, 3)) + (box[:3] - np.asarray(position_m))
@@ -83,12 +83,14 @@ def twin(scene, pose, sensor, frame):
 
 def built(folder, *settings):
     """The scene of a scenario."""
-    return pipeline.build_scene(pipeline.load(folder, settings))
+    return egvs.build_scene(egvs.load(folder, settings))
 
 
 def own_sensor(**keys):
     """A sensor from the keys of ``[sensors.own]``, without noise unless said."""
-    return sensors.resolve("own", {"own": SensorModel.of({"range_sigma_m": 0.0, "range_m": 100.0, **keys})}, "test")
+    return sensor.resolve_sensor(
+        "own", {"own": SensorConfig.of({"range_sigma_m": 0.0, "range_m": 100.0, **keys})}, "test"
+    )
 
 
 def cubes(folder, *kinds):

@@ -6,30 +6,30 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline import load
-from pipeline.core.errors import InputError
-from pipeline.runs import workflow
-from pipeline.scenario.validation import BodyKind
-from pipeline.validation.clouds import bodies, surfaces
+from egvs import load
+from egvs.core.errors import InputError
+from egvs.runs import run
+from egvs.scenario.model import BodyKind
+from egvs.validation import cloud_simulation
 from tests.validation.clouds.scenes import frame_of
 
 
-@pytest.mark.parametrize("kind", sorted(bodies.own()))
+@pytest.mark.parametrize("kind", sorted(cloud_simulation.builtin_bodies()))
 class TestOwn:
     def test_it_touches_every_face_of_its_box_and_never_leaves_it(self, kind):
-        corners = np.concatenate([part.triangles for part in bodies.own()[kind]]).reshape(-1, 3)
+        corners = np.concatenate([part.triangles for part in cloud_simulation.builtin_bodies()[kind]]).reshape(-1, 3)
         np.testing.assert_array_equal(corners.min(axis=0), [-0.5] * 3)
         np.testing.assert_array_equal(corners.max(axis=0), [0.5] * 3)
 
     def test_each_part_is_closed_convex_and_faces_outwards(self, kind):
-        for part in bodies.own()[kind]:
+        for part in cloud_simulation.builtin_bodies()[kind]:
             mesh = trimesh.Trimesh(**trimesh.triangles.to_kwargs(part.triangles))
             assert mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0
             hull = mesh.convex_hull.volume
             assert mesh.volume == pytest.approx(hull, rel=0.01)  # sides that lean in are warped a little
 
     def test_it_is_small_and_one_piece(self, kind):
-        parts = bodies.own()[kind]
+        parts = cloud_simulation.builtin_bodies()[kind]
         assert sum(len(part.triangles) for part in parts) <= 300
         low, high = (np.array([getattr(p.triangles, of)(axis=(0, 1)) for p in parts]) for of in ("min", "max"))
         joined = ((low[:, None] < high) & (low < high[:, None])).all(axis=2)
@@ -38,11 +38,11 @@ class TestOwn:
         assert joined.all()
 
     def test_its_surfaces_have_a_reflectivity(self, kind):
-        assert {part.surface for part in bodies.own()[kind]} <= set(surfaces.REFLECTIVITY)
+        assert {part.surface for part in cloud_simulation.builtin_bodies()[kind]} <= set(cloud_simulation.REFLECTIVITY)
 
 
 def test_the_kinds_that_a_scenario_may_name_are_those_that_there_are():
-    assert set(get_args(BodyKind)) == set(bodies.own())
+    assert set(get_args(BodyKind)) == set(cloud_simulation.builtin_bodies())
 
 
 @pytest.mark.parametrize(
@@ -66,12 +66,12 @@ def test_the_kinds_that_a_scenario_may_name_are_those_that_there_are():
     ],
 )
 def test_which_body_a_box_gets(vclass, size_m, part, jointed, kind):
-    assert bodies.kind_of(vclass, list(size_m), part, jointed) == kind
+    assert cloud_simulation.body_kind(vclass, list(size_m), part, jointed) == kind
 
 
 def test_every_vclass_of_the_table_gets_a_body_that_there_is():
-    for vclass in bodies._document()["classes"]:
-        assert bodies.kind_of(vclass, [4.5, 1.8, 1.5]) in bodies.own()
+    for vclass in cloud_simulation._read_bodies_file()["classes"]:
+        assert cloud_simulation.body_kind(vclass, [4.5, 1.8, 1.5]) in cloud_simulation.builtin_bodies()
 
 
 def _scenario(mini, name):
@@ -83,17 +83,19 @@ def test_a_mesh_of_the_users_is_stretched_to_the_unit_box(mini):
     mesh.apply_scale([4.0, 1.0, 2.0])
     mesh.apply_translation([100.0, -3.0, 7.0])
     mesh.export(mini / "own.ply")
-    corners = np.concatenate([p.triangles for p in bodies.read(mini / "own.ply", "validation.bodies.truck")])
+    corners = np.concatenate(
+        [p.triangles for p in cloud_simulation.read_body(mini / "own.ply", "validation.bodies.truck")]
+    )
     assert corners.shape == (len(mesh.faces), 3, 3)
     np.testing.assert_array_equal(corners.min(axis=(0, 1)), [-0.5] * 3)
     np.testing.assert_array_equal(corners.max(axis=(0, 1)), [0.5] * 3)
     scenario = _scenario(mini, "own.ply")
-    made = bodies.of_scenario(scenario)
-    assert made.kinds == bodies.of_scenario(load(mini)).kinds
-    before = bodies.digests(scenario)
+    made = cloud_simulation.vehicle_meshes(scenario)
+    assert made.kinds == cloud_simulation.vehicle_meshes(load(mini)).kinds
+    before = cloud_simulation.hash_body_files(scenario)
     mesh.apply_scale([1.0, 1.0, 1.1])
     mesh.export(mini / "own.ply")
-    assert bodies.digests(scenario) != before and set(before) == {"bodies.toml", "own.ply"}
+    assert cloud_simulation.hash_body_files(scenario) != before and set(before) == {"bodies.toml", "own.ply"}
 
 
 @pytest.mark.parametrize(
@@ -127,7 +129,7 @@ def test_what_is_no_body_is_refused(mini, name, write, message):
     if write is not None:
         write(mini / name)
     with pytest.raises(InputError, match=message):
-        bodies.of_scenario(_scenario(mini, name))
+        cloud_simulation.vehicle_meshes(_scenario(mini, name))
 
 
 def test_an_unknown_kind_of_body_is_refused(mini):
@@ -138,13 +140,13 @@ def test_an_unknown_kind_of_body_is_refused(mini):
 def test_an_articulated_truck_is_a_tractor_with_trailers_and_a_bus_stays_a_bus():
     rows = [(0.0, 0.0, 1.5, 5.0, 2.5, 3.0, 0.0, 0.0)] * 5
     frame = frame_of(rows, ["trailer"] * 2 + ["bus"] * 2 + ["truck"], vehicles="aabbc", part=[0, 1, 0, 1, 0])
-    made = bodies.Bodies.of(bodies.own())
+    made = cloud_simulation.VehicleMeshes.of(cloud_simulation.builtin_bodies())
     assert [made.kinds[k] for k in made.of_frame(frame)] == ["tractor", "trailer", "bus", "bus", "truck"]
 
 
 def test_nothing_of_a_run_depends_on_bodies_and_noise(mini, tmp_path):
     """A body, or the noise of a range, makes no stage run again."""
     given = ["sensors.small.range_sigma_m=0.1", 'validation.bodies.truck="own.ply"']
-    first, then = (workflow.run(load(mini, some), tmp_path / "run").stages for some in ([], given))
+    first, then = (run.run(load(mini, some), tmp_path / "run").stages for some in ([], given))
     for name in ("traffic", "statics", "tpog", "scan", "score"):
         assert then[name].inputs == first[name].inputs

@@ -6,9 +6,9 @@ import math
 import numpy as np
 import pytest
 
-from pipeline.effects.base import Detect
-from pipeline.sensing.sites import Pose
-from pipeline.validation.clouds.point_clouds import CloudMaker, random_of
+from egvs.effects.base import Detect
+from egvs.sensors.sites import Pose
+from egvs.validation.cloud_simulation import CloudSimulator, sweep_rng
 from tests.conftest import BUILDING, collection, feature
 from tests.validation.clouds.scenes import built, frame_of, own_sensor, random_frame
 
@@ -29,14 +29,14 @@ SWEEPS = 20
 )
 def test_returns_are_lost_by_the_chances_of_the_score(mini, settings):
     scene, sensor = built(mini, *settings), own_sensor(**FINE)
-    maker = CloudMaker(scene, POSE, sensor, "here")
+    maker = CloudSimulator(scene, POSE, sensor, "here")
     frame = random_frame(np.random.default_rng(2), (20.0, 5.0, 0.0))
     hits = maker.first_hits(frame)
     met = np.flatnonzero(np.isfinite(hits.range_m))
     chance = np.prod([e.detect(hits.range_m[met], sensor) for e in scene.acting(Detect)], axis=0)
     seen = np.zeros(len(hits.range_m))
     for number in range(SWEEPS):
-        seen[maker.sweep(frame, random_of(1, "here", number)).sweep.beam] += 1
+        seen[maker.sweep(frame, sweep_rng(1, "here", number)).sweep.beam] += 1
     assert seen[np.isinf(hits.range_m)].sum() == 0
     near = hits.range_m[met] < np.median(hits.range_m[met])
     for some in (near, ~near):
@@ -45,8 +45,8 @@ def test_returns_are_lost_by_the_chances_of_the_score(mini, settings):
 
 
 def test_all_is_lost_where_the_share_is_one(mini):
-    maker = CloudMaker(built(mini, "effects.dropout.share=1"), POSE, own_sensor(**FINE), "here")
-    assert len(maker.sweep(frame_of([]), random_of(1, "here", 0)).sweep.points) == 0
+    maker = CloudSimulator(built(mini, "effects.dropout.share=1"), POSE, own_sensor(**FINE), "here")
+    assert len(maker.sweep(frame_of([]), sweep_rng(1, "here", 0)).sweep.points) == 0
 
 
 @pytest.mark.parametrize(
@@ -56,10 +56,10 @@ def test_all_is_lost_where_the_share_is_one(mini):
 )
 def test_each_beam_draws_one_of_its_rows_by_weight(mini, settings):
     scene, sensor = built(mini, *settings), own_sensor(**FINE)
-    maker = CloudMaker(scene, POSE, sensor, "here")
+    maker = CloudSimulator(scene, POSE, sensor, "here")
     weight = maker._scanner.scan(POSE, sensor).rows.weight
     drawn = np.zeros(len(weight))
-    random = random_of(1, "here", 0)
+    random = sweep_rng(1, "here", 0)
     for _ in range(60):
         rows = maker._drawn(maker._cumulated, random)
         np.testing.assert_array_equal(maker._beam[rows], np.arange(sensor.beams))
@@ -72,21 +72,21 @@ def test_each_beam_draws_one_of_its_rows_by_weight(mini, settings):
 def test_a_weighted_beam_returns_once_and_along_its_nominal_direction(mini):
     sensor = own_sensor(**FINE)
     frame = random_frame(np.random.default_rng(2), (20.0, 5.0, 0.0))
-    maker = CloudMaker(built(mini, "effects.mount_sway.tilt_deg=2"), POSE, sensor, "here")
-    cloud = maker.sweep(frame, random_of(1, "here", 0)).sweep
+    maker = CloudSimulator(built(mini, "effects.mount_sway.tilt_deg=2"), POSE, sensor, "here")
+    cloud = maker.sweep(frame, sweep_rng(1, "here", 0)).sweep
     assert (np.diff(cloud.beam.astype(int)) > 0).all() and len(cloud.beam) > 1000
     far = np.sqrt((cloud.points[:, :3].astype(np.float64) ** 2).sum(axis=1))
     np.testing.assert_allclose(cloud.points[:, :3], far[:, None] * sensor.directions()[cloud.beam], atol=1e-4)
-    plain = CloudMaker(built(mini), POSE, sensor, "here").first_hits(frame)
+    plain = CloudSimulator(built(mini), POSE, sensor, "here").first_hits(frame)
     assert (np.abs(far - plain.range_m[cloud.beam]) > 0.05).mean() > 0.3
 
 
 def test_no_weight_left_over_is_lost_and_what_is_left_over_is(mini):
-    from pipeline.validation.clouds.point_clouds import _cumulated
+    from egvs.validation.cloud_simulation import _cumulate_weights
 
     beam, weight = np.array([0, 0, 0, 2, 2, 3]), np.array([0.1, 0.2, 0.7, 0.25, 0.25, 1.0])
-    np.testing.assert_allclose(_cumulated(beam, weight), [0.1, 0.3, 1.0, 2.25, 2.5, 4.0], rtol=0, atol=1e-15)
-    assert _cumulated(beam, weight)[2] == 1.0
+    np.testing.assert_allclose(_cumulate_weights(beam, weight), [0.1, 0.3, 1.0, 2.25, 2.5, 4.0], rtol=0, atol=1e-15)
+    assert _cumulate_weights(beam, weight)[2] == 1.0
 
 
 def test_leaves_return_some_beams_and_let_others_through_to_the_road(mini):
@@ -99,17 +99,17 @@ def test_leaves_return_some_beams_and_let_others_through_to_the_road(mini):
     scene = built(mini, "effects.foliage.leaf_area_density=0.7")
     assert [effect.NAME for effect in scene.effects] == ["foliage"]
     sensor = own_sensor(elevations_deg=[-20, -5], channels=30, azimuth_deg=[-20, 20], azimuth_step_deg=0.5)
-    maker = CloudMaker(scene, Pose(8.0, -8.0, 4.0), sensor, "here")
+    maker = CloudSimulator(scene, Pose(8.0, -8.0, 4.0), sensor, "here")
     frame = frame_of([(20.0, -8.0, 1.5, 8.0, 2.5, 3.0, 1.4, 0.0)], ["bus"])
     share = through = 0.0
     for number in range(SWEEPS):
-        cloud = maker.sweep(frame, random_of(1, "here", number))
+        cloud = maker.sweep(frame, sweep_rng(1, "here", number))
         x = cloud.sweep.points[:, 0] + 8.0
         leaves = (cloud.owner == -1) & (x > 13.0 - 1e-6) & (x < 15.0 + 1e-6) & (cloud.sweep.points[:, 2] > -3.0 + 1e-3)
         share += leaves.sum() / len(x) / SWEEPS
         through += cloud.points_on(1)[0] / SWEEPS
         assert set(np.round(cloud.sweep.points[leaves, 3], 6)) == {np.float32(0.3)}
-    plain = CloudMaker(built(mini), Pose(8.0, -8.0, 4.0), sensor, "here")
-    assert plain.sweep(frame, random_of(1, "here", 0)).points_on(1)[0] < 0.2 * through
+    plain = CloudSimulator(built(mini), Pose(8.0, -8.0, 4.0), sensor, "here")
+    assert plain.sweep(frame, sweep_rng(1, "here", 0)).points_on(1)[0] < 0.2 * through
     assert 0.2 < share < 0.8
     assert json.dumps(scene.skipped("scan")) == "[]"

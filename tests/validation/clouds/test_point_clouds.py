@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.core.errors import InputError
-from pipeline.sensing.scanner import Scanner
-from pipeline.sensing.sites import Pose
-from pipeline.validation.clouds import bodies, surfaces
-from pipeline.validation.clouds.point_clouds import CloudMaker, random_of
+from egvs.core.errors import InputError
+from egvs.sensors.scanner import Scanner
+from egvs.sensors.sites import Pose
+from egvs.validation import cloud_simulation
+from egvs.validation.cloud_simulation import CloudSimulator, sweep_rng
 from tests.oracles import cast
 from tests.validation.clouds.scenes import built, cubes, frame_of, moved, own_sensor, placed, random_frame, twin
 
@@ -39,7 +39,7 @@ CAR = (4.0, 2.0, 1.5)
 
 def hits_equal(scene, pose, sensor, frame):
     """Hold the first hits against the twin's; how many beams ended on a body."""
-    hits = CloudMaker(scene, pose, sensor, "here").first_hits(frame)
+    hits = CloudSimulator(scene, pose, sensor, "here").first_hits(frame)
     ranges, owner = twin(scene, pose, sensor, frame)
     met = np.isfinite(ranges)
     np.testing.assert_array_equal(np.isfinite(hits.range_m), met)
@@ -72,7 +72,7 @@ def test_traffic_all_round_within_reach_and_beyond_it(mini):
     frame = frame_of([*around, (20.3, 0.1, 0.75, *CAR, 0.0, 0.0), (60.0, 0.0, 1.5, 12.0, 2.5, 3.0, 0.0, 0.0)])
     near = own_sensor(elevations_deg=[-89, 0], channels=45, azimuth_step_deg=2.0, range_m=30.0)
     assert hits_equal(scene, pose, near, frame) > 500
-    owner = CloudMaker(scene, pose, near, "here").first_hits(frame).owner
+    owner = CloudSimulator(scene, pose, near, "here").first_hits(frame).owner
     assert set(owner[owner >= 0]) == set(range(10))  # the last one is out of reach
 
 
@@ -84,9 +84,9 @@ def test_points_and_intensities_counted_by_hand(mini):
     """
     scene = built(mini, *cubes(mini, "sedan", "van"))
     sensor = own_sensor(elevations_deg=[-45, -30, -10], azimuth_step_deg=90.0)
-    maker = CloudMaker(scene, Pose(10.0, -8.0, 3.0), sensor, "here")
+    maker = CloudSimulator(scene, Pose(10.0, -8.0, 3.0), sensor, "here")
     frame = frame_of([(13.0, -8.0, 0.75, 4.0, 2.0, 1.5, 0, 0), (18.0, -8.0, 1.5, 4.0, 1.7, 3.0, math.pi, 0)])
-    cloud = maker.sweep(frame, random_of(0, "here", 0))
+    cloud = maker.sweep(frame, sweep_rng(0, "here", 0))
     np.testing.assert_array_equal(cloud.sweep.beam, np.arange(12))
     np.testing.assert_array_equal(cloud.owner, [0, 0, 1, *[-1] * 9])
     np.testing.assert_array_equal(cloud.points_on(2), [2, 1])
@@ -104,18 +104,18 @@ def test_points_and_intensities_counted_by_hand(mini):
 
 def test_what_stands_behind_a_wall_gets_nothing(mini):
     scene = built(mini)
-    maker = CloudMaker(scene, Pose(16.0, -5.0, 3.0), own_sensor(**SENSORS["rings"]), "here")
+    maker = CloudSimulator(scene, Pose(16.0, -5.0, 3.0), own_sensor(**SENSORS["rings"]), "here")
     hidden, empty = frame_of([(16.0, 10.0, 0.75, 2.0, 1.5, 1.5, 0, 0)]), frame_of([])
-    clouds = [maker.sweep(frame, random_of(0, "here", 0)) for frame in (hidden, empty)]
+    clouds = [maker.sweep(frame, sweep_rng(0, "here", 0)) for frame in (hidden, empty)]
     assert clouds[0].sweep.points.tobytes() == clouds[1].sweep.points.tobytes()
     assert (clouds[0].owner == -1).all()
 
 
 def test_a_body_in_a_body_hides_what_it_encloses(mini):
-    maker = CloudMaker(built(mini), Pose(10.0, 12.0, 3.0), own_sensor(**SENSORS["rings"]), "here")
+    maker = CloudSimulator(built(mini), Pose(10.0, 12.0, 3.0), own_sensor(**SENSORS["rings"]), "here")
     large = (20.0, 12.0, 1.5, 8.0, 3.0, 3.0, 0.0, 0.0)
     cargo = (16.5, 12.0, 2.0, 0.5, 0.5, 0.5, 0.0, 0.0)
-    assert maker.sweep(frame_of([large, cargo], ["truck"] * 2), random_of(0, "a", 0)).points_on(2)[1] == 0
+    assert maker.sweep(frame_of([large, cargo], ["truck"] * 2), sweep_rng(0, "a", 0)).points_on(2)[1] == 0
 
 
 @pytest.mark.parametrize("height_m", [3.0, 2.0])
@@ -123,7 +123,7 @@ def test_beams_along_a_roof_or_a_side_decide_nothing(mini, height_m):
     """The sensor as high as the roof and in line with the side of a box; beams along both meet its front, or none."""
     scene = built(mini, *cubes(mini, "sedan", "van"))
     sensor = own_sensor(elevations_deg=[0, -10], azimuth_step_deg=90.0)
-    maker = CloudMaker(scene, Pose(10.0, -8.0, 3.0), sensor, "here")
+    maker = CloudSimulator(scene, Pose(10.0, -8.0, 3.0), sensor, "here")
     frame = frame_of([(15.0, -7.0, height_m / 2, 4.0, 2.0, height_m, 0, 0)])
     hits = maker.first_hits(frame)
     level, low = hits.range_m[:2]
@@ -133,7 +133,7 @@ def test_beams_along_a_roof_or_a_side_decide_nothing(mini, height_m):
 
 def test_a_body_that_holds_the_sensor_is_left_out(mini):
     scene, pose = built(mini), Pose(10.0, 12.0, 3.0)
-    maker = CloudMaker(scene, pose, own_sensor(**SENSORS["rings"]), "here")
+    maker = CloudSimulator(scene, pose, own_sensor(**SENSORS["rings"]), "here")
     bus = (*pose.position_m[:2], 2.0, 12.0, 2.5, 4.0, 0.4, 0.0)
     car = (18.0, 12.0, 0.75, *CAR, 0.0, 0.0)
     both, alone = (maker.first_hits(frame_of(rows)) for rows in ([bus, car], [car]))
@@ -143,8 +143,8 @@ def test_a_body_that_holds_the_sensor_is_left_out(mini):
 
 def test_noise_is_gaussian_along_the_beam(mini):
     sensor = replace(own_sensor(elevations_deg=[-60, -5], channels=60, azimuth_step_deg=1.0), range_sigma_m=0.05)
-    maker = CloudMaker(built(mini), Pose(10.0, 12.0, 3.0, pitch_deg=-10.0, yaw_deg=30.0), sensor, "here")
-    cloud = maker.sweep(frame_of([]), random_of(3, "here", 0)).sweep
+    maker = CloudSimulator(built(mini), Pose(10.0, 12.0, 3.0, pitch_deg=-10.0, yaw_deg=30.0), sensor, "here")
+    cloud = maker.sweep(frame_of([]), sweep_rng(3, "here", 0)).sweep
     nominal = sensor.directions()[cloud.beam]
     measured = (cloud.points[:, :3] * nominal).sum(axis=1)
     np.testing.assert_allclose(cloud.points[:, :3], measured[:, None] * nominal, atol=1e-4)
@@ -157,13 +157,13 @@ def test_noise_is_gaussian_along_the_beam(mini):
 
 def test_the_same_bytes_whatever_the_order_of_frames_and_sites_and_the_threads(mini):
     scene = built(mini, "effects.dropout.share=0.2", "effects.divergence.sub_beams=7")
-    scanner, random = Scanner(scene, whole=True), np.random.default_rng(1)
+    scanner, random = Scanner(scene, full_sweep=True), np.random.default_rng(1)
     frames = [random_frame(random, (20.0, 0.0, 0.0), number=n) for n in range(4)]
 
     def digest(job):
         site, frame = job
-        maker = CloudMaker.of_site(scene, site, scanner)
-        cloud = maker.sweep(frame, random_of(7, site.name, frame.number))
+        maker = CloudSimulator.of_site(scene, site, scanner)
+        cloud = maker.sweep(frame, sweep_rng(7, site.name, frame.number))
         return cloud.sweep.points.tobytes() + cloud.sweep.beam.tobytes() + cloud.owner.tobytes()
 
     jobs = [(site, frame) for site in scene.sites for frame in frames]
@@ -172,9 +172,9 @@ def test_the_same_bytes_whatever_the_order_of_frames_and_sites_and_the_threads(m
     assert [digest(job) for job in reversed(jobs)][::-1] == once
     with ThreadPoolExecutor(4) as pool:
         assert list(pool.map(digest, jobs)) == once
-    shared = CloudMaker.of_site(scene, scene.sites[0], scanner)
+    shared = CloudSimulator.of_site(scene, scene.sites[0], scanner)
     with ThreadPoolExecutor(4) as pool:
-        clouds = list(pool.map(lambda f: shared.sweep(f, random_of(7, scene.sites[0].name, f.number)), frames))
+        clouds = list(pool.map(lambda f: shared.sweep(f, sweep_rng(7, scene.sites[0].name, f.number)), frames))
     assert [c.sweep.points.tobytes() + c.sweep.beam.tobytes() + c.owner.tobytes() for c in clouds] == once[:4]
 
 
@@ -182,7 +182,7 @@ def test_the_empty_scan_holds_every_beam_and_those_at_the_region_as_ever(mini):
     scene = built(mini)
     for site in scene.sites:
         sensor = scene.sensor(site.sensor)
-        few, all_ = Scanner(scene).scan_site(site).rows, Scanner(scene, whole=True).scan_site(site).rows
+        few, all_ = Scanner(scene).scan_site(site).rows, Scanner(scene, full_sweep=True).scan_site(site).rows
         np.testing.assert_array_equal(all_.beam, np.arange(sensor.beams))
         assert len(few.beam) < sensor.beams
         np.testing.assert_array_equal(all_.ends_m[few.beam], few.ends_m)
@@ -194,22 +194,24 @@ def test_a_measured_scan_is_refused(mini):
     with pytest.raises(
         InputError, match=r"site pole_a: an empty scan that was measured \(scan\.pcd\).*; a site without"
     ):
-        CloudMaker.of_site(scene, replace(scene.sites[0], points="scan.pcd"))
+        CloudSimulator.of_site(scene, replace(scene.sites[0], points="scan.pcd"))
 
 
 def test_intensities_are_those_of_the_surface_that_is_met(mini):
     """Reflectivity times the cosine between beam and normal, worked out triangle by triangle in metres."""
     scene, pose, sensor = built(mini), POSES["tilted"], own_sensor(**SENSORS["rings"])
     frame = random_frame(np.random.default_rng(8), np.array(pose.position_m) * (1, 1, 0), spread_m=12.0)
-    hits = CloudMaker(scene, pose, sensor, "here").first_hits(frame)
+    hits = CloudSimulator(scene, pose, sensor, "here").first_hits(frame)
     on = np.flatnonzero(hits.owner >= 0)
     beams, (corners, _) = sensor.directions(*pose.angles_deg)[on], placed(frame, pose.position_m)
     _, triangle = cast.first_hits(np.zeros(3), beams, corners, edge_m=1e-9)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[triangle]
     cosine = np.abs((normals * beams).sum(axis=1)) / np.linalg.norm(normals, axis=1)
-    kinds = [bodies.kind_of(k, b[3:6].tolist()) for k, b in zip(frame.kinds, frame.boxes, strict=True)]
-    surface = [part.surface for kind in kinds for part in bodies.own()[kind] for _ in part.triangles]
-    share = np.array([surfaces.REFLECTIVITY[surface[t]] for t in triangle])
+    kinds = [cloud_simulation.body_kind(k, b[3:6].tolist()) for k, b in zip(frame.kinds, frame.boxes, strict=True)]
+    surface = [
+        part.surface for kind in kinds for part in cloud_simulation.builtin_bodies()[kind] for _ in part.triangles
+    ]
+    share = np.array([cloud_simulation.REFLECTIVITY[surface[t]] for t in triangle])
     assert len(on) > 100 and len(set(share)) > 2
     np.testing.assert_allclose(hits.intensity[on], share * cosine, rtol=0, atol=1e-9)
 
@@ -223,7 +225,7 @@ def test_a_mesh_of_the_users_is_met_from_both_sides(mini, inside_out):
     ball.export(mini / "ball.ply")
     scene = built(mini, 'validation.bodies.bus="ball.ply"')
     sensor = own_sensor(elevations_deg=[-2, 2], channels=5, azimuth_deg=[-2, 2], azimuth_step_deg=1.0)
-    maker = CloudMaker(scene, Pose(10.0, -8.0, 3.0), sensor, "here")
+    maker = CloudSimulator(scene, Pose(10.0, -8.0, 3.0), sensor, "here")
     hits = maker.first_hits(frame_of([(19.0, -8.0, 3.0, 4.0, 4.0, 4.0, 0.0, 0.0)], ["bus"]))
     along = 9.0 * sensor.directions()[:, 0]
     assert (hits.owner == 0).all()

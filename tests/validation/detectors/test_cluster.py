@@ -5,14 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.core.grid import Roi
-from pipeline.sensing.sensors import CATALOGUE
-from pipeline.sensing.sites import Pose
-from pipeline.validation.detectors.cluster.clustering import SQUARE_M, Density, clusters_of
-from pipeline.validation.detectors.cluster.detector import Cluster, scores
-from pipeline.validation.detectors.cluster.kinds import kinds
-from pipeline.validation.metrics.overlap import overlap_each
-from pipeline.validation.sweeps import SiteView, Sweep
+from egvs.core.grid import Roi
+from egvs.sensors.sensor import CATALOGUE
+from egvs.sensors.sites import Pose
+from egvs.validation.detection_metrics import paired_overlap
+from egvs.validation.detectors.cluster import Cluster, box_scores, load_kinds
+from egvs.validation.detectors.clustering import SQUARE_M, Density, find_clusters
+from egvs.validation.sweeps import SiteView, Sweep
 
 ROI = Roi((-60.0, -60.0, -10.0), (120.0, 120.0, 25.0))
 SENSOR = CATALOGUE["VLP-32C"]
@@ -50,7 +49,7 @@ def look(boxes, pose=POSE, slope=0.0, still=(), noise_m=0.0):
 def overlaps(boxes, found, slope=0.0):
     """The best overlap of each box with the detections, from above and in space, (2, n)."""
     wanted = np.array([(x, y, slope * x + h / 2, le, w, h, yaw) for x, y, le, w, h, yaw in boxes])
-    each = [overlap_each(np.repeat(box[None], len(found.boxes), 0), found.boxes).max(axis=1) for box in wanted]
+    each = [paired_overlap(np.repeat(box[None], len(found.boxes), 0), found.boxes).max(axis=1) for box in wanted]
     return np.array(each).T
 
 
@@ -153,7 +152,7 @@ def test_clusters_are_those_of_single_linkage():
     random = np.random.default_rng(4)
     density = Density(reach_m=0.6, reach_per_range=0.03, core_squares=1, least_points=1)
     points = np.column_stack([random.uniform(-12, 12, (300, 2)), random.uniform(0, 2, 300)])  # nearer than 20 m
-    clusters = clusters_of(points, density)
+    clusters = find_clusters(points, density)
     squares = {tuple(np.floor(p[:2] / SQUARE_M).astype(int)): [] for p in points}
     for p in points:
         squares[tuple(np.floor(p[:2] / SQUARE_M).astype(int))].append(p)
@@ -168,7 +167,7 @@ def test_clusters_are_those_of_single_linkage():
 
 
 def test_the_table_of_kinds_is_sound():
-    table = kinds()
+    table = load_kinds()
     assert (table.size_m[:, 0] >= table.size_m[:, 1]).all() and (table.size_m > 0.3).all()
     assert len(set(table.names)) == len(table.names)
     assert (table.share > 0).all() and not table.is_vehicle.all()
@@ -182,5 +181,5 @@ def test_its_settings_say_all_that_its_boxes_depend_on():
 def test_a_score_is_of_points_and_fit():
     """By hand: 1 - e^-1 with 100 points; 1/e of it with a cost of 10."""
     full = 1.0 - np.exp(-1.0)
-    found = scores(np.array([100, 100, 100, 0]), np.array([0.0, 10.0, -3.0, 0.0]))
+    found = box_scores(np.array([100, 100, 100, 0]), np.array([0.0, 10.0, -3.0, 0.0]))
     np.testing.assert_allclose(found, [full, full / np.e, full, 0.0], rtol=1e-12)

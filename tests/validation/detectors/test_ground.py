@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from pipeline.core.grid import Roi
-from pipeline.sensing.sensors import CATALOGUE
-from pipeline.sensing.sites import Pose
-from pipeline.validation.detectors import background
-from pipeline.validation.detectors.ground import SQUARE_M, STEEPEST, GroundMap
-from pipeline.validation.sweeps import SiteView, Sweep
+from egvs.core.grid import Roi
+from egvs.sensors.sensor import CATALOGUE
+from egvs.sensors.sites import Pose
+from egvs.validation.detectors import background
+from egvs.validation.detectors.background import MAX_SLOPE, SQUARE_M, GroundMap
+from egvs.validation.sweeps import SiteView, Sweep
 
 ROI = Roi((0.0, 0.0, 0.0), (40.0, 40.0, 5.0))
 SENSOR = CATALOGUE["VLP-32C"]
@@ -43,7 +43,7 @@ def test_the_ground_of_a_slope_is_the_slope(slope):
 def test_a_wall_is_no_ground():
     ground = GroundMap.of(_view(_to_plane(0.0, wall_x_m=30.0)), ROI)
     at = np.array([[10.0, 20.0], [29.0, 20.0], [31.0, 20.0], [39.0, 10.0]])
-    np.testing.assert_allclose(ground.height_m(at), 0.0, atol=STEEPEST * SQUARE_M)  # its foot is taken for a climb
+    np.testing.assert_allclose(ground.height_m(at), 0.0, atol=MAX_SLOPE * SQUARE_M)  # its foot is taken for a climb
 
 
 def test_where_nothing_was_met_the_ground_is_below_the_sensor():
@@ -59,6 +59,6 @@ def test_what_is_new_lies_before_the_empty_scan_and_in_the_world_where_it_was_me
     shorter = view.empty_range_m[beam] - [0.0, 0.14, 0.16]
     points = np.column_stack([ways[beam] * shorter[:, None], np.ones(3)]).astype(np.float32)
     sweep = Sweep(points, beam)
-    np.testing.assert_array_equal(background.new_in(sweep, view), [False, False, True])
+    np.testing.assert_array_equal(background.foreground_mask(sweep, view), [False, False, True])
     there = np.asarray(pose.position_m) + SENSOR.directions(*pose.angles_deg)[beam] * shorter[:, None]
-    np.testing.assert_allclose(background.in_world(sweep, view), there, atol=1e-5)
+    np.testing.assert_allclose(background.points_in_world(sweep, view), there, atol=1e-5)

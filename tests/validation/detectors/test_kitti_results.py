@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from pipeline.core.errors import InputError
-from pipeline.formats import kitti
-from pipeline.sensing.sites import Pose
-from pipeline.validation.detectors import kitti_results
-from pipeline.validation.exports.level_frame import LevelFrame
+from egvs.core.errors import InputError
+from egvs.formats import kitti
+from egvs.sensors.sites import Pose
+from egvs.validation import kitti_results
+from egvs.validation.dataset_files import LevelFrame
 
 POSES = {"a": Pose(100.0, 200.0, 3.0, yaw_deg=90.0), "b": Pose(-5.0, 2.0, 6.0, yaw_deg=30.0, pitch_deg=-12.0)}
 NUMBERS = np.array([0, 8])
@@ -28,7 +28,7 @@ def folder(tmp_path):
 
 def test_a_car_ahead_that_heads_left_counted_by_hand(folder):
     """Site a looks north from 3 m: the car is 10 m north of it, stands on z = 0 and heads west."""
-    found = kitti_results.read(folder, POSES, NUMBERS)
+    found = kitti_results.read_kitti_results(folder, POSES, NUMBERS)
     assert list(found) == ["mine"] and list(found["mine"]) == ["a", "b"]
     first, second = found["mine"]["a"]
     np.testing.assert_allclose(first.boxes[0, :6], [100, 210, 0.75, 4.5, 1.8, 1.5], atol=1e-9)
@@ -45,17 +45,17 @@ def test_boxes_of_the_world_come_back(folder, site):
     )
     scores = random.uniform(-2, 2, 200)
     level = LevelFrame(POSES[site])
-    (folder / site / "mine" / "000008.txt").write_text(kitti.lines(["Truck"] * 200, level.boxes(boxes), scores))
-    found = kitti_results.read(folder, POSES, NUMBERS)["mine"][site][1]
+    (folder / site / "mine" / "000008.txt").write_text(kitti.format_labels(["Truck"] * 200, level.boxes(boxes), scores))
+    found = kitti_results.read_kitti_results(folder, POSES, NUMBERS)["mine"][site][1]
     np.testing.assert_allclose(found.boxes[:, :6], boxes[:, :6], atol=1.1e-6)  # six decimals are written
-    np.testing.assert_allclose(kitti.wrapped(found.boxes[:, 6] - boxes[:, 6]), 0, atol=1.1e-6)
+    np.testing.assert_allclose(kitti.wrap_angle(found.boxes[:, 6] - boxes[:, 6]), 0, atol=1.1e-6)
     np.testing.assert_allclose(found.scores, scores, atol=1e-6)
 
 
 def test_people_and_cyclists_are_left_out_and_dont_care_is_no_box(folder):
     lines = [CAR.replace("Car", name) for name in ("Cyclist", "Pedestrian", "Bus", "DontCare")]
     (folder / "a" / "mine" / "000000.txt").write_text("\n".join(lines) + "\n\n")
-    assert len(kitti_results.read(folder, POSES, NUMBERS)["mine"]["a"][0].scores) == 1
+    assert len(kitti_results.read_kitti_results(folder, POSES, NUMBERS)["mine"]["a"][0].scores) == 1
 
 
 def test_results_may_lie_beside_the_export_and_be_called_data(folder):
@@ -65,7 +65,7 @@ def test_results_may_lie_beside_the_export_and_be_called_data(folder):
         for name in ("000000", "000008"):
             (folder / site / "calib" / f"{name}.txt").write_text(kitti.CALIBRATION.replace("1", "1.0e0"))
         (folder / site / "mine").rename(folder / site / "data")
-    assert list(kitti_results.read(folder, POSES, NUMBERS)) == ["res"]
+    assert list(kitti_results.read_kitti_results(folder, POSES, NUMBERS)) == ["res"]
 
 
 @pytest.mark.parametrize(
@@ -84,7 +84,7 @@ def test_results_may_lie_beside_the_export_and_be_called_data(folder):
 def test_a_wrong_line_is_told_by_file_and_line(folder, line, told):
     (folder / "b" / "mine" / "000008.txt").write_text(f"{CAR}\n\n{line}\n")
     with pytest.raises(InputError) as error:
-        kitti_results.read(folder, POSES, NUMBERS)
+        kitti_results.read_kitti_results(folder, POSES, NUMBERS)
     for text in (str(folder / "b" / "mine" / "000008.txt: line 3"), *told):
         assert text in str(error.value)
 
@@ -113,6 +113,6 @@ def _calibrated(folder, text):
 def test_a_wrong_folder_is_told(folder, spoil, told):
     spoil(folder)
     with pytest.raises(InputError) as error:
-        kitti_results.read(folder, POSES, NUMBERS)
+        kitti_results.read_kitti_results(folder, POSES, NUMBERS)
     for text in told:
         assert text in str(error.value)

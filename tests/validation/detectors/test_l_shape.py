@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.validation.detectors.cluster import l_shape
+from egvs.validation.detectors import cluster
 
 
 def corner_of(length, width, yaw, at, step=0.05):
@@ -25,7 +25,7 @@ def twin(xy):
         for c in (c1, c2):
             from_top, from_bottom = c.max() - c, c - c.min()
             sides.append(from_top if np.linalg.norm(from_top) < np.linalg.norm(from_bottom) else from_bottom)
-        beta = sum(1.0 / max(min(d1, d2), l_shape.ON_SIDE_M) for d1, d2 in zip(*sides, strict=True))
+        beta = sum(1.0 / max(min(d1, d2), cluster.ON_SIDE_M) for d1, d2 in zip(*sides, strict=True))
         if beta > best[0]:
             best = beta, degree, (c1.min(), c1.max(), c2.min(), c2.max())
     return best
@@ -35,7 +35,7 @@ def twin(xy):
 def test_a_box_seen_from_one_corner_gives_its_corner(degrees):
     yaw = np.deg2rad(degrees)
     xy = corner_of(4.5, 1.8, yaw, (20.0, -7.0))
-    found = l_shape.rectangles(xy, np.array([0, len(xy)]))
+    found = cluster.bounding_rectangles(xy, np.array([0, len(xy)]))
     np.testing.assert_allclose(found.yaw_rad, [yaw], atol=1e-12)
     corner = found.along_axes(0, np.array([[20.0, -7.0]]))[0]
     np.testing.assert_allclose(found.ends_m[0, :, 0], corner, atol=1e-9)
@@ -48,15 +48,15 @@ def test_the_kernel_agrees_with_the_published_algorithm():
     clusters = [random.uniform(-3, 3, (int(n), 2)) + random.uniform(-50, 50, 2) for n in random.integers(1, 60, 20)]
     clusters += [corner_of(*size, yaw, (5.0, 9.0), 0.11) for size, yaw in (((4, 2), 0.3), ((10, 2.5), 1.2))]
     starts = np.cumsum([0, *map(len, clusters)])
-    found = l_shape.rectangles(np.concatenate(clusters), starts)
+    found = cluster.bounding_rectangles(np.concatenate(clusters), starts)
     for k, xy in enumerate(clusters):
         beta, degree, ends = twin(xy)
-        np.testing.assert_allclose(found.closeness[k], beta * l_shape.ON_SIDE_M / len(xy), rtol=1e-9)
+        np.testing.assert_allclose(found.closeness[k], beta * cluster.ON_SIDE_M / len(xy), rtol=1e-9)
         if len(xy) > 2:  # of one or two points many headings are as good
             assert found.yaw_rad[k] == np.deg2rad(degree)
             np.testing.assert_allclose(found.ends_m[k].ravel(), ends, atol=1e-9)
 
 
 def test_no_cluster_has_no_rectangle():
-    found = l_shape.rectangles(np.empty((0, 2)), np.array([0]))
+    found = cluster.bounding_rectangles(np.empty((0, 2)), np.array([0]))
     assert found.ends_m.shape == (0, 2, 2)

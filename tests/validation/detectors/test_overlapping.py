@@ -4,26 +4,26 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.validation.detectors.overlapping import MOST_SHARED, apart
-from pipeline.validation.metrics.overlap import overlap_each
-from pipeline.validation.sweeps import Detections
+from egvs.validation.detection_metrics import paired_overlap
+from egvs.validation.detectors.base import MAX_OVERLAP, suppress_overlaps
+from egvs.validation.sweeps import Detections
 
 
 def test_of_two_boxes_that_overlap_the_surer_one_stays():
     boxes = np.array([[1, 0, 1, 4, 2, 2, 0.1], [3.9, 0, 1, 4, 2, 2, 0.0], [0, 0, 1, 4, 2, 2, 0.0]])
     scores = np.array([0.4, 0.2, 0.9])
-    found = apart(Detections(boxes, scores), scores)
+    found = suppress_overlaps(Detections(boxes, scores), scores)
     np.testing.assert_array_equal(found.boxes[:, 0], [0.0, 3.9])
     np.testing.assert_array_equal(found.scores, [0.9, 0.2])
 
 
 def test_of_equals_the_first_stays():
     boxes = np.array([[0, 0, 1, 4, 2, 2, 0.0], [0.5, 0, 1, 4, 2, 2, 0.0]])
-    assert apart(Detections(boxes, np.array([0.9, 0.5])), np.array([20, 20])).boxes[:, 0].tolist() == [0.0]
+    assert suppress_overlaps(Detections(boxes, np.array([0.9, 0.5])), np.array([20, 20])).boxes[:, 0].tolist() == [0.0]
 
 
 def test_nothing_stays_nothing():
-    assert len(apart(Detections.none(), np.empty(0)).boxes) == 0
+    assert len(suppress_overlaps(Detections.empty(), np.empty(0)).boxes) == 0
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 25))
@@ -32,10 +32,10 @@ def test_as_one_by_one_against_all(seed, count):
     size = random.uniform([3, 1, 1], [18, 3, 4], (count, 3))
     boxes = np.column_stack([random.uniform(-12, 12, (count, 3)), size, random.uniform(-4, 4, count)])
     scores, weight = random.uniform(0, 1, count), random.integers(0, 5, count)
-    found = apart(Detections(boxes, scores), weight)
+    found = suppress_overlaps(Detections(boxes, scores), weight)
     kept = []
     for row in sorted(range(count), key=lambda row: -weight[row]):  # stable
-        if all(overlap_each(boxes[[row]], boxes[[other]])[0][0] <= MOST_SHARED for other in kept):
+        if all(paired_overlap(boxes[[row]], boxes[[other]])[0][0] <= MAX_OVERLAP for other in kept):
             kept.append(row)
     np.testing.assert_array_equal(found.boxes, boxes[kept])
     np.testing.assert_array_equal(found.scores, scores[kept])

@@ -6,30 +6,30 @@ import math
 import numpy as np
 import pytest
 
-from pipeline import load
-from pipeline.core.errors import InputError
-from pipeline.core.grid import Roi
-from pipeline.validation.detectors.pointpillars import decoding, detector, encoding
-from pipeline.validation.detectors.pointpillars.encoding import POINTS, SeenPoints, Window
-from pipeline.validation.looking import Look
-from pipeline.validation.site_findings import POINTS as POINTS_ON
-from pipeline.validation.site_findings import FoundBoxes, FoundPoints
-from pipeline.validation.unseen_record import prepare
+from egvs import load
+from egvs.core.errors import InputError
+from egvs.core.grid import Roi
+from egvs.validation.detector_runs import SiteDetectionTask
+from egvs.validation.detectors import pointpillars
+from egvs.validation.detectors.pointpillars import POINTS_PER_PILLAR, PillarPoints, PillarWindow
+from egvs.validation.held_out_traffic import prepare_held_out_traffic
+from egvs.validation.sweeps import POINT_COUNTS_NAME as POINTS_ON
+from egvs.validation.sweeps import DetectedBoxes, PointCounts
 
 
 def _seen(rows):
     """Points of (x, y, height, intensity, new, range)."""
     values = np.array(rows, dtype=np.float64)
-    return SeenPoints(
+    return PillarPoints(
         values[:, :2], values[:, 2], values[:, 3].astype(np.float32), values[:, 4].astype(bool), values[:, 5]
     )
 
 
 def test_the_pillars_of_four_points_are_as_on_paper():
-    window = Window((0.0, 0.0), cells=4)  # 1.6 m wide, its first corner at (-0.8, -0.8)
+    window = PillarWindow((0.0, 0.0), cells=4)  # 1.6 m wide, its first corner at (-0.8, -0.8)
     rows = [(-0.7, -0.7, 1.0, 0.5, 1, 25.0), (-0.5, -0.6, 3.0, 0.1, 0, 50.0), (0.1, 0.3, 0.0, 0.2, 0, 10.0)]
     rows += [(0.9, 0.0, 1.0, 0.5, 1, 25.0), (0.0, 0.0, 4.6, 0.5, 1, 25.0)]  # out of the window; too high
-    found = encoding.pillars(_seen(rows), window, "ground")
+    found = pointpillars.make_pillars(_seen(rows), window, "ground")
     np.testing.assert_array_equal(found.cell, [0, 2 * 4 + 2])
     np.testing.assert_array_equal(found.present.sum(axis=1), [2, 1])
     # the first pillar's middle is (0.2, 0.2) from the corner, its points are at (0.1, 0.1) and (0.3, 0.2)
@@ -41,9 +41,9 @@ def test_the_pillars_of_four_points_are_as_on_paper():
 
 
 def test_of_a_full_pillar_every_so_many_points_are_taken():
-    rows = [(0.1, 0.1, i / 100, 0.5, 1, 5.0) for i in range(2 * POINTS + 3)]
-    found = encoding.pillars(_seen(rows), Window((0.0, 0.0)), "ground")
-    assert found.present.sum() == POINTS
+    rows = [(0.1, 0.1, i / 100, 0.5, 1, 5.0) for i in range(2 * POINTS_PER_PILLAR + 3)]
+    found = pointpillars.make_pillars(_seen(rows), PillarWindow((0.0, 0.0)), "ground")
+    assert found.present.sum() == POINTS_PER_PILLAR
     steps = np.diff(np.round(100 * found.features[0, :, 2]).astype(int))
     assert set(steps.tolist()) <= {2, 3}  # 35 points to 16 places
 
@@ -52,7 +52,7 @@ def test_the_order_of_pillars_does_not_depend_on_that_of_points_nor_do_heights_o
     random = np.random.default_rng(3)
     rows = np.column_stack([random.uniform(-9, 9, (300, 2)), random.uniform(-4, 5, 300), random.random((300, 3))])
     seen = _seen(rows)
-    found = encoding.pillars(seen, Window((0.0, 0.0)), "sensor")
+    found = pointpillars.make_pillars(seen, PillarWindow((0.0, 0.0)), "sensor")
     heights = found.features[..., 2][found.present > 0]
     assert heights.min() >= -3.0 and heights.max() <= 1.0 and len(heights) > 100
     assert (np.diff(found.cell) > 0).all()
@@ -61,7 +61,7 @@ def test_the_order_of_pillars_does_not_depend_on_that_of_points_nor_do_heights_o
 
 @pytest.mark.parametrize("turn", [0.0, 0.7, -2.5])
 def test_a_window_leads_to_the_world_and_back(turn):
-    window, at = Window((10.0, -4.0), turn), np.random.default_rng(0).uniform(-50, 50, (20, 2))
+    window, at = PillarWindow((10.0, -4.0), turn), np.random.default_rng(0).uniform(-50, 50, (20, 2))
     np.testing.assert_allclose(window.to_world(window.to_window(at)), at, atol=1e-12)
     ahead = window.to_world(np.array([[window.size_m / 2 + 1.0, window.size_m / 2]]))
     np.testing.assert_allclose(ahead, [[10.0 + math.cos(turn), -4.0 + math.sin(turn)]], atol=1e-12)
@@ -73,27 +73,27 @@ def test_boxes_come_back_from_their_values():
     sizes = np.array([[4.5, 1.8, 1.5], [10.9, 2.5, 3.1], [3.4, 1.5, 1.7]])
     yaw = random.uniform(-math.pi, math.pi, 3)
     boxes = np.column_stack([places, [0.75, 1.55, 0.85], sizes, yaw])
-    cell, values = decoding.encode(boxes)
-    heat, maps = np.zeros((128, 128), np.float32), np.zeros((decoding.VALUES, 128, 128), np.float32)
+    cell, values = pointpillars.encode_boxes(boxes)
+    heat, maps = np.zeros((128, 128), np.float32), np.zeros((pointpillars.N_VALUES, 128, 128), np.float32)
     heat[tuple(cell.T)] = [0.9, 0.6, 0.7]
     maps[:, cell[:, 0], cell[:, 1]] = values.T
-    found, scores = decoding.decode(heat, maps)
+    found, scores = pointpillars.decode_boxes(heat, maps)
     np.testing.assert_allclose(scores, [0.9, 0.7, 0.6], atol=1e-6)
     np.testing.assert_allclose(found[:, :6], boxes[[0, 2, 1], :6], atol=1e-5)
     np.testing.assert_allclose(np.sin(found[:, 6] - boxes[[0, 2, 1], 6]), 0.0, atol=1e-5)  # up to half a turn
 
 
 def test_neighbours_of_a_peak_and_faint_ones_are_no_detections():
-    heat, maps = np.zeros((8, 8), np.float32), np.zeros((decoding.VALUES, 8, 8), np.float32)
+    heat, maps = np.zeros((8, 8), np.float32), np.zeros((pointpillars.N_VALUES, 8, 8), np.float32)
     heat[3, 3], heat[3, 4], heat[6, 6] = 0.8, 0.7, 0.04
-    _, scores = decoding.decode(heat, maps)
+    _, scores = pointpillars.decode_boxes(heat, maps)
     np.testing.assert_allclose(scores, [0.8], atol=1e-6)
 
 
 @pytest.mark.parametrize("size_m", [(100.0, 50.0), (102.4, 102.4), (150.0, 60.0), (400.0, 300.0)])
 def test_windows_cover_the_region_and_share_a_seam(size_m):
     roi = Roi((5.0, -7.0, 0.0), (*size_m, 5.0))
-    found = detector.windows(roi)
+    found = pointpillars.roi_windows(roi)
     at = np.asarray(roi.origin_m[:2]) + np.random.default_rng(0).uniform(0, 1, (500, 2)) * size_m
     inside = [((w.to_window(at) >= 0) & (w.to_window(at) < w.size_m)).all(axis=1) for w in found]
     assert np.any(inside, axis=0).all()
@@ -107,13 +107,13 @@ def test_a_model_that_is_none_is_named(tmp_path):
     path = tmp_path / "m.onnx"
     path.write_bytes(b"no model")
     with pytest.raises(InputError, match=r"m\.onnx: no ONNX model .*; a model that egvs train wrote"):
-        detector.Model.of(path)
+        pointpillars.OnnxModel.of(path)
     with pytest.raises(InputError, match="No such file"):
-        detector.Model.of(tmp_path / "absent.onnx")
+        pointpillars.OnnxModel.of(tmp_path / "absent.onnx")
 
 
 def test_the_shipped_model_says_how_it_was_made():
-    about = detector.Model.of(detector.SHIPPED).about
+    about = pointpillars.OnnxModel.of(pointpillars.SHIPPED_MODEL).metadata
     assert about["convention"] == "ground" and about["parameters"] == 985785
     assert "nishishinjuku" not in about["junctions"] and len(about["junctions"]) >= 4
     assert about["curve"][-1]["step"] == about["recipe"]["steps"]
@@ -123,15 +123,15 @@ def test_the_shipped_model_says_how_it_was_made():
 @pytest.mark.slow
 def test_the_shipped_model_finds_the_cars_of_a_road(mini, tmp_path):
     """From both sites, with a sensor of the catalogue: every car with 100 points, to half a metre."""
-    record = prepare(load(mini, ["sites.sensor=VLP-32C"]), tmp_path / "r", 10)
-    look, well_seen = Look(record, {"pointpillars": detector.PointPillars()}), 0
+    record = prepare_held_out_traffic(load(mini, ["sites.sensor=VLP-32C"]), tmp_path / "r", 10)
+    look, well_seen = SiteDetectionTask(record, {"pointpillars": pointpillars.PointPillars()}), 0
     for site in record.scene.sites:
         its = look.at(site, [POINTS_ON, "pointpillars"])
         boxes, points = its["pointpillars"], its[POINTS_ON]
-        assert isinstance(boxes, FoundBoxes) and isinstance(points, FoundPoints)
+        assert isinstance(boxes, DetectedBoxes) and isinstance(points, PointCounts)
         for frame, found, on in zip(record.read(), boxes.frames, points.points, strict=True):
             sure = found.boxes[found.scores > 0.3]
-            for box in frame.boxes[frame.wanted(record.scene.roi)][on >= 100]:
+            for box in frame.boxes[frame.target_rows(record.scene.roi)][on >= 100]:
                 assert np.hypot(*(sure[:, :2] - box[:2]).T).min(initial=9.0) < 0.5, (site.name, frame.number)
                 well_seen += 1
     assert well_seen > 20

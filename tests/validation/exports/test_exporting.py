@@ -7,17 +7,16 @@ import re
 import numpy as np
 import pytest
 
-from pipeline import load
-from pipeline.core import files
-from pipeline.core.errors import InputError
-from pipeline.formats import kitti
-from pipeline.formats.point_clouds import read_points
-from pipeline.sensing.sensors import rotation
-from pipeline.validation import unseen_record
-from pipeline.validation.clouds.point_clouds import CloudMaker, random_of
-from pipeline.validation.exports import exporting, openpcdet
-from pipeline.validation.exports.exporting import export
-from pipeline.validation.exports.layouts import LAYOUTS
+from egvs import load
+from egvs.core import files
+from egvs.core.errors import InputError
+from egvs.formats import kitti
+from egvs.formats.point_clouds import read_points
+from egvs.sensors.sensor import rotation_world_sensor
+from egvs.validation import dataset, held_out_traffic
+from egvs.validation.cloud_simulation import CloudSimulator, sweep_rng
+from egvs.validation.dataset import write_dataset
+from egvs.validation.dataset_files import LAYOUTS
 
 SITES = """\
 site,x_m,y_m,z_m,yaw_deg,pitch_deg,roll_deg
@@ -39,24 +38,24 @@ def four(mini):
 
 def truth(scenario, tmp_path):
     """The record's frames, and for each site its pose and what a maker of its own gives of each."""
-    record = unseen_record.prepare(scenario, tmp_path / "truth", FRAMES)
+    record = held_out_traffic.prepare_held_out_traffic(scenario, tmp_path / "truth", FRAMES)
     frames = list(record.read())
     swept = {}
     for site in record.scene.sites:
-        maker = CloudMaker.of_site(record.scene, site)
-        swept[site.name] = [maker.sweep(f, random_of(record.scenario.seed, site.name, f.number)) for f in frames]
+        maker = CloudSimulator.of_site(record.scene, site)
+        swept[site.name] = [maker.sweep(f, sweep_rng(record.scenario.seed, site.name, f.number)) for f in frames]
     return record, frames, swept
 
 
 def in_world(pose, points):
     """Points of a level frame in the world, the long way round: yaw, then the place."""
-    return points @ rotation(pose.yaw_deg, 0, 0).T + np.asarray(pose.position_m)
+    return points @ rotation_world_sensor(pose.yaw_deg, 0, 0).T + np.asarray(pose.position_m)
 
 
 def labels_of(folder, kind, name):
     """Classes and boxes of a frame, as a detector's program reads them."""
     if kind == "kitti":
-        found = kitti.read(folder / "label_2" / f"{name}.txt")
+        found = kitti.read_labels(folder / "label_2" / f"{name}.txt")
         return list(found.names), found.boxes
     rows = [line.split(" ") for line in (folder / "labels" / f"{name}.txt").read_text().splitlines()]
     return [row[-1] for row in rows], np.array([row[:-1] for row in rows], dtype=float).reshape(-1, 7)
@@ -86,7 +85,7 @@ def test_labels_and_points_read_back_are_those_of_the_traffic(four, tmp_path, ki
     """Boxes to 1e-3 m and 1e-3 rad in the world; each cloud holds its points, and those on a vehicle are in its box."""
     scenario = load(four, [QUIET])
     record, frames, swept = truth(scenario, tmp_path)
-    done = export(scenario, tmp_path / "out", frames=FRAMES, kind=kind)
+    done = write_dataset(scenario, tmp_path / "out", frames=FRAMES, kind=kind)
     checked = 0
     for site in record.scene.sites:
         folder = tmp_path / "out" / site.name
@@ -100,7 +99,7 @@ def test_labels_and_points_read_back_are_those_of_the_traffic(four, tmp_path, ki
             turned = boxes[:, 6] + np.radians(site.pose.yaw_deg) - frame.boxes[seen, 6]
             np.testing.assert_allclose(np.abs(np.exp(1j * turned) - 1), 0, atol=1e-3)
             points = points_of(folder, kind, name)
-            beams = rotation(*site.pose.angles_deg) @ taken.sweep.points[:, :3].T.astype(float)
+            beams = rotation_world_sensor(*site.pose.angles_deg) @ taken.sweep.points[:, :3].T.astype(float)
             np.testing.assert_allclose(in_world(site.pose, points) - site.pose.position_m, beams.T, atol=1e-4)
             for row, box in zip(seen, boxes, strict=True):
                 assert inside(points[taken.owner == row], box, 1e-3).all()
@@ -109,7 +108,7 @@ def test_labels_and_points_read_back_are_those_of_the_traffic(four, tmp_path, ki
 
 
 def test_every_frame_is_in_one_list_and_empty_ones_are_told(four, tmp_path):
-    done = export(load(four), tmp_path / "out", frames=FRAMES, kind="openpcdet")
+    done = write_dataset(load(four), tmp_path / "out", frames=FRAMES, kind="openpcdet")
     for about in done.sites:
         sets = {
             s: (tmp_path / "out" / about.site / "ImageSets" / f"{s}.txt").read_text().split()
@@ -129,7 +128,7 @@ def test_every_frame_is_in_one_list_and_empty_ones_are_told(four, tmp_path):
 def test_clouds_tell_which_object_each_point_is_on(four, tmp_path, kind):
     scenario = load(four)
     _, frames, swept = truth(scenario, tmp_path)
-    export(scenario, tmp_path / "out", sites=["rolled"], frames=FRAMES, kind=kind)
+    write_dataset(scenario, tmp_path / "out", sites=["rolled"], frames=FRAMES, kind=kind)
     record = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")] + [("object", "<i4")])
     for frame, taken in zip(frames, swept["rolled"], strict=True):
         path = tmp_path / "out" / "rolled" / "points" / f"{frame.number:06d}.{kind}"
@@ -142,13 +141,13 @@ def test_clouds_tell_which_object_each_point_is_on(four, tmp_path, kind):
 def test_objects_csv_holds_all_boxes_and_says_which_are_ground_truth(four, tmp_path):
     scenario = load(four)
     record, frames, swept = truth(scenario, tmp_path)
-    export(scenario, tmp_path / "out", sites=["behind", "level"], frames=FRAMES, kind="pcd")
+    write_dataset(scenario, tmp_path / "out", sites=["behind", "level"], frames=FRAMES, kind="pcd")
     for site in ("behind", "level"):
         rows = list(csv.DictReader((tmp_path / "out" / site / "objects.csv").read_text().splitlines()))
         assert len(rows) == sum(len(frame.boxes) for frame in frames)
         at = iter(rows)
         for frame, taken in zip(frames, swept[site], strict=True):
-            wanted, on = set(frame.wanted(record.scene.roi).tolist()), taken.points_on(len(frame.boxes))
+            wanted, on = set(frame.target_rows(record.scene.roi).tolist()), taken.points_on(len(frame.boxes))
             for number in range(len(frame.boxes)):
                 row = next(at)
                 assert (row["frame"], row["object"]) == (f"{frame.number:06d}", str(number))
@@ -157,13 +156,13 @@ def test_objects_csv_holds_all_boxes_and_says_which_are_ground_truth(four, tmp_p
 
 
 def bytes_of(folder):
-    return {str(path.relative_to(folder)): files.sha256_of(path) for path in folder.rglob("*") if path.is_file()}
+    return {str(path.relative_to(folder)): files.hash_file(path) for path in folder.rglob("*") if path.is_file()}
 
 
 @pytest.mark.parametrize("kind", LAYOUTS)
 def test_the_same_bytes_twice_and_on_any_number_of_threads(four, tmp_path, kind):
     for name, jobs in (("a", 1), ("b", 2)):
-        export(load(four), tmp_path / name, sites=["tilted", "level"], frames=FRAMES, kind=kind, jobs=jobs)
+        write_dataset(load(four), tmp_path / name, sites=["tilted", "level"], frames=FRAMES, kind=kind, jobs=jobs)
     assert bytes_of(tmp_path / "a") == bytes_of(tmp_path / "b")
     folders = {path.name for path in (tmp_path / "a").iterdir()}
     assert folders == {"README.md", "tilted", "level"}
@@ -171,7 +170,7 @@ def test_the_same_bytes_twice_and_on_any_number_of_threads(four, tmp_path, kind)
 
 
 def test_the_readme_says_what_the_files_hold(four, tmp_path):
-    done = export(load(four, ["effects.dropout.share=0.2"]), tmp_path / "out", frames=FRAMES, kind="kitti")
+    done = write_dataset(load(four, ["effects.dropout.share=0.2"]), tmp_path / "out", frames=FRAMES, kind="kitti")
     text = (tmp_path / "out" / "README.md").read_text()
     rows = {
         row[0]: row for line in text.splitlines() if len(row := [w.strip() for w in line.strip("|").split("|")]) == 13
@@ -198,9 +197,9 @@ def test_the_readme_says_what_the_files_hold(four, tmp_path):
 
 
 def test_openpcdet_gets_a_grid_that_holds_the_labels(four, tmp_path):
-    done = export(load(four), tmp_path / "out", frames=FRAMES, kind="openpcdet")
+    done = write_dataset(load(four), tmp_path / "out", frames=FRAMES, kind="openpcdet")
     for about in done.sites:
-        text = (tmp_path / "out" / about.site / openpcdet.FILE).read_text()
+        text = (tmp_path / "out" / about.site / dataset.CONFIG_FILE).read_text()
         grid = [float(word) for word in re.search(r"POINT_CLOUD_RANGE: \[(.*)\]", text)[1].split(",")]
         voxel = [float(word) for word in re.search(r"VOXEL_SIZE: \[(.*)\]", text)[1].split(",")]
         cells = (np.array(grid[3:]) - grid[:3]) / voxel
@@ -223,18 +222,18 @@ def test_openpcdet_gets_a_grid_that_holds_the_labels(four, tmp_path):
     [
         (["--site", "levl"], "--site: no site 'levl'; did you mean level?"),
         (["--site", "x9"], "--site: no site 'x9'; one of level, tilted, rolled, behind"),
-        (["--frames", "11"], "--frames: 11, of traffic with 40 frames every 0.5 s; at most 10"),
+        (["--frames", "11"], "--frames: expected at most 10 frames at least 2 s apart, got 11"),
         (["--frames", "0"], "--frames"),
         (["--format", "waymo"], "--format: 'waymo'; one of kitti, openpcdet, ply, pcd"),
     ],
 )
-def test_wrong_words_are_refused_and_nothing_is_written(four, tmp_path, egvs, words, message):
-    code, _, err = egvs("clouds", four, "--frames", 2, "--out", tmp_path / "out", *words)
+def test_wrong_words_are_refused_and_nothing_is_written(four, tmp_path, run_egvs, words, message):
+    code, _, err = run_egvs("clouds", four, "--frames", 2, "--out", tmp_path / "out", *words)
     assert code == 2 and message in err
     assert not (tmp_path / "out").exists() and not list(tmp_path.glob(".out*"))
 
 
-def test_nothing_is_overwritten(four, tmp_path, egvs):
+def test_nothing_is_overwritten(four, tmp_path, run_egvs):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").write_text("mine")
     for out, message in (
@@ -242,7 +241,7 @@ def test_nothing_is_overwritten(four, tmp_path, egvs):
         ("full/mine.txt", "is a file"),
         ("full/mine.txt/a", "cannot be written"),
     ):
-        code, _, err = egvs("clouds", four, "--frames", 2, "--out", tmp_path / out)
+        code, _, err = run_egvs("clouds", four, "--frames", 2, "--out", tmp_path / out)
         assert code == 2 and message in err
     assert [path.name for path in tmp_path.rglob("*mine*")] == ["mine.txt"]
 
@@ -251,24 +250,24 @@ def test_a_disk_without_room_is_told_before_anything_is_written(four, tmp_path, 
     class Full:
         free = 1000
 
-    monkeypatch.setattr(exporting.shutil, "disk_usage", lambda _: Full)
+    monkeypatch.setattr(dataset.shutil, "disk_usage", lambda _: Full)
     with pytest.raises(InputError, match=r"GB of points, but 0\.0 GB are free there; fewer --frames"):
-        export(load(four), tmp_path / "out", frames=FRAMES)
+        write_dataset(load(four), tmp_path / "out", frames=FRAMES)
     assert not (tmp_path / "out").exists() and not list(tmp_path.glob(".out*"))
 
 
 def test_sites_that_cannot_be_exported_are_refused(four, tmp_path):
     (four / "sites.csv").write_text("site,x_m,y_m,z_m,points\n..,10,8,3,\nmeasured,12,8,3,scan.ply\n")
     with pytest.raises(InputError, match=r"site \.\.: its name cannot be that of a folder here"):
-        export(load(four), tmp_path / "out", sites=[".."], frames=2)
+        write_dataset(load(four), tmp_path / "out", sites=[".."], frames=2)
     with pytest.raises(InputError, match="site measured: an empty scan that was measured"):
-        export(load(four), tmp_path / "out", sites=["measured"], frames=2)
+        write_dataset(load(four), tmp_path / "out", sites=["measured"], frames=2)
 
 
-def test_what_a_killed_export_left_is_taken_away_and_an_empty_folder_is_filled(four, tmp_path, egvs):
+def test_what_a_killed_export_left_is_taken_away_and_an_empty_folder_is_filled(four, tmp_path, run_egvs):
     (tmp_path / ".out.partial" / "level").mkdir(parents=True)
     (tmp_path / "out").mkdir()
-    code, out, _ = egvs("clouds", four, "--frames", 2, "--site", "level", "--out", tmp_path / "out")
+    code, out, _ = run_egvs("clouds", four, "--frames", 2, "--site", "level", "--out", tmp_path / "out")
     assert code == 0 and "level" in out and "README.md" in out
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"README.md", "level"}
     assert not list(tmp_path.glob(".out*"))

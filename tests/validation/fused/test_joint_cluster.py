@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import strategies
 
-from pipeline.sensing.sites import Pose
-from pipeline.validation.detectors.cluster.clustering import Clusters, Density, _united, clusters_of
-from pipeline.validation.detectors.cluster.detector import Cluster
-from pipeline.validation.detectors.cluster.hiding import shown_ends
-from pipeline.validation.detectors.cluster.l_shape import Rectangles
-from pipeline.validation.sweeps import Detections, Sweep
+from egvs.sensors.sites import Pose
+from egvs.validation.detectors.cluster import Cluster, Rectangles, visible_ends
+from egvs.validation.detectors.clustering import Clusters, Density, _merge_labels, find_clusters
+from egvs.validation.sweeps import Detections, Sweep
 from tests.validation.detectors.test_cluster import CAR, ROI, look, overlaps
 
 NEAR, FAR = Pose(0.0, 0.0, 4.0), Pose(0.0, 30.0, 4.0, yaw_deg=40.0)
@@ -63,7 +61,7 @@ def test_sweeps_without_points_are_nothing():
     detector, _ = look([], NEAR)
     joint = Cluster().together([detector.joint.views[0]] * 2, ROI)
     empty = Sweep(np.empty((0, 4), np.float32), np.empty(0, np.uint32))
-    assert joint.detect([empty, empty]).boxes.shape == Detections.none().boxes.shape
+    assert joint.detect([empty, empty]).boxes.shape == Detections.empty().boxes.shape
 
 
 def test_neighbours_of_different_sensors_are_linked_and_others_are_not():
@@ -72,7 +70,7 @@ def test_neighbours_of_different_sensors_are_linked_and_others_are_not():
     sensors_m = np.array([[0.0, 0.0], [45.0, 0.0]])
 
     def sizes(sensor):
-        return np.diff(clusters_of(points, density, np.array(sensor), sensors_m).starts).tolist()
+        return np.diff(find_clusters(points, density, np.array(sensor), sensors_m).starts).tolist()
 
     assert sizes([0, 1, 0, 0, 0]) == [2, 2]  # 0.5 m apart; and 0.75 m, near at a range of 40 m
     assert sizes([0, 1, 0, 1, 1]) == [2]  # but not at 5 m
@@ -89,10 +87,10 @@ def test_ends_that_another_sensor_faces_and_sees_as_sides():
     clusters = Clusters(points, starts, points[:, :2], starts, sensor)
     box = Rectangles(np.zeros(1), np.array([[[-2.0, 2.0], [9.0, 11.0]]]), np.ones(1))
     sensors_m = np.array([[0.0, 0.0], [10.0, 20.0]])
-    assert shown_ends(clusters, box, sensors_m, 0).tolist() == [[[False, True], [False, True]]]
-    assert shown_ends(clusters, box, sensors_m, 1).tolist() == [[[False, False], [True, False]]]
+    assert visible_ends(clusters, box, sensors_m, 0).tolist() == [[[False, True], [False, True]]]
+    assert visible_ends(clusters, box, sensors_m, 1).tolist() == [[[False, False], [True, False]]]
     edge = replace(clusters, sensor=np.where(points[:, 0] >= 2.0, 1, 0))  # of the east alone, the north by its corner
-    assert shown_ends(edge, box, sensors_m, 0).tolist() == [[[False, True], [False, False]]]
+    assert visible_ends(edge, box, sensors_m, 0).tolist() == [[[False, True], [False, False]]]
 
 
 @pytest.mark.slow
@@ -109,7 +107,7 @@ LABELS = strategies.lists(strategies.integers(-1, 4), min_size=8, max_size=8)
 
 @hypothesis.given(strategies.lists(LABELS, min_size=1, max_size=3))
 def test_what_is_linked_any_way_is_one(labels):
-    found = _united([_compact(label) for label in labels])
+    found = _merge_labels([_compact(label) for label in labels])
     linked = np.zeros((8, 8), dtype=bool)
     for label in labels:
         linked |= (np.equal.outer(label, label)) & (np.array(label) >= 0)

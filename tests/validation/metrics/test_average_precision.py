@@ -5,13 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from pipeline.artefacts.traffic_frames import TrafficFrame
-from pipeline.core.errors import InputError
-from pipeline.core.grid import Roi
-from pipeline.validation.metrics.average_precision import evaluate
-from pipeline.validation.metrics.leave_out import Estimate, blocks_of
-from pipeline.validation.metrics.matching import Objects, Record, within
-from pipeline.validation.sweeps import Detections
+from egvs.artefacts.traffic_frames import TrafficFrame
+from egvs.core.errors import InputError
+from egvs.core.grid import Roi
+from egvs.validation.detection_metrics import EvaluationFrames, GroundTruth, JackknifeEstimate, evaluate, frame_blocks
+from egvs.validation.sweeps import Detections, detections_in_roi
 from tests.oracles import kitti
 
 CAR = (0.75, 4.0, 2.0, 1.5, 0.0)  # z, length, width, height, yaw
@@ -23,7 +21,7 @@ def box(x, z=0.75, length=4.0):
 
 def objects(boxes, cars=None, points=None):
     n = len(boxes)
-    return Objects(
+    return GroundTruth(
         np.array(boxes, float).reshape(n, 7),
         np.ones(n, bool) if cars is None else np.array(cars, bool),
         np.full(n, 100) if points is None else np.array(points),
@@ -36,8 +34,8 @@ def found(*scored):
 
 def one_frame(truth, *scored):
     """The measures of one frame, beside nine that are empty."""
-    empty = [(objects([]), Detections.none())] * 9
-    return evaluate(Record.of(*zip((truth, found(*scored)), *empty, strict=True)))
+    empty = [(objects([]), Detections.empty())] * 9
+    return evaluate(EvaluationFrames.of(*zip((truth, found(*scored)), *empty, strict=True)))
 
 
 def values(evaluation, view="bev", iou=70, end=""):
@@ -98,11 +96,11 @@ def test_by_hand(truth, scored, r11, r40, recall):
 def test_no_objects_is_no_number_and_is_told():
     evaluation = one_frame(objects([]), (A, 0.9))
     assert all(math.isnan(its.value) and math.isnan(its.se) for its in evaluation.measures.values())
-    doubts = [str(doubt) for doubt in evaluation.doubts("site c03, cluster")]
+    doubts = [str(doubt) for doubt in evaluation.warnings("site c03, cluster")]
     assert doubts[0] == ("site c03, cluster: no vehicles in 10 frames: there is no average precision; more frames")
     assert len(doubts) == 5  # of each subset
     evaluation = one_frame(objects([A]), (A, 0.9))
-    assert "the only vehicles are in one of 10 blocks of frames" in str(evaluation.doubts("site c03")[0])
+    assert "the only vehicles are in one of 10 blocks of frames" in str(evaluation.warnings("site c03")[0])
     assert evaluation.measures["ap_bev_r40_iou70"].value == 1 and math.isnan(evaluation.measures["ap_bev_r40_iou70"].se)
 
 
@@ -146,7 +144,7 @@ def test_standard_error_by_hand():
     """One object a frame, found in five of ten. Recall .5; without a found one 4/9, without a missed one 5/9. Pseudo-
     values 10 * .5 - 9 * that: 1 and 0. se^2 = mean of (1/2)^2 / 9, so se = 1/6: that of a mean of five 1 and five 0."""
     truth, hit = objects([A]), found((A, 0.9))
-    record = Record.of([truth] * 10, [hit] * 5 + [Detections.none()] * 5)
+    record = EvaluationFrames.of([truth] * 10, [hit] * 5 + [Detections.empty()] * 5)
     recall = evaluate(record).measures["recall_bev_iou70"]
     np.testing.assert_allclose(recall.left_out, [4 / 9] * 5 + [5 / 9] * 5)
     assert recall.value == 0.5 and recall.se == pytest.approx(1 / 6)
@@ -154,18 +152,18 @@ def test_standard_error_by_hand():
 
 def test_standard_error_of_unequal_blocks():
     """A mean over frames: pseudo-values are the blocks' own means, whatever their lengths."""
-    frames, rng = np.bincount(blocks_of(47, 10)), np.random.default_rng(0)
+    frames, rng = np.bincount(frame_blocks(47, 10)), np.random.default_rng(0)
     sums = rng.normal(size=10) * frames
     left_out = (sums.sum() - sums) / (frames.sum() - frames)
-    estimate = Estimate.of(np.concatenate([[sums.sum() / 47], left_out]), frames)
+    estimate = JackknifeEstimate.of(np.concatenate([[sums.sum() / 47], left_out]), frames)
     expected = ((sums / frames - sums.sum() / 47) ** 2 / (47 / frames - 1)).mean() ** 0.5
     assert estimate.se == pytest.approx(expected)
 
 
 def test_blocks_are_neighbours_of_equal_length():
-    assert list(blocks_of(7, 3)) == [0, 0, 0, 1, 1, 2, 2]
+    assert list(frame_blocks(7, 3)) == [0, 0, 0, 1, 1, 2, 2]
     with pytest.raises(InputError, match="--frames: 9; at least 10: standard errors come from 10 blocks"):
-        blocks_of(9)
+        frame_blocks(9)
 
 
 # ---- against the twin
@@ -181,7 +179,7 @@ def random_scenes(seed, frames, objects_a_frame=5.0):
             rng.uniform(0, 12, (n, 2)), np.full(n, 0.8), rng.uniform(3.5, 5, n), rng.uniform(1.6, 2.2, n),
             rng.uniform(1.4, 1.8, n), rng.uniform(-3, 3, n),
         ])  # fmt: skip
-        truth.append(Objects(boxes, rng.random(n) < 0.7, rng.integers(0, 30, n)))
+        truth.append(GroundTruth(boxes, rng.random(n) < 0.7, rng.integers(0, 30, n)))
         seen = np.repeat(boxes, rng.integers(0, 3, n), axis=0)
         seen = seen + rng.normal(0, [0.3, 0.1, 0.05, 0.2, 0.1, 0.1, 0.1], seen.shape)
         false = boxes[rng.random(n) < 0.3] + [20, 0, 0, 0, 0, 0, 0]
@@ -210,7 +208,7 @@ def twin(truth, detections, subset, view, iou):
 @pytest.mark.parametrize("seed", range(3))
 def test_it_is_the_twins(seed):
     truth, detections = random_scenes(seed, 20)
-    evaluation = evaluate(Record.of(truth, detections))
+    evaluation = evaluate(EvaluationFrames.of(truth, detections))
     for subset in ("", "cars", "points_20"):
         for view, iou in (("bev", 0.7), ("3d", 0.5)):
             end = f"_{subset}" if subset else ""
@@ -221,7 +219,7 @@ def test_it_is_the_twins(seed):
 
 def test_left_out_values_are_those_of_fewer_frames():
     truth, detections = random_scenes(7, 20)
-    estimate = evaluate(Record.of(truth, detections), 5).measures
+    estimate = evaluate(EvaluationFrames.of(truth, detections), 5).measures
     for block in (0, 3):
         rest = [k for k in range(20) if k // 4 != block]
         right = twin([truth[k] for k in rest], [detections[k] for k in rest], "cars", "3d", 0.5)
@@ -232,7 +230,7 @@ def test_left_out_values_are_those_of_fewer_frames():
 def test_few_objects_are_frames_counted_often():
     truth, detections = random_scenes(3, 12, 1.0)
     assert 5 < sum(len(its.boxes) for its in truth) < 30
-    got = values(evaluate(Record.of(truth, detections)), "bev", 50)
+    got = values(evaluate(EvaluationFrames.of(truth, detections)), "bev", 50)
     np.testing.assert_allclose(got, twin(truth, detections, "", "bev", 0.5), atol=1e-12)
 
 
@@ -242,12 +240,12 @@ def test_the_order_in_which_things_are_given_has_no_say():
 
     def shuffled(its):
         row = rng.permutation(len(its.boxes))
-        if isinstance(its, Objects):
-            return Objects(its.boxes[row], its.is_car[row], its.points[row])
+        if isinstance(its, GroundTruth):
+            return GroundTruth(its.boxes[row], its.is_car[row], its.points[row])
         return Detections(its.boxes[row], its.scores[row])
 
-    plain = evaluate(Record.of(truth, detections))
-    other = evaluate(Record.of([shuffled(its) for its in truth], [shuffled(its) for its in detections]))
+    plain = evaluate(EvaluationFrames.of(truth, detections))
+    other = evaluate(EvaluationFrames.of([shuffled(its) for its in truth], [shuffled(its) for its in detections]))
     for name, its in plain.measures.items():
         assert (its.value, its.se) == (other.measures[name].value, other.measures[name].se), name
 
@@ -267,7 +265,7 @@ def test_who_comes_first_among_equals(turned, swapped):
 def test_scores_matter_by_their_order_alone():
     truth, detections = random_scenes(12, 30)
     bent = [Detections(its.boxes, np.exp(7 * its.scores) - 100) for its in detections]
-    plain, other = (evaluate(Record.of(truth, its)).measures for its in (detections, bent))
+    plain, other = (evaluate(EvaluationFrames.of(truth, its)).measures for its in (detections, bent))
     assert all(plain[name].value == other[name].value for name in plain)
 
 
@@ -277,13 +275,13 @@ def test_scores_matter_by_their_order_alone():
 def test_vehicles_of_a_frame():
     boxes = np.array([box(1.0), box(2.0), box(3.0), box(30.0)])
     frame = TrafficFrame(0, tuple("abcd"), ("taxi", "bus", "bicycle", "taxi"), boxes, np.zeros(4))
-    its = Objects.of(frame, np.array([7, 8, 9, 10]), Roi((0.0, -5.0, 0.0), (10.0, 10.0, 5.0)))
+    its = GroundTruth.of(frame, np.array([7, 8, 9, 10]), Roi((0.0, -5.0, 0.0), (10.0, 10.0, 5.0)))
     assert list(its.is_car) == [True, False] and list(its.points) == [7, 8] and list(its.boxes[:, 0]) == [1, 2]
 
 
 def test_detections_beyond_the_region_are_dropped():
     roi = Roi((0.0, -5.0, 0.0), (10.0, 10.0, 5.0))
-    kept = within(found((box(0.0), 0.1), (box(10.0), 0.2), (box(5.0, z=99.0), 0.3)), roi)
+    kept = detections_in_roi(found((box(0.0), 0.1), (box(10.0), 0.2), (box(5.0, z=99.0), 0.3)), roi)
     assert list(kept.scores) == [0.1, 0.3]
 
 
@@ -297,5 +295,5 @@ def test_detections_beyond_the_region_are_dropped():
 )
 def test_what_is_no_box_is_refused(wrong, score, message):
     with pytest.raises(InputError) as caught:
-        Record.of([objects([])] * 2, [Detections.none(), found((A, 0.5), (wrong, score))])
+        EvaluationFrames.of([objects([])] * 2, [Detections.empty(), found((A, 0.5), (wrong, score))])
     assert str(caught.value) == message

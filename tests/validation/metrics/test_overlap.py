@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import shapely
 
-from pipeline.validation.metrics.overlap import overlap_each
+from egvs.validation.detection_metrics import paired_overlap
 
 PAIRS = 10_000
 
@@ -16,7 +16,7 @@ def box(x=0.0, y=0.0, z=0.0, length=4.0, width=2.0, height=1.5, yaw=0.0):
 
 
 def pair(a, b):
-    return overlap_each(a[None], b[None])[:, 0]
+    return paired_overlap(a[None], b[None])[:, 0]
 
 
 def polygons(boxes):
@@ -63,10 +63,10 @@ def hostile_pairs(count):
 
 def test_it_is_shapelys():
     a, b = hostile_pairs(PAIRS)
-    found, right = overlap_each(a, b), by_shapely(a, b)
+    found, right = paired_overlap(a, b), by_shapely(a, b)
     assert (right > 0).sum() > PAIRS  # of both views: most pairs meet
     np.testing.assert_allclose(found, right, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(overlap_each(b, a), found, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(paired_overlap(b, a), found, rtol=0, atol=1e-9)
 
 
 def test_it_does_not_feel_where_the_boxes_are():
@@ -74,7 +74,7 @@ def test_it_does_not_feel_where_the_boxes_are():
     shift = np.array([400_000.0, 3_900_000.0, 100.0, 0, 0, 0, 0])
     exact = np.round(np.stack([a, b]) * 1024) / 1024  # moved without loss of a digit
     exact[..., 6] = np.stack([a, b])[..., 6]
-    np.testing.assert_array_equal(overlap_each(*exact), overlap_each(*(exact + shift)))
+    np.testing.assert_array_equal(paired_overlap(*exact), paired_overlap(*(exact + shift)))
 
 
 @pytest.mark.parametrize(
@@ -105,4 +105,4 @@ def test_by_hand(a, b, bev, solid):
 
 
 def test_no_pair_at_all():
-    assert overlap_each(np.empty((0, 7)), np.empty((0, 7))).shape == (2, 0)
+    assert paired_overlap(np.empty((0, 7)), np.empty((0, 7))).shape == (2, 0)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from pipeline.validation.statistics.junctions import Junction, Measured
+from egvs.validation.correlation import JunctionScores, MeasureValues
 
 NOISE = 0.15
 """Standard error of detection, in units of its spread over sites."""
@@ -21,7 +21,7 @@ def truth(rho: float, kind: str) -> float:
 
 def junction(
     rng: np.random.Generator, sites: int, rhos: tuple[float, ...], blocks: int = 10, name: str = "made up"
-) -> Junction:
+) -> JunctionScores:
     """Scores s0, s1 .. that go with detection by rhos, and detection measured in blocks that sites have in common.
 
     A third of the variance between blocks is common to all sites: the same traffic."""
@@ -30,6 +30,6 @@ def junction(
     noise = math.sqrt(1 / 3) * rng.normal(size=(1, blocks)) + math.sqrt(2 / 3) * rng.normal(size=(sites, blocks))
     means = true[:, None] + NOISE * math.sqrt(blocks) * noise
     left_out = (means.sum(axis=1, keepdims=True) - means) / (blocks - 1)
-    return Junction(
-        name, tuple(f"c{k:02}" for k in range(sites)), scores, {"ap": Measured(means.mean(axis=1), left_out)}
+    return JunctionScores(
+        name, tuple(f"c{k:02}" for k in range(sites)), scores, {"ap": MeasureValues(means.mean(axis=1), left_out)}
     )

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from pipeline.validation.statistics.coefficients import KINDS, Form
+from egvs.validation.correlation import COEFFICIENT_KINDS, StandardisedValues
 
 OTHER = {
     "pearson": lambda a, b: scipy.stats.pearsonr(a, b).statistic,
@@ -17,7 +17,9 @@ OTHER = {
 
 
 def coefficient(a, b, kind):
-    return Form.of(np.atleast_2d(np.asarray(a, float)), kind).with_(Form.of(np.atleast_2d(np.asarray(b, float)), kind))
+    return StandardisedValues.of(np.atleast_2d(np.asarray(a, float)), kind).correlate(
+        StandardisedValues.of(np.atleast_2d(np.asarray(b, float)), kind)
+    )
 
 
 # a 1 2 2 3, b 1 3 2 4. Means 2 and 2.5; products 1.5 + 0 + 0 + 1.5 = 3; squares 2 and 5: r = 3 / sqrt 10.
@@ -30,7 +32,7 @@ def test_by_hand(kind, value):
     assert coefficient([1, 2, 2, 3], [1, 3, 2, 4], kind)[0] == pytest.approx(value, abs=1e-15)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", COEFFICIENT_KINDS)
 def test_they_are_those_of_scipy_for_every_resample(kind):
     rng = np.random.default_rng(4)
     a, b = rng.integers(0, 9, (200, 13)).astype(float), rng.normal(size=(200, 13)).round(1)
@@ -46,7 +48,7 @@ def test_kendalls_pairs_one_by_one():
     assert coefficient(a, b, "kendall")[0] == pytest.approx(right, abs=1e-15)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", COEFFICIENT_KINDS)
 def test_limits(kind):
     up = np.array([0.1, 0.2, 0.7, 3.0])
     assert coefficient(up, 5 * up - 3, kind)[0] == pytest.approx(1, abs=1e-15)
@@ -56,7 +58,7 @@ def test_limits(kind):
     assert math.isnan(coefficient([1, 2], [1, 2], kind)[0])  # two always agree
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", COEFFICIENT_KINDS)
 def test_it_does_not_matter_which_comes_first_nor_in_which_order_sites_stand(kind):
     rng = np.random.default_rng(2)
     a, b = rng.normal(size=(2, 12))

@@ -7,24 +7,27 @@ import pytest
 import scipy.stats
 from scipy.special import ndtr, ndtri
 
-from pipeline.validation.metrics.average_precision import evaluate
-from pipeline.validation.metrics.leave_out import blocks_of
-from pipeline.validation.metrics.matching import Record
-from pipeline.validation.statistics.coefficients import KINDS
-from pipeline.validation.statistics.correlation import Study
-from pipeline.validation.statistics.intervals import Interval, share_above
-from pipeline.validation.statistics.junctions import Draws, Junction, Measured
+from egvs.validation.correlation import (
+    COEFFICIENT_KINDS,
+    ConfidenceInterval,
+    CorrelationStudy,
+    JunctionScores,
+    MeasureValues,
+    Resamples,
+    share_above_zero,
+)
+from egvs.validation.detection_metrics import EvaluationFrames, evaluate, frame_blocks
 from tests.validation.metrics.test_average_precision import random_scenes
 from tests.validation.statistics import made_up
 
 
 def study(junctions, resamples=300, seed=1):
-    return Study([junctions] if isinstance(junctions, Junction) else junctions, seed, resamples)
+    return CorrelationStudy([junctions] if isinstance(junctions, JunctionScores) else junctions, seed, resamples)
 
 
 def with_scores(junction, **scores):
     scores = {name: np.asarray(values, float) for name, values in scores.items()}
-    return Junction(junction.name, junction.sites, {**junction.scores, **scores}, junction.measures)
+    return JunctionScores(junction.name, junction.sites, {**junction.scores, **scores}, junction.measures)
 
 
 @pytest.fixture
@@ -37,36 +40,36 @@ def thirteen():
 
 def test_an_interval_without_bias_is_that_of_the_quantiles():
     draws = np.linspace(-1, 1, 2001)
-    interval = Interval.of(0.0, draws)
+    interval = ConfidenceInterval.of(0.0, draws)
     np.testing.assert_allclose([interval.low, interval.high], [-0.95, 0.95], atol=1e-9)
 
 
 def test_bias_is_corrected_by_the_normal_scale():
     """A tenth of the resamples lie below the value: z0 = -1.2816, so the ends are at Phi(2 z0 -+ 1.96)."""
     draws = np.linspace(0, 1, 10_001)
-    interval, z0 = Interval.of(0.1, draws), ndtri(0.1)
+    interval, z0 = ConfidenceInterval.of(0.1, draws), ndtri(0.1)
     np.testing.assert_allclose([interval.low, interval.high], ndtr(2 * z0 + np.array([-1.96, 1.96])), atol=5e-4)
 
 
 def test_values_that_equal_count_half():
-    assert Interval.of(0.5, np.array([0.0] * 50 + [0.5] * 50 + [1.0] * 50)) == Interval(0.0, 1.0)
+    assert ConfidenceInterval.of(0.5, np.array([0.0] * 50 + [0.5] * 50 + [1.0] * 50)) == ConfidenceInterval(0.0, 1.0)
 
 
 def test_what_an_interval_cannot_tell():
-    assert "all resamples agree" in Interval.of(1.0, np.ones(100)).why
+    assert "all resamples agree" in ConfidenceInterval.of(1.0, np.ones(100)).why
     draws = np.concatenate([np.full(10, math.nan), np.linspace(0, 1, 90)])
-    assert Interval.of(0.5, draws).why == "10% of the resamples have equal values only"
-    assert math.isnan(Interval.of(0.5, draws).low)
-    assert math.isfinite(Interval.of(0.5, draws[8:]).low)
+    assert ConfidenceInterval.of(0.5, draws).why == "10% of the resamples have equal values only"
+    assert math.isnan(ConfidenceInterval.of(0.5, draws).low)
+    assert math.isfinite(ConfidenceInterval.of(0.5, draws[8:]).low)
 
 
 def test_share_above():
-    assert share_above(np.array([1.0, -1.0, 0.0, 2.0, math.nan])) == pytest.approx(2.5 / 4)
-    assert math.isnan(share_above(np.array([math.nan])))
+    assert share_above_zero(np.array([1.0, -1.0, 0.0, 2.0, math.nan])) == pytest.approx(2.5 / 4)
+    assert math.isnan(share_above_zero(np.array([math.nan])))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", COEFFICIENT_KINDS)
 def test_intervals_hold_the_truth_as_often_as_they_say(kind):
     """Of 100 studies 95 % should; fewer than 87 would happen by chance once in 1000. ``benchmarks.coverage`` has the
     numbers."""
@@ -84,16 +87,16 @@ def test_intervals_hold_the_truth_as_often_as_they_say(kind):
 def test_blocks_drawn_are_as_good_as_average_precision_computed_anew():
     """A draw of blocks is a sum of frames: AP of these frames against its linear form from the left-out values."""
     truth, found = random_scenes(21, 60)
-    measures = evaluate(Record.of(truth, found)).measures
-    block, rng = blocks_of(60), np.random.default_rng(5)
+    measures = evaluate(EvaluationFrames.of(truth, found)).measures
+    block, rng = frame_blocks(60), np.random.default_rng(5)
     weights = rng.multinomial(10, np.full(10, 0.1), 30)
     for name, least in (("ap_bev_r40_iou50", 0.85), ("recall_3d_iou50_cars", 0.98)):
-        measured = Measured.of([measures[name]])
-        linear = Draws(np.zeros((30, 1), np.int64), weights).of_measure(measured, np.array([True]))[:, 0]
+        measured = MeasureValues.of([measures[name]])
+        linear = Resamples(np.zeros((30, 1), np.int64), weights).of_measure(measured, np.array([True]))[:, 0]
         anew = []
         for drawn in weights:
             rows = [k for k in range(60) for _ in range(drawn[block[k]])]
-            again = evaluate(Record.of([truth[k] for k in rows], [found[k] for k in rows])).measures
+            again = evaluate(EvaluationFrames.of([truth[k] for k in rows], [found[k] for k in rows])).measures
             anew.append(again[name].value)
         assert np.corrcoef(linear, anew)[0, 1] > least
         assert np.std(linear) == pytest.approx(np.std(anew), rel=0.25)
@@ -102,8 +105,8 @@ def test_blocks_drawn_are_as_good_as_average_precision_computed_anew():
 
 def test_blocks_drawn_scatter_by_the_standard_error():
     made = made_up.junction(np.random.default_rng(6), 3, (0.5,)).measures["ap"]
-    draws = Draws.of("a", 3, 10, 20_000, 0)
-    fixed = Draws(np.tile(np.arange(3), (20_000, 1)), draws.blocks).of_measure(made, made.known)
+    draws = Resamples.of("a", 3, 10, 20_000, 0)
+    fixed = Resamples(np.tile(np.arange(3), (20_000, 1)), draws.blocks).of_measure(made, made.known)
     se = np.sqrt(9 / 10 * ((made.left_out - made.left_out.mean(axis=1, keepdims=True)) ** 2).sum(axis=1))
     np.testing.assert_allclose(fixed.std(axis=0), se, rtol=0.02)
     np.testing.assert_allclose(fixed.mean(axis=0), made.values, atol=0.005)
@@ -111,7 +114,7 @@ def test_blocks_drawn_scatter_by_the_standard_error():
 
 def test_a_resample_has_whole_sites(thirteen):
     """A site's score and measure stay together, and a site that is drawn twice has the same of both."""
-    draws = Draws.of("a", 13, 10, 50, 0)
+    draws = Resamples.of("a", 13, 10, 50, 0)
     score, measure = draws.of_score(thirteen.scores["s0"]), draws.of_measure(thirteen.measures["ap"], np.ones(13, bool))
     for row in range(50):
         assert len(np.unique(score[row])) == len(np.unique(measure[row])) == len(np.unique(draws.sites[row]))
@@ -124,10 +127,10 @@ def test_a_resample_has_whole_sites(thirteen):
 def test_values_are_those_of_scipy_and_the_same_twice(thirteen):
     a, b = thirteen.scores["s0"], thirteen.measures["ap"].values
     right = scipy.stats.pearsonr(a, b), scipy.stats.spearmanr(a, b), scipy.stats.kendalltau(a, b)
-    found = [study(thirteen).correlation("s0", "ap", kind) for kind in KINDS]
+    found = [study(thirteen).correlation("s0", "ap", kind) for kind in COEFFICIENT_KINDS]
     np.testing.assert_allclose([its.value for its in found], [its.statistic for its in right])
-    assert found == [study(thirteen).correlation("s0", "ap", kind) for kind in KINDS]
-    assert found != [study(thirteen, seed=2).correlation("s0", "ap", kind) for kind in KINDS]
+    assert found == [study(thirteen).correlation("s0", "ap", kind) for kind in COEFFICIENT_KINDS]
+    assert found != [study(thirteen, seed=2).correlation("s0", "ap", kind) for kind in COEFFICIENT_KINDS]
     assert all(its.sites == 13 and its.interval.low < its.value < its.interval.high for its in found)
 
 
@@ -142,7 +145,7 @@ def test_what_is_asked_before_has_no_say(thirteen):
 def test_a_constant_score_has_no_correlation_and_it_is_told(thirteen):
     found = study(with_scores(thirteen, flat=np.full(13, 0.1))).correlation("flat", "ap", "spearman")
     assert math.isnan(found.value) and math.isnan(found.interval.low)
-    (doubt,) = found.doubts("flat, ap")
+    (doubt,) = found.warnings("flat, ap")
     assert str(doubt) == (
         "flat, ap: no correlation: flat is the same at all sites of made up; more sites, or sites that differ more"
     )
@@ -164,8 +167,8 @@ def test_few_sites(sites, defined, why):
 
 def test_a_perfect_order_of_ranks_has_an_interval_only_if_resamples_differ():
     made = made_up.junction(np.random.default_rng(0), 8, (1.0,))
-    sure = Measured(made.scores["s0"], np.tile(made.scores["s0"][:, None], (1, 10)))  # no block changes anything
-    found = study(Junction("j", made.sites, made.scores, {"ap": sure})).correlation("s0", "ap", "spearman")
+    sure = MeasureValues(made.scores["s0"], np.tile(made.scores["s0"][:, None], (1, 10)))  # no block changes anything
+    found = study(JunctionScores("j", made.sites, made.scores, {"ap": sure})).correlation("s0", "ap", "spearman")
     assert found.value == 1 and math.isnan(found.interval.low) and "all resamples agree" in found.why
 
 
@@ -175,12 +178,12 @@ def test_sites_without_a_value_are_left_out_and_named(thirteen):
     measured = thirteen.measures["ap"]
     left_out = measured.left_out.copy()
     left_out[7, 3] = math.nan
-    partly = Junction("j", thirteen.sites, {"s0": values}, {"ap": Measured(measured.values, left_out)})
+    partly = JunctionScores("j", thirteen.sites, {"s0": values}, {"ap": MeasureValues(measured.values, left_out)})
     found = study(partly).correlation("s0", "ap", "spearman")
     rest = [k for k in range(13) if k not in (4, 7)]
     assert found.value == pytest.approx(scipy.stats.spearmanr(values[rest], measured.values[rest]).statistic)
     assert found.sites == 11 and found.dropped == ("j c04", "j c07")
-    assert "left out, for a value is not defined there: j c04, j c07" in str(found.doubts("s0")[0])
+    assert "left out, for a value is not defined there: j c04, j c07" in str(found.warnings("s0")[0])
 
 
 # ---- two scores
@@ -213,9 +216,9 @@ def test_sites_are_ranked_within_their_junctions():
     """The scale of a junction has no say: one junction's scores and detection lie far above the other's."""
     rng = np.random.default_rng(9)
     low, high = (made_up.junction(rng, n, (0.6,), name=name) for n, name in ((12, "low"), (9, "high")))
-    moved = Measured(high.measures["ap"].values * 7 + 100, high.measures["ap"].left_out * 7 + 100)
-    high = Junction("high", high.sites, {"s0": high.scores["s0"] * 50 + 1e4}, {"ap": moved})
-    for kind in KINDS:
+    moved = MeasureValues(high.measures["ap"].values * 7 + 100, high.measures["ap"].left_out * 7 + 100)
+    high = JunctionScores("high", high.sites, {"s0": high.scores["s0"] * 50 + 1e4}, {"ap": moved})
+    for kind in COEFFICIENT_KINDS:
         each = [study(its).correlation("s0", "ap", kind).value for its in (low, high)]
         both = study([low, high]).correlation("s0", "ap", kind)
         assert both.value == pytest.approx((12 * each[0] + 9 * each[1]) / 21)
@@ -250,25 +253,25 @@ def test_one_junction_with_a_constant_score_is_named():
 
 def test_sites_of_one_place_are_drawn_together() -> None:
     places = ("a", "b", "a", "c", "d", "d")  # two of two sites, two of one
-    draws = Draws.of("x", 6, 10, 4000, 0, places)
+    draws = Resamples.of("x", 6, 10, 4000, 0, places)
     assert draws.sites.shape == (4000, 6)
     often = np.stack([np.bincount(row, minlength=6) for row in draws.sites])
     np.testing.assert_array_equal(often[:, 0], often[:, 2])
     np.testing.assert_array_equal(often[:, 4], often[:, 5])
     assert (often[:, [0, 4]].sum(axis=1) == 2).all() and (often[:, [1, 3]].sum(axis=1) == 2).all()
     assert 0.45 < (often[:, 0] == 1).mean() < 0.55  # each of two, twice
-    alone = Draws.of("x", 6, 10, 50, 0, tuple("abcdef"))
-    np.testing.assert_array_equal(alone.sites, Draws.of("x", 6, 10, 50, 0).sites)
+    alone = Resamples.of("x", 6, 10, 50, 0, tuple("abcdef"))
+    np.testing.assert_array_equal(alone.sites, Resamples.of("x", 6, 10, 50, 0).sites)
 
 
 def test_places_widen_an_interval_where_their_sites_are_alike() -> None:
     rng = np.random.default_rng(1)
     score, detected = (np.repeat(rng.normal(size=10), 4) + 0.01 * rng.normal(size=40) for _ in range(2))
-    measures = {"ap": Measured(detected, np.tile(detected[:, None], 10))}
+    measures = {"ap": MeasureValues(detected, np.tile(detected[:, None], 10))}
     sites = tuple(f"s{i}" for i in range(40))
     widths = []
     for places in ((), tuple(f"p{i // 4}" for i in range(40))):
-        study = Study([Junction("x", sites, {"s": score}, measures, places)], 0, 500)
+        study = CorrelationStudy([JunctionScores("x", sites, {"s": score}, measures, places)], 0, 500)
         interval = study.correlation("s", "ap", "spearman").interval
         widths.append(interval.high - interval.low)
     assert widths[1] > 1.5 * widths[0]

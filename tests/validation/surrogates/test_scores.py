@@ -18,13 +18,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipeline.artefacts.readers import Tpog
-from pipeline.core.grid import Grid
-from pipeline.scoring.visibility import Beams
-from pipeline.sensing import sensors
-from pipeline.sensing.sites import Pose
-from pipeline.validation.surrogates import registry
-from pipeline.validation.surrogates.evidence import Occupancy, SiteEvidence
+from egvs.artefacts.tpog import Tpog
+from egvs.core.grid import Grid
+from egvs.scoring.visibility import Beams
+from egvs.sensors import sensor
+from egvs.sensors.sites import Pose
+from egvs.validation import surrogates
+from egvs.validation.surrogates import Occupancy, SiteEvidence
 
 LN2 = math.log(2.0)
 H_QUARTER = 2.0 - 0.75 * math.log2(3.0)  # H(1/4) = 1/4 * 2 + 3/4 * (2 - log2 3), in bits
@@ -36,7 +36,7 @@ def evidence(counts=(0, 1, 2), hits=(2, 2, 1), ends=ENDS, returned=None, seen=()
     """The case above, or another one."""
     tpog = Tpog(more.pop("grid", GRID), 4, np.array(counts, dtype=np.int64).reshape(more.pop("shape", (3, 1, 1))))
     ends = np.array(ends, dtype=np.float64).reshape(-1, 3)
-    beams = Beams(Pose(-0.5, 0.5, more.pop("z_m", 0.5)), sensors.CATALOGUE["VLP-16"], ends, more.pop("weight", None))
+    beams = Beams(Pose(-0.5, 0.5, more.pop("z_m", 0.5)), sensor.CATALOGUE["VLP-16"], ends, more.pop("weight", None))
     counted = np.array(hits, dtype=np.uint32), 1
     vehicles = SimpleNamespace(points=np.array(seen, dtype=np.float64), points_alone=np.array(alone, dtype=np.float64))
     returned = np.ones(len(ends), dtype=np.bool_) if returned is None else np.array(returned)
@@ -44,7 +44,7 @@ def evidence(counts=(0, 1, 2), hits=(2, 2, 1), ends=ENDS, returned=None, seen=()
 
 
 def value(name: str, given: SiteEvidence, **parameters: object) -> float:
-    found = registry.score(name).function(given, **parameters)
+    found = surrogates.load_score(name).function(given, **parameters)
     assert type(found) is float
     return found
 
@@ -130,7 +130,7 @@ def test_a_long_product_does_not_vanish_before_its_logarithm():
     grid = Grid((0.0, 0.0, 0.0), 1.0, (401, 1, 1))
     counts = np.full((401, 1, 1), 99, dtype=np.int64)
     tpog = Tpog(grid, 100, counts)
-    beams = Beams(Pose(-0.5, 0.5, 0.5), sensors.CATALOGUE["VLP-16"], np.array([[450.0, 0.0, 0.0]]))
+    beams = Beams(Pose(-0.5, 0.5, 0.5), sensor.CATALOGUE["VLP-16"], np.array([[450.0, 0.0, 0.0]]))
     none = SiteEvidence(Occupancy(tpog), beams, np.array([True]), None, None)
     np.testing.assert_allclose(none.log_reach, np.arange(401) * math.log(0.01), rtol=1e-12)
 
@@ -156,7 +156,9 @@ def test_density_is_points_on_the_road_over_its_area():
     assert value("density", road(list(OFF.values()))) == 0.0
     assert value("density", road(list(AT.values()), returned=[True, False, True, True])) == pytest.approx(3 / 1.5)
     assert value("density", road(list(AT.values()), weight=np.array([0.5, 1, 1, 1]))) == pytest.approx(3.5 / 1.5)
-    assert value("density", road(list(AT.values()), noticed=lambda r: 0 * r + 0.25)) == pytest.approx(1 / 1.5)
+    assert value("density", road(list(AT.values()), detection_probability=lambda r: 0 * r + 0.25)) == pytest.approx(
+        1 / 1.5
+    )
 
 
 def test_uniformity_is_the_spread_of_density_over_squares():
@@ -219,7 +221,7 @@ def test_traffic_that_never_leaves_has_no_entropy_and_nothing_warns():
 
 
 def test_every_score_of_this_program_is_told_with_its_source_and_sign():
-    entries = registry.catalogue()
+    entries = surrogates.score_catalogue()
     assert [entry.problem for entry in entries] == [""] * len(entries)
     for entry in entries:
         score = entry.score

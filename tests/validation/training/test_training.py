@@ -11,21 +11,28 @@ pytest.importorskip("torch", reason="PyTorch is not installed: make test-train")
 import onnx
 import torch
 
-from pipeline import load
-from pipeline.artefacts.traffic_frames import TrafficFrame
-from pipeline.core.errors import InputError
-from pipeline.sensing.sensors import CATALOGUE
-from pipeline.sensing.sites import Pose
-from pipeline.validation.detectors.pointpillars import decoding
-from pipeline.validation.detectors.pointpillars.detector import ABOUT, Model, PointPillars
-from pipeline.validation.detectors.pointpillars.encoding import FEATURES, POINTS, HeightZero, Pillars, Window
-from pipeline.validation.sweeps import SiteView
-from pipeline.validation.training import export, samples
-from pipeline.validation.training.loss import Batch, loss
-from pipeline.validation.training.network import PillarNet
-from pipeline.validation.training.samples import CROP_CELLS, Junction, Sample, Samples
-from pipeline.validation.training.train import Recipe, train
-from pipeline.validation.unseen_record import prepare
+from egvs import load
+from egvs.artefacts.traffic_frames import TrafficFrame
+from egvs.core.errors import InputError
+from egvs.sensors.sensor import CATALOGUE
+from egvs.sensors.sites import Pose
+from egvs.validation.detectors import pointpillars
+from egvs.validation.detectors.pointpillars import (
+    METADATA_KEY,
+    N_FEATURES,
+    POINTS_PER_PILLAR,
+    HeightZero,
+    OnnxModel,
+    Pillars,
+    PillarWindow,
+    PointPillars,
+)
+from egvs.validation.held_out_traffic import prepare_held_out_traffic
+from egvs.validation.sweeps import SiteView
+from egvs.validation.training import pillar_net, samples
+from egvs.validation.training.pillar_net import Batch, PillarNet, compute_loss
+from egvs.validation.training.samples import CROP_CELLS, Sample, Samples, TrainingJunction
+from egvs.validation.training.train import Recipe
 
 SENSOR = CATALOGUE["VLP-16"]
 VIEW = SiteView("s", Pose(0.0, 0.0, 5.0), SENSOR, np.full(SENSOR.beams, np.inf))
@@ -35,7 +42,7 @@ def _target(boxes, points, kinds=None):
     frame = TrafficFrame(0, ("v",) * len(boxes), kinds or ("passenger",) * len(boxes), np.array(boxes), np.zeros(2))
     zero = HeightZero("sensor", VIEW, None)  # heights from 5 m
     motor = np.array([kind != "pedestrian" for kind in frame.kinds])
-    return samples.target(frame, motor, np.array(points), Window((0.0, 0.0), 0.0, CROP_CELLS), zero)
+    return samples.make_target(frame, motor, np.array(points), PillarWindow((0.0, 0.0), 0.0, CROP_CELLS), zero)
 
 
 def test_a_target_has_its_vehicles_and_lets_the_hardly_seen_pass():
@@ -54,36 +61,40 @@ def test_a_target_has_its_vehicles_and_lets_the_hardly_seen_pass():
 def test_a_mirrored_sample_is_the_sample_of_the_mirrored_street():
     seen = [1.0, 2.0, 0.75, 4.5, 1.8, 1.5, 0.3]
     mirrored_box = [1.0, -2.0, 0.75, 4.5, 1.8, 1.5, -0.3]
-    features = np.random.default_rng(0).normal(size=(3, POINTS, FEATURES)).astype(np.float32)
-    pillars = Pillars(features, np.ones((3, POINTS), np.float32), np.array([5, 300, 301]))
+    features = np.random.default_rng(0).normal(size=(3, POINTS_PER_PILLAR, N_FEATURES)).astype(np.float32)
+    pillars = Pillars(features, np.ones((3, POINTS_PER_PILLAR), np.float32), np.array([5, 300, 301]))
 
     class Tails:
         def random(self):
             return 0.9
 
     was = Sample(pillars, _target([seen, seen], [5, 0]))
-    now = samples.mirrored(was, Tails())
+    now = samples.randomly_mirrored(was, Tails())
     want = _target([mirrored_box, mirrored_box], [5, 0])
     np.testing.assert_allclose(now.target.heat, want.heat, atol=1e-6)
     np.testing.assert_array_equal(now.target.cell, want.cell)
     np.testing.assert_allclose(now.target.values, want.values, atol=1e-5)
     np.testing.assert_array_equal(now.pillars.cell, sorted([127 - 5, 2 * 128 + 127 - 44, 2 * 128 + 127 - 45]))
-    back = samples.mirrored(now, Tails())
+    back = samples.randomly_mirrored(now, Tails())
     np.testing.assert_array_equal(back.pillars.features, pillars.features)
 
 
 def test_the_loss_is_as_on_paper():
     its = _target([[1.0, 2.0, 5.0, 4.5, 1.8, 1.5, 0.0], [0, 0, 0, 1, 1, 1, 0.0]], [3, 0])
-    pillars = Pillars(np.zeros((1, POINTS, FEATURES), np.float32), np.ones((1, POINTS), np.float32), np.array([0]))
+    pillars = Pillars(
+        np.zeros((1, POINTS_PER_PILLAR, N_FEATURES), np.float32),
+        np.ones((1, POINTS_PER_PILLAR), np.float32),
+        np.array([0]),
+    )
     batch = Batch.of([Sample(pillars, its)])
     odds = torch.full((1, 1, 64, 64), -20.0)  # surely nothing anywhere
-    values = torch.zeros((1, decoding.VALUES, 64, 64))
-    middles, boxes = loss(odds, values, batch)
+    values = torch.zeros((1, pointpillars.N_VALUES, 64, 64))
+    middles, boxes = compute_loss(odds, values, batch)
     assert middles.item() == pytest.approx(20.0, abs=1e-4)  # -(1 - 0)^2 log(e^-20)
     assert boxes.item() == pytest.approx(0.5 * np.abs(its.values).sum(), rel=1e-5)
     odds[0, 0, its.cell[0, 0], its.cell[0, 1]] = 20.0
     values[0, :, its.cell[0, 0], its.cell[0, 1]] = torch.from_numpy(its.values[0])
-    middles, boxes = loss(odds, values, batch)
+    middles, boxes = compute_loss(odds, values, batch)
     assert middles.item() == pytest.approx(0.0, abs=1e-6) and boxes.item() == 0.0
 
 
@@ -91,14 +102,16 @@ def test_an_exported_model_says_what_the_network_says(tmp_path):
     torch.manual_seed(0)
     net = PillarNet()
     path = tmp_path / "m.onnx"
-    path.write_bytes(export.to_bytes(net, {"convention": "ground", "note": "é"}))
-    model = Model.of(path)
-    assert model.about == {"convention": "ground", "note": "é"}
+    path.write_bytes(pillar_net.export_onnx(net, {"convention": "ground", "note": "é"}))
+    model = OnnxModel.of(path)
+    assert model.metadata == {"convention": "ground", "note": "é"}
     net.eval()
     for pillars in (1, 37):
         feed = {
-            "features": np.random.default_rng(1).normal(size=(pillars, POINTS, FEATURES)).astype(np.float32),
-            "present": np.ones((pillars, POINTS), np.float32),
+            "features": np.random.default_rng(1)
+            .normal(size=(pillars, POINTS_PER_PILLAR, N_FEATURES))
+            .astype(np.float32),
+            "present": np.ones((pillars, POINTS_PER_PILLAR), np.float32),
             "cell": np.arange(pillars) * 11,
         }
         heat, values = model.session.run(None, feed)
@@ -117,17 +130,17 @@ def test_models_of_other_shapes_are_named(tmp_path):
     opset = [onnx.helper.make_opsetid("", 18)]
     path.write_bytes(onnx.helper.make_model(graph, opset_imports=opset, ir_version=9).SerializeToString())
     with pytest.raises(InputError, match=r"m\.onnx: a model with inputs .*'x': \[3\].*; inputs"):
-        Model.of(path)
-    good = onnx.load_from_string(export.to_bytes(PillarNet(), {"convention": "ground"}))
+        OnnxModel.of(path)
+    good = onnx.load_from_string(pillar_net.export_onnx(PillarNet(), {"convention": "ground"}))
     del good.metadata_props[:]
     path.write_bytes(good.SerializeToString())
     with pytest.raises(InputError, match="its metadata does not say how heights count"):
-        Model.of(path)
+        OnnxModel.of(path)
 
 
 def test_a_sample_is_a_function_of_its_number(mini, tmp_path):
     scenario = load(mini, ["sensors.small.channels=32"])
-    junction = Junction(prepare(scenario, tmp_path / "r", 10), (3.0, 4.0))
+    junction = TrainingJunction(prepare_held_out_traffic(scenario, tmp_path / "r", 10), (3.0, 4.0))
     first, again = (Samples([junction], ["small"], "ground", 5) for _ in range(2))
     forward = [first.sample(i) for i in range(10)]
     for i in reversed(range(10)):
@@ -141,11 +154,11 @@ def test_a_sample_is_a_function_of_its_number(mini, tmp_path):
 def test_training_learns_goes_on_after_a_stop_and_says_how_it_was_made(mini, tmp_path, monkeypatch):
     scenario = load(mini, ["sensors.small.channels=32"])
     recipe = Recipe(steps=4, frames=10, heights_m=(3.0, 4.0), sensors=("small",), look_every=4)
-    from pipeline.validation.training import train as module
-    from pipeline.validation.training.held_out import HeldOut
+    from egvs.validation.training import train
+    from egvs.validation.training.train import HeldOutSet
 
-    monkeypatch.setattr(HeldOut, "FRAMES", 10)
-    monkeypatch.setattr(module, "_KEEP_EVERY", 2)
+    monkeypatch.setattr(HeldOutSet, "FRAMES", 10)
+    monkeypatch.setattr(train, "_KEEP_EVERY", 2)
     whole = train([scenario], tmp_path / "whole.onnx", recipe)
     assert [entry["step"] for entry in whole["curve"]] == [4]
     assert whole["junctions"] == [scenario.name] and whole["recipe"]["steps"] == 4
@@ -165,6 +178,6 @@ def test_training_learns_goes_on_after_a_stop_and_says_how_it_was_made(mini, tmp
     train([scenario], tmp_path / "part.onnx", recipe)
     assert not (tmp_path / "part.onnx.partial").exists()
     assert (tmp_path / "part.onnx").read_bytes() == (tmp_path / "whole.onnx").read_bytes()
-    about = json.loads({p.key: p.value for p in onnx.load(tmp_path / "whole.onnx").metadata_props}[ABOUT])
+    about = json.loads({p.key: p.value for p in onnx.load(tmp_path / "whole.onnx").metadata_props}[METADATA_KEY])
     assert about["parameters"] == 985785
     assert PointPillars(tmp_path / "whole.onnx").settings["model"]

@@ -1,1 +1,0 @@
-"""The files that a run leaves, Parquet and JSON, and their readers."""

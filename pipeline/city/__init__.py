@@ -1,1 +1,0 @@
-"""A city: one traffic, and an ordinary scenario for each of its junctions."""

@@ -1,1 +1,0 @@
-"""``egvs city``: every junction of a city."""

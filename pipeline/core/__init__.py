@@ -1,1 +1,0 @@
-"""What every other package builds on: errors, files, grids, parallel work, progress."""

@@ -1,1 +1,0 @@
-"""What goes beyond the plain scene: each effect a module, imported only when named."""

@@ -1,1 +1,0 @@
-"""Effects on what a beam becomes before and at static surfaces."""

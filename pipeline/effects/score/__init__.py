@@ -1,1 +1,0 @@
-"""Effects on what a beam is worth in a voxel."""

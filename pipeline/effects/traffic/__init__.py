@@ -1,1 +1,0 @@
-"""Effects on who moves, and on the ground."""

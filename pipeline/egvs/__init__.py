@@ -1,0 +1,125 @@
+"""egvs: which pole, what height, how many roadside LiDARs?
+
+How data flows, stage by stage (each a module of :mod:`egvs.stages`, a verb of the command line, and an artefact)::
+
+    scenario.toml -+-> traffic -> trajectories.parquet -> tpog -> tpog.parquet -+
+                   |                                       ^                    +-> score -> scores.parquet -> report
+                   +-> statics -> statics.ply -------------+-> scan -> scans.parquet
+
+From a notebook::
+
+    import egvs
+
+    scenario = egvs.load("scenarios/nishishinjuku", ["traffic.frames=500"])
+    record = egvs.run(scenario, "runs/trial")
+    tpog = egvs.read_tpog("runs/trial/tpog.parquet")
+    tpog.p  # share of frames in which each voxel is occupied
+
+Any pose, not only the scenario's sites, in milliseconds::
+
+    scene = egvs.build_scene(scenario)
+    scanner, scorer = egvs.Scanner(scene), egvs.Scorer(scene, tpog)
+    pose = egvs.Pose(x_m=12.0, y_m=30.0, z_m=4.5, yaw_deg=180.0)
+    scorer.score(scanner.scan(pose, scene.sensor("VLP-32C"))).egvs
+
+Several poses together, and plans with what is proved of them::
+
+    joint = egvs.JointScore.of(scenario, "runs/trial")
+    joint.add("c03")
+    joint.gain("c10")
+    egvs.place(egvs.load("scenarios/nishishinjuku", ["placement.count=3"])).certificate
+
+Names are imported when they are first used, so that ``import egvs`` costs nothing.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from egvs._version import __version__
+
+if TYPE_CHECKING:
+    from egvs.artefacts.readers import read_scans, read_scores, read_scores_by_period, read_visibility
+    from egvs.artefacts.tpog import Tpog, read_tpog
+    from egvs.artefacts.traffic_frames import read_trajectories
+    from egvs.core.errors import EgvsError, InputError, RunError
+    from egvs.placement.plan import JointScore, place
+    from egvs.runs.run import run
+    from egvs.runs.verification import verify
+    from egvs.scenario.loading import load
+    from egvs.scenario.model import Scenario
+    from egvs.scoring.scorer import Scorer
+    from egvs.sensors.scanner import Scanner
+    from egvs.sensors.scene import Scene
+    from egvs.sensors.sensor import Sensor
+    from egvs.sensors.sites import Pose, Site
+    from egvs.stages.inputs import build_scene
+    from egvs.world.mesh import World
+
+
+_HOME = {
+    "EgvsError": "core.errors",
+    "InputError": "core.errors",
+    "JointScore": "placement.plan",
+    "Pose": "sensors.sites",
+    "RunError": "core.errors",
+    "Scanner": "sensors.scanner",
+    "Scenario": "scenario.model",
+    "Scene": "sensors.scene",
+    "Scorer": "scoring.scorer",
+    "Sensor": "sensors.sensor",
+    "Site": "sensors.sites",
+    "Tpog": "artefacts.tpog",
+    "World": "world.mesh",
+    "build_scene": "stages.inputs",
+    "load": "scenario.loading",
+    "place": "placement.plan",
+    "read_scans": "artefacts.readers",
+    "read_scores": "artefacts.readers",
+    "read_scores_by_period": "artefacts.readers",
+    "read_tpog": "artefacts.tpog",
+    "read_trajectories": "artefacts.traffic_frames",
+    "read_visibility": "artefacts.readers",
+    "run": "runs.run",
+    "verify": "runs.verification",
+}
+"""Public name -> the module that it is from."""
+
+__all__ = [
+    "EgvsError",
+    "InputError",
+    "JointScore",
+    "Pose",
+    "RunError",
+    "Scanner",
+    "Scenario",
+    "Scene",
+    "Scorer",
+    "Sensor",
+    "Site",
+    "Tpog",
+    "World",
+    "__version__",
+    "build_scene",
+    "load",
+    "place",
+    "read_scans",
+    "read_scores",
+    "read_scores_by_period",
+    "read_tpog",
+    "read_trajectories",
+    "read_visibility",
+    "run",
+    "verify",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        return getattr(importlib.import_module(f"egvs.{_HOME[name]}"), name)
+    raise AttributeError(f"module 'egvs' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

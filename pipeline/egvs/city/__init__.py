@@ -1,0 +1,1 @@
+"""All junctions of a city, on one machine or a cluster."""

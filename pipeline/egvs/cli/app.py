@@ -1,0 +1,517 @@
+"""The command line ``egvs``: each verb parses its options, calls the program, and prints the result.
+
+Verbs with several tables are in modules of their own (``place``, ``validate``, ``city``). Heavy modules are imported by
+the verb that needs them, so that ``egvs --help`` is quick.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from egvs._version import __version__
+from egvs.cli import city, exit, place, validate
+from egvs.cli import options as cli_options
+from egvs.cli.options import Audit, Jobs, Out, Run, ScenarioPath, Set, Top
+from egvs.core.errors import InputError
+
+if TYPE_CHECKING:
+    from egvs.scenario.model import Scenario
+    from egvs.studies.effect_study import EffectStatus
+
+
+app = typer.Typer(
+    name="egvs",
+    help="Rank candidate sites of roadside LiDARs by the Entropy-Guided Visibility Score.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+
+def main() -> None:
+    """Run the command line; errors of this program become one message and an exit code."""
+    with exit.report_errors(), exit.after_imports():
+        app()
+
+
+def _print_version(requested: bool) -> None:
+    if requested:
+        print(f"egvs {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Define the options that come before the verb."""
+    del version
+
+
+def _load(path: Path, overrides: Sequence[str] | None, out: Path | None) -> tuple[Scenario, Path]:
+    """Return the scenario with its overrides, and the folder of its run."""
+    from egvs.runs.run import default_folder
+    from egvs.scenario.loading import load
+
+    scenario = load(path, overrides or ())
+    return scenario, out or default_folder(scenario)
+
+
+# ---- a run and its stages
+
+
+@app.command()
+def run(
+    scenario: ScenarioPath,
+    out: Out = None,
+    set_: Set = None,
+    jobs: Jobs = None,
+    audit: Audit = False,
+    top: Top = None,
+) -> None:
+    """Run all stages in order and print the ranking; stages with unchanged inputs are skipped."""
+    from egvs.cli import run_tables
+    from egvs.cli.console import ProgressDisplay
+    from egvs.runs import run
+
+    loaded, folder = _load(scenario, set_, out)
+    stage_options = {"score": {"audit": True}} if audit else None
+    with ProgressDisplay() as screen:
+        record = run.run(
+            loaded, folder, jobs=jobs, progress=screen.progress, listener=screen.stage_event, options=stage_options
+        )
+    run_tables.print_run(folder, record, anything_ran=screen.any_stage_ran, top=top)
+
+
+@app.command()
+def check(scenario: ScenarioPath, set_: Set = None) -> None:
+    """Check a scenario before a run, and print all errors and warnings; writes nothing."""
+    from egvs.cli import run_tables
+    from egvs.scenario.loading import load
+    from egvs.stages import check
+
+    checked = check.check_scenario(load(scenario, set_ or ()))
+    run_tables.print_check(checked)
+    if checked.errors:
+        raise typer.Exit(InputError.exit_code)
+
+
+@app.command()
+def traffic(
+    scenario: ScenarioPath,
+    out: Out = None,
+    set_: Set = None,
+    traci: Annotated[
+        str | None,
+        typer.Option(metavar="HOST:PORT", help="Record from a SUMO that is already running with --remote-port."),
+    ] = None,
+) -> None:
+    """Simulate the traffic with SUMO: trajectories.parquet."""
+    stage_options: dict[str, Any] = {}
+    if traci is not None:
+        stage_options["traci"] = cli_options.host_and_port(traci)
+    _run_stage("traffic", scenario, out, set_, **stage_options)
+
+
+@app.command()
+def statics(scenario: ScenarioPath, out: Out = None, set_: Set = None) -> None:
+    """Build the static world: statics.ply."""
+    _run_stage("statics", scenario, out, set_)
+
+
+@app.command()
+def tpog(scenario: ScenarioPath, out: Out = None, set_: Set = None) -> None:
+    """Count how often each voxel is occupied by traffic: tpog.parquet."""
+    _run_stage("tpog", scenario, out, set_)
+
+
+@app.command()
+def scan(
+    scenario: ScenarioPath,
+    out: Out = None,
+    set_: Set = None,
+    jobs: Jobs = None,
+    points: Annotated[
+        list[str] | None,
+        typer.Option(metavar="SITE", help="Also write the empty scan of this site as a point cloud (repeatable)."),
+    ] = None,
+    cloud: Annotated[str, typer.Option(metavar="FORMAT", help="Format of --points: ply or pcd.")] = "ply",
+) -> None:
+    """Cast an empty scan (without traffic) from every site: scans.parquet."""
+    if cloud not in ("ply", "pcd"):
+        raise InputError("--cloud", f"expected ply or pcd, got {cloud!r}", "Use --cloud ply.")
+    stage_options: dict[str, Any] = {}
+    if points:
+        stage_options = {"points": tuple(points), "cloud": cloud}
+    _run_stage("scan", scenario, out, set_, jobs, **stage_options)
+
+
+@app.command()
+def score(
+    scenario: ScenarioPath,
+    out: Out = None,
+    set_: Set = None,
+    jobs: Jobs = None,
+    audit: Audit = False,
+    top: Top = None,
+) -> None:
+    """Score and rank the sites: scores.parquet."""
+    stage_options = {"audit": True} if audit else {}
+    _run_stage("score", scenario, out, set_, jobs, top, **stage_options)
+
+
+@app.command()
+def report(scenario: ScenarioPath, out: Out = None, set_: Set = None) -> None:
+    """Write the report of a run: report.html."""
+    _run_stage("report", scenario, out, set_)
+
+
+def _run_stage(
+    stage: str,
+    scenario: Path,
+    out: Path | None,
+    set_: list[str] | None,
+    jobs: int | None = None,
+    top: int | None = None,
+    **stage_options: Any,
+) -> None:
+    """Run one stage and print the files that it wrote."""
+    from egvs.cli import run_tables
+    from egvs.cli.console import ProgressDisplay
+    from egvs.runs import run
+
+    loaded, folder = _load(scenario, set_, out)
+    with ProgressDisplay() as screen:
+        record = run.run_one(
+            stage, loaded, folder, jobs=jobs, progress=screen.progress, listener=screen.stage_event, **stage_options
+        )
+    run_tables.print_stage(folder, stage, record, top=top)
+
+
+@app.command()
+def verify(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a finished run.")],
+    scenario: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="The scenario's folder, if it was moved since the run.")
+    ] = None,
+    jobs: Jobs = None,
+) -> None:
+    """Repeat the run recorded in DIR/run.json, and compare every artefact byte for byte."""
+    from egvs.cli import run_tables
+    from egvs.cli.console import ProgressDisplay
+    from egvs.runs import verification
+
+    with ProgressDisplay() as screen:
+        differences = verification.verify(
+            folder, scenario, jobs=jobs, progress=screen.progress, listener=screen.stage_event
+        )
+    run_tables.print_verification(folder, differences)
+    if differences:
+        raise typer.Exit(1)
+
+
+# ---- studies
+
+
+@app.command()
+def compare(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN RUN...", help="Two or more folders of finished runs.")],
+    top: Top = None,
+) -> None:
+    """Compare runs: scores, ranks, rank correlations, and differences of settings and files."""
+    from egvs.cli import study_tables
+    from egvs.studies import run_comparison
+
+    study_tables.print_comparison(run_comparison.compare_runs(runs), top)
+
+
+@app.command()
+def accuracy(
+    scenario: ScenarioPath,
+    out: Out = None,
+    set_: Set = None,
+    jobs: Jobs = None,
+    tolerance: Annotated[
+        float, typer.Option(help="Largest relative error of the recommended setting, e.g. 0.02 for 2 %.")
+    ] = 0.02,
+    budget: Annotated[str, typer.Option(metavar="TIME", help="Time for the study, e.g. 60s or 10m.")] = "10m",
+    seeds: Annotated[
+        int,
+        typer.Option(
+            min=0, help="Also check the standard errors with this many independent runs (2 or more, beyond --budget)."
+        ),
+    ] = 0,
+) -> None:
+    """Measure error against run time for many settings, and recommend the cheapest within a tolerance."""
+    from egvs.cli import study_tables
+    from egvs.cli.console import ProgressDisplay
+    from egvs.studies.accuracy import run_accuracy_study
+
+    _, folder = _load(scenario, set_, out)
+    with ProgressDisplay("accuracy") as screen:
+        study = run_accuracy_study(
+            scenario,
+            set_ or (),
+            folder,
+            tolerance=tolerance,
+            budget_s=cli_options.duration_s(budget),
+            seeds=seeds,
+            jobs=jobs,
+            progress=screen.progress,
+            listener=screen.setting_event,
+        )
+    study_tables.print_study(study, cli_options.command("run", scenario, set_))
+
+
+@app.command()
+def effects(
+    scenario: Annotated[
+        Path | None, typer.Argument(metavar="[SCENARIO]", help="A scenario; without it, all effects are listed.")
+    ] = None,
+    set_: Set = None,
+    ablation: Annotated[
+        bool, typer.Option("--ablation", help="Run each effect of the scenario alone, and print what it changes.")
+    ] = False,
+    out: Out = None,
+    jobs: Jobs = None,
+) -> None:
+    """List the effects; for a scenario, which ones it calls for, why, and what they change."""
+    from egvs.cli import run_tables
+    from egvs.cli.console import ProgressDisplay
+    from egvs.studies import effect_study
+
+    if scenario is None:
+        if ablation:
+            raise InputError("--ablation", "used without a scenario", "Run egvs effects SCENARIO --ablation.")
+        run_tables.print_effects(effect_study.effect_catalogue())
+        return
+
+    loaded, folder = _load(scenario, set_, out)
+    with ProgressDisplay() as screen:
+        costs = effect_study.effect_costs(loaded, folder)
+        statuses = effect_study.effect_statuses(loaded, folder, screen.progress)
+    run_tables.print_effects(statuses, costs)
+
+    if any(status.change == effect_study.UNTRIED for status in statuses):
+        print(f"to measure the expected changes, first: {cli_options.command('run', scenario, set_, out)}")
+    if recommended := [f"effects.{status.name}={{}}" for status in statuses if status.state == "called for"]:
+        overrides = [*(set_ or ()), *recommended]
+        print(f"with all effects that are called for: {cli_options.command('run', scenario, overrides, out)}")
+    if unmeasured := _unmeasured_effects(statuses, costs, loaded):
+        study = cli_options.command("accuracy", scenario, set_, out)
+        print(f"to measure what {unmeasured} cost and change: {study}, or use --ablation")
+
+    if not ablation:
+        return
+    if not loaded.effects.named:
+        raise InputError(
+            "--ablation", "the scenario names no effect", "Name one, e.g. --set effects.rain.rate_mm_h=20."
+        )
+    with ProgressDisplay() as screen:
+        changes = effect_study.run_ablation(loaded, folder, jobs=jobs, progress=screen.progress)
+    run_tables.print_ablation(changes)
+
+
+def _unmeasured_effects(statuses: Sequence[EffectStatus], costs: Collection[str] | None, scenario: Scenario) -> str:
+    """Return the named effects without a measured cost, as text; empty if there is none."""
+    if costs is None:
+        return "they"
+    active = [status.name for status in statuses if status.state == "on" and status.name in scenario.effects.named]
+    return ", ".join(name for name in active if name not in costs)
+
+
+app.command()(place.place)
+
+
+# ---- the explorer
+
+
+@app.command()
+def explore(
+    folder: Annotated[
+        Path, typer.Argument(metavar="RUN|SCENARIO", help="Folder of a run, or a scenario, which is run first.")
+    ],
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page on this machine; 0 for any free.")] = 0,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")] = True,
+    out: Out = None,
+    set_: Set = None,
+    jobs: Jobs = None,
+    view: Annotated[
+        str, typer.Option(metavar="LINK", help='View to open, copied from "Link to this view" in the page.')
+    ] = "",
+) -> None:
+    """Move sensors in the browser and see their scores at once."""
+    import webbrowser
+
+    from egvs.cli.console import ProgressDisplay
+    from egvs.core import files, plugins
+
+    plugins.require_libraries("egvs explore", "explore", "viser")
+    from egvs.explore.page import Page, check_port_free
+    from egvs.explore.settings import open_session
+
+    check_port_free(port)
+    with ProgressDisplay("explore") as screen:
+        session = open_session(
+            folder, set_ or (), out, jobs=jobs, progress=screen.progress, listener=screen.stage_event
+        )  # fmt: skip
+    command = cli_options.command_words("explore", folder, set_, out)
+    with files.temporary_folder() as scratch:
+        page = Page(session, scratch, port, tuple(command))
+        try:
+            if view:
+                page.open_at(view, "--view")
+            print(f"{page.address}  (press Ctrl-C to stop)", flush=True)
+            if browser:
+                webbrowser.open(page.address)
+            page.run()
+        except KeyboardInterrupt:  # the normal way to stop
+            print()
+        finally:
+            page.stop()
+
+
+for verb in validate.VERBS:
+    app.command()(verb)
+
+
+# ---- files of a run
+
+
+@app.command()
+def export(
+    run: Run,
+    to: Annotated[str, typer.Option(metavar="FORMAT", help="gpkg, geojson, geoparquet, kml, csv or geotiff.")],
+    crs: Annotated[
+        str | None,
+        typer.Option(metavar="CRS", help="scenario or wgs84; by default the one that is usual for the format."),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="FILE|DIR", help="A file (gpkg, kml) or a folder; RUN/export by default."),
+    ] = None,
+    site: Annotated[
+        list[str] | None,
+        typer.Option(metavar="SITE", help="For geotiff: a site whose view is exported (repeatable); the best default."),
+    ] = None,
+) -> None:
+    """Export sites, plan, blind spots and footprints of a run for GIS and spreadsheets, or rasters."""
+    from egvs.cli.console import ProgressDisplay
+    from egvs.export import export
+
+    with ProgressDisplay("export") as screen:
+        exported = export.export_run(run, to, crs=crs, out=out, sites=site or (), progress=screen.progress)
+    for note in exported.notes:
+        print(note)
+    print(f"positions in {exported.reference}")
+    for path in exported.paths:
+        print(path)
+
+
+@app.command()
+def figure(
+    run: Run,
+    what: Annotated[str, typer.Option(metavar="FIGURE", help="ranking, map, tpog, seen or missed.")],
+    site: Annotated[
+        str | None, typer.Option(metavar="SITE", help="For seen and missed: the site; the best one by default.")
+    ] = None,
+    kind: Annotated[str, typer.Option("--format", metavar="FORMAT", help="pdf, png or svg.")] = "pdf",
+    size: Annotated[
+        str, typer.Option(metavar="WIDTH", help="Width on paper, e.g. 85mm (a column) or 170mm (a page).")
+    ] = "85mm",
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="File to write; RUN/export/FIGURE.FORMAT by default.")
+    ] = None,
+) -> None:
+    """Draw a figure of a run for a paper or slides."""
+    from egvs.cli.console import ProgressDisplay
+    from egvs.export import figure
+
+    width_mm = cli_options.width_mm(size, figure.MIN_WIDTH_MM, figure.MAX_WIDTH_MM)
+    with ProgressDisplay("figure") as screen:
+        path = figure.draw_figure(run, what, site=site, kind=kind, width_mm=width_mm, out=out, progress=screen.progress)
+    print(path)
+
+
+app.add_typer(city.app, name="city")
+
+
+# ---- scenarios, sensors, cached results
+
+
+@app.command()
+def sensors() -> None:
+    """List the sensor catalogue."""
+    from egvs.cli import run_tables
+    from egvs.sensors.sensor import CATALOGUE
+
+    run_tables.print_sensors(CATALOGUE.values())
+
+
+@app.command()
+def new(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="The scenario's folder, which is created.")],
+    osm: Annotated[
+        Path, typer.Option(metavar="FILE", help="An OpenStreetMap extract (.osm, .osm.xml, .osm.pbf, also gzipped).")
+    ],
+    at: Annotated[
+        str | None, typer.Option(metavar="LAT,LON", help="Use the junction nearest to this point; default: largest.")
+    ] = None,
+    lefthand: Annotated[bool, typer.Option("--lefthand", help="Traffic drives on the left.")] = False,
+    walk: Annotated[bool, typer.Option("--walk", help="Include sidewalks and crossings, for pedestrians.")] = False,
+    surroundings: Annotated[
+        str | None,
+        typer.Option(
+            metavar="METRES", help="Radius around the junction in which streets are simulated, or all; 300 by default."
+        ),
+    ] = None,
+) -> None:
+    """Create a scenario from an OpenStreetMap extract."""
+    from egvs.cli import run_tables
+    from egvs.importers import openstreetmap
+
+    location = cli_options.latitude_and_longitude(at) if at is not None else None
+    surroundings_m: float | None = openstreetmap.SURROUNDINGS_M
+    if surroundings is not None:
+        surroundings_m = cli_options.radius_m(surroundings)
+    scenario = openstreetmap.create_scenario(
+        folder, osm, location, lefthand=lefthand, walk=walk, surroundings_m=surroundings_m
+    )
+    run_tables.print_new_scenario(scenario)
+
+
+@app.command()
+def store(
+    prune: Annotated[
+        bool, typer.Option("--prune", help="Remove the least recently used entries beyond --max.")
+    ] = False,
+    max_size: Annotated[
+        str | None, typer.Option("--max", metavar="SIZE", help="Size for --prune, e.g. 2G; default: EGVS_STORE_MAX_GB.")
+    ] = None,
+    clear: Annotated[bool, typer.Option("--clear", help="Remove all entries.")] = False,
+) -> None:
+    """List or remove the cached results of earlier runs."""
+    from egvs.cli import run_tables
+    from egvs.runs.store import Store
+
+    if clear and prune:
+        raise InputError("--clear", "given together with --prune", "Use --clear to remove all entries.")
+    if max_size is not None and not prune:
+        raise InputError("--max", "used without --prune", "Run egvs store --prune --max 2G.")
+    cache = Store.default()
+    cache.check(changed=clear or prune)
+    if not clear and not prune:
+        run_tables.print_store(cache)
+        return
+    bound_bytes = cache.bound_bytes
+    if clear:
+        bound_bytes = -1.0
+    elif max_size is not None:
+        bound_bytes = cli_options.size_bytes(max_size)
+    run_tables.print_removed(cache, cache.prune(bound_bytes))

@@ -1,0 +1,267 @@
+"""``egvs city``: create a city, simulate its traffic, run all junctions, and plan sensors for the whole city."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from egvs.cli import options
+
+if TYPE_CHECKING:
+    from egvs.city.city_run import CityPlacement, CityRun
+    from egvs.city.creation import NewCity
+    from egvs.city.tasks import JobResult
+    from egvs.city.traffic_split import CityTraffic
+
+_WIDTH = 150
+
+CityPath = Annotated[Path, typer.Argument(metavar="CITY", help="A folder created by egvs city new.")]
+CityOut = Annotated[
+    Path | None, typer.Option("--out", metavar="DIR", help="Folder of the city run; runs/<name> by default.")
+]
+Cluster = Annotated[
+    str,
+    typer.Option(
+        metavar="WHERE",
+        help="local (one process per core), processes=N, or a Dask scheduler such as tcp://host:8786.",
+    ),
+]
+Junctions = Annotated[
+    list[str] | None, typer.Option("--junction", metavar="ID", help="Only this junction (repeatable); all by default.")
+]
+CitySet = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Override one key of every junction, e.g. score.gamma=2 (not of the traffic).",
+    ),
+]
+
+
+def new(
+    folder: Annotated[Path, typer.Argument(metavar="CITY", help="The city's folder, which is created.")],
+    osm: Annotated[
+        Path, typer.Option(metavar="FILE", help="An OpenStreetMap extract (.osm, .osm.xml, .osm.pbf, also gzipped).")
+    ],
+    around: Annotated[
+        str | None, typer.Option(metavar="LAT,LON", help="Only the streets around this point; all by default.")
+    ] = None,
+    radius: Annotated[
+        str | None, typer.Option(metavar="LENGTH", help="Radius of --around, e.g. 1500m; 2km by default.")
+    ] = None,
+    junctions: Annotated[
+        str,
+        typer.Option(
+            metavar="WHICH", help="signalised, all, or a CSV table with the columns junction, lat_deg, lon_deg."
+        ),
+    ] = "signalised",
+    lefthand: Annotated[bool, typer.Option("--lefthand", help="Traffic drives on the left.")] = False,
+    walk: Annotated[bool, typer.Option("--walk", help="Include sidewalks and crossings, for pedestrians.")] = False,
+) -> None:
+    """Create a city from an OpenStreetMap extract: one network, and a scenario for each junction."""
+    from egvs.city import creation
+    from egvs.cli.console import ProgressDisplay
+
+    centre = options.latitude_and_longitude(around, "--around") if around is not None else None
+    radius_m = options.length_m(radius, "--radius") if radius is not None else None
+    with ProgressDisplay("city") as screen:
+        created = creation.create_city(
+            folder, osm, around=centre, radius_m=radius_m, which=junctions, lefthand=lefthand, walk=walk,
+            progress=screen.progress,
+        )  # fmt: skip
+    _print_new(created)
+
+
+def traffic(city: CityPath) -> None:
+    """Simulate a city's traffic once and divide it among its junctions, if anything changed."""
+    from egvs.city import model, traffic_split
+    from egvs.cli.console import ProgressDisplay
+
+    loaded = model.load_city(city)
+    with ProgressDisplay("traffic") as screen:
+        result = traffic_split.make_city_traffic(loaded, screen.progress)
+    _print_traffic(loaded.folder, result)
+
+
+def run(
+    city: CityPath,
+    out: CityOut = None,
+    cluster: Cluster = "local",
+    junction: Junctions = None,
+    set_: CitySet = None,
+) -> None:
+    """Run every junction: the traffic once, then all junctions in parallel."""
+    from egvs.city import city_run, model
+    from egvs.cli.console import ProgressDisplay
+
+    with ProgressDisplay("city") as screen:
+        result = city_run.run_city(
+            model.load_city(city), out, where=cluster, only=junction or (), sets=set_ or (), progress=screen.progress,
+            on_done=lambda done: screen.say(describe_done(done)),
+        )  # fmt: skip
+        for warning in result.warnings:
+            screen.say(f"warning: {warning}")
+    print_junctions(result)
+
+
+def place(
+    city: CityPath,
+    out: CityOut = None,
+    count: Annotated[int | None, typer.Option(metavar="K", min=1, help="Find the best K sensors of the city.")] = None,
+    budget: Annotated[
+        float | None, typer.Option(metavar="COST", help="Find the best sensors within this total cost (see \\[costs]).")
+    ] = None,
+    cluster: Cluster = "local",
+    junction: Junctions = None,
+    set_: CitySet = None,
+) -> None:
+    """Plan sensors over all junctions together: the best plan of the whole city."""
+    from egvs.city import city_run, model
+    from egvs.cli.console import ProgressDisplay
+
+    with ProgressDisplay("city") as screen:
+        placed = city_run.place_city(
+            model.load_city(city), out, count=count, budget=budget, where=cluster, only=junction or (), sets=set_ or (),
+            progress=screen.progress, on_done=lambda done: screen.say(describe_done(done)),
+        )  # fmt: skip
+        for warning in placed.city_run.warnings:
+            screen.say(f"warning: {warning}")
+    print_plan(placed)
+
+
+def _print_new(city: NewCity) -> None:
+    from egvs.cli.console import WIDE, Column, console, make_table
+
+    columns: list[Column[Any]] = [
+        Column("junction", lambda row: row.id, "left"),
+        Column("title", lambda row: row.junction.title, "left", wrap=True),
+        Column("lanes in", lambda row: str(row.junction.lanes_in)),
+        Column("poles", lambda row: str(len(row.places))),
+        Column("sites", lambda row: str(row.sites)),
+    ]
+    out = console(WIDE)
+    out.print(make_table(columns, city.junctions))
+    _print_mapping({"folder": str(city.folder)} | city.to_json())
+    out.print(f"next: egvs city traffic {city.folder}")
+
+
+def _print_traffic(folder: Path, result: CityTraffic) -> None:
+    from egvs.city import model
+    from egvs.cli.console import console
+    from egvs.core.errors import WARNINGS_KEY, collect_warnings
+
+    out = console(_WIDTH)
+    _print_mapping(_shown_statistics(result.summary))
+    for name, summary in result.summary.get("periods", {}).items():
+        _print_mapping({name: _shown_statistics(summary)})
+    if result.linked:
+        junctions = ", ".join(result.linked)
+        out.print(f"{model.JUNCTIONS_FOLDER}/*/scenario.toml: added the city's files and periods to {junctions}")
+    if WARNINGS_KEY in result.summary:
+        for warning in collect_warnings([result.summary]):
+            out.print(f"warning: {warning}")
+    fewest = min(result.rows, key=lambda name: result.rows[name])
+    most = max(result.rows, key=lambda name: result.rows[name])
+    out.print(f"rows: {result.rows[most]:,} at {most} (the most), {result.rows[fewest]:,} at {fewest} (the fewest)")
+    if not result.is_new:
+        out.print("nothing to do: neither the traffic nor a region changed")
+    out.print(str(folder / "traffic"))
+
+
+_STATISTICS = (
+    "frames", "vehicles", "mean_speed_m_s", "share_standing", "frames_with_overlap", "collisions", "notes",
+)  # fmt: skip
+
+
+def _shown_statistics(summary: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: summary[key] for key in _STATISTICS if summary.get(key) not in (None, [])}
+
+
+def _print_mapping(values: Mapping[str, Any]) -> None:
+    """Print one line per key."""
+    from egvs.cli.console import console, format_value, format_values
+
+    out = console(_WIDTH)
+    for key, value in values.items():
+        text = format_values(value) if isinstance(value, dict) else format_value(value)
+        out.print(f"{key}: {text}")
+
+
+def describe_done(done: JobResult) -> str:
+    """Return one line about a finished junction."""
+    stages = ", ".join(done.made) or "nothing, all results were up to date"
+    return f"{done.junction:<14} {done.seconds:>8.2f} s   {done.sites} sites; ran {stages}"
+
+
+def print_junctions(city_run: CityRun) -> None:
+    """Print the junctions, best first, and the files that were written."""
+    from egvs.city.results import gain_label
+    from egvs.cli.console import NARROW, WIDE, Column, console, make_table
+
+    by = city_run.results[0].best.by
+    gain = gain_label(by.name)
+    columns: list[Column[Any]] = [
+        Column("rank", lambda row: str(row.rank)),
+        Column("junction", lambda row: row.junction.id, "left"),
+        Column("title", lambda row: row.junction.title, "left", wrap=True, min_width=NARROW),
+        Column("best site", lambda row: row.best.site, "left"),
+        Column(gain.head, lambda row: gain.value(row.gain)),
+    ]
+    if by.head != gain.head:
+        columns.append(Column(by.head, lambda row: by.value(row.score)))
+    if "entropy seen" not in (gain.head, by.head):
+        columns.append(Column("entropy seen", lambda row: f"{row.best.entropy_seen:.1%}"))
+    columns.append(Column("vehicles", lambda row: f"{row.vehicles:.1f}"))
+    columns.append(Column("sites", lambda row: str(row.sites)))
+
+    out = console(WIDE)
+    out.print(make_table(columns, city_run.results, width=out.width))
+    for path in city_run.files:
+        out.print(str(path))
+
+
+def print_plan(placed: CityPlacement) -> None:
+    """Print the sensors, the certificate, and the files that were written."""
+    from egvs.city.results import gain_label
+    from egvs.cli.console import WIDE, Column, console, make_table
+
+    plan = placed.plan
+    label = gain_label(plan.rank_by)
+    columns: list[Column[Any]] = [
+        Column("", lambda sensor: f"{sensor.order}*" if sensor.forced else str(sensor.order)),
+        Column("junction", lambda sensor: sensor.junction, "left"),
+        Column("site", lambda sensor: sensor.site, "left"),
+        Column("z m", lambda sensor: f"{sensor.z_m:g}"),
+        Column("yaw deg", lambda sensor: f"{sensor.yaw_deg:.1f}"),
+        Column("pitch deg", lambda sensor: f"{sensor.pitch_deg:.1f}"),
+        Column("sensor", lambda sensor: sensor.sensor, "left"),
+        Column("gain", lambda sensor: label.value(sensor.gain)),
+        Column("joint score", lambda sensor: label.value(sensor.score)),
+        Column("cost", lambda sensor: f"{sensor.cost:g}"),
+    ]
+    out = console(WIDE)
+    out.print(make_table(columns, plan.sensors))
+    if any(sensor.forced for sensor in plan.sensors):
+        out.print("* already installed")
+
+    cost = f" for {plan.cost:g}" if plan.cost else ""
+    share = plan.joint / plan.together if plan.together > 0 else 0.0
+    proved = math.floor(plan.certificate * 1e4) / 1e2  # never rounded up
+    out.print(
+        f"{len(plan.sensors)} sensors at {len(plan.by_junction)} of {plan.junctions} junctions{cost}: "
+        f"{label.label} {label.value(plan.joint)}, {share:.1%} of the score of all {plan.candidates:,} candidates "
+        f"together; proved: at least {proved:.2f} % of the best possible"
+    )
+    for path in placed.files:
+        out.print(str(path))
+
+
+app = typer.Typer(no_args_is_help=True, help="Run every junction of a city, on one machine or a cluster.")
+
+for verb in (new, traffic, run, place):
+    app.command()(verb)

@@ -1,0 +1,205 @@
+"""What all output of the command line shares: the console, tables, values as text, and the progress display.
+
+Results go to standard output; progress, stage lines and warnings go to standard error.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Generic, Literal, TypeVar
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from egvs.artefacts.run_folder import StageRecord
+from egvs.cli import stage_summary
+from egvs.core.errors import collect_warnings
+
+NARROW, WIDE = 110, 190
+"""Terminals below ``NARROW`` columns get fewer columns of tables; those of about ``WIDE`` get all."""
+
+Row = TypeVar("Row")
+
+
+@dataclass(frozen=True)
+class Column(Generic[Row]):
+    """One column of a printed table.
+
+    Attributes
+    ----------
+    title
+        Head of the column.
+    text
+        Returns the cell of a row.
+    align
+        ``"left"`` for text, ``"right"`` for numbers.
+    wrap
+        Whether a cell that is too wide continues on the next line.
+    min_width
+        Narrowest terminal, in characters, in which the column is shown.
+    """
+
+    title: str
+    text: Callable[[Row], str]
+    align: Literal["left", "right"] = "right"
+    wrap: bool = False
+    min_width: int = 0
+
+
+def console(file_width: int, *, soft_wrap: bool = True) -> Console:
+    """Return standard output: as wide as the terminal, or ``file_width`` characters if it is no terminal.
+
+    Text is never taken for markup or an emoji: names may have brackets and colons.
+    """
+    width = None if sys.stdout.isatty() else file_width
+    return Console(width=width, highlight=False, markup=False, emoji=False, soft_wrap=soft_wrap)
+
+
+def make_table(
+    columns: Sequence[Column[Row]],
+    rows: Iterable[Row],
+    *,
+    width: int = WIDE,
+    title: str | None = None,
+    caption: str | None = None,
+    truncate: bool = False,
+) -> Table:
+    """Return a table without a frame.
+
+    Parameters
+    ----------
+    columns
+        Columns from left to right; those with a larger ``min_width`` than ``width`` are left out.
+    rows
+        One object per row.
+    width
+        Width of the terminal, in characters.
+    title, caption
+        Text above and below the table.
+    truncate
+        Whether cells that are too wide end in "…" instead of continuing on the next line.
+    """
+    shown = [column for column in columns if width >= column.min_width]
+    table = Table(box=None, pad_edge=False, title=title, title_justify="left", caption=caption)
+    for column in shown:
+        table.add_column(
+            column.title,
+            justify=column.align,
+            no_wrap=not column.wrap,
+            overflow="ellipsis" if truncate else "fold",
+        )
+    for row in rows:
+        table.add_row(*(column.text(row) for column in shown))
+    return table
+
+
+def print_table(columns: Sequence[Column[Row]], rows: Iterable[Row], *, file_width: int = WIDE) -> None:
+    """Print a table as wide as the terminal."""
+    out = console(file_width, soft_wrap=False)
+    out.print(make_table(columns, rows, width=out.width))
+
+
+def format_values(values: Mapping[str, Any]) -> str:
+    """Return the entries of a mapping in one line, without empty ones."""
+    shown = []
+    for key, value in values.items():
+        if value not in ("", [], {}, None):
+            shown.append(f"{key.replace('_', ' ')} {format_value(value)}")
+    return "; ".join(shown)
+
+
+def format_value(value: Any) -> str:
+    """Return a value as text; a mapping of counts as "3 pole, 2 sign"."""
+    if isinstance(value, dict):
+        return ", ".join(_format_entry(str(key).replace("_", " "), entry) for key, entry in value.items())
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, list | tuple):
+        return ", ".join(format_value(entry) for entry in value)
+    return str(value)
+
+
+def _format_entry(key: str, value: Any) -> str:
+    if isinstance(value, dict):
+        return f"{key} ({format_value(value)})"
+    return f"{format_value(value)} {key}"
+
+
+class ProgressDisplay:
+    """Shows the progress of a run: a bar on a terminal, and one line per finished stage.
+
+    Attributes
+    ----------
+    any_stage_ran
+        Whether at least one stage was run or restored from the cache.
+    """
+
+    def __init__(self, verb: str = "") -> None:
+        self.any_stage_ran = False
+        self._stage = verb
+        self._console = Console(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=True)
+        self._bar = Progress(
+            TextColumn("{task.description}", markup=False),  # names may have brackets
+            BarColumn(),
+            TimeElapsedColumn(),
+            console=self._console,
+            transient=True,
+        )
+        self._task = self._bar.add_task("", total=None, visible=False)
+        self._has_bar = sys.stderr.isatty()
+
+    def __enter__(self) -> ProgressDisplay:
+        if self._has_bar:
+            self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._has_bar:
+            self._bar.stop()
+
+    def progress(self, what: str, done: int, total: int) -> None:
+        """Move the bar; a :data:`egvs.core.runtime.ProgressCallback`."""
+        if not self._has_bar:
+            return
+        count = f"{done}/{total}" if total else str(done)
+        self._bar.update(self._task, description=f"{self._stage}: {what} {count}", completed=done, visible=True)
+        self._bar.tasks[0].total = total or None  # update() takes None for "unchanged"
+
+    def stage_event(self, stage: str, state: str, record: StageRecord | None) -> None:
+        """Print one line when a stage ends; a :data:`egvs.runs.run.StageListener`."""
+        self._stage = stage
+        if state in ("runs", "fetched"):
+            self.any_stage_ran = True
+        if record is None:
+            self._show_stage(stage)
+            return
+        if self._has_bar:
+            self._bar.update(self._task, visible=False)
+
+        for line in stage_summary.stage_lines(stage, state, record):
+            self.say(line)
+        for warning in collect_warnings([record.summary]):
+            self.say(f"warning: {warning}")
+
+    def _show_stage(self, stage: str) -> None:
+        if self._has_bar:
+            self._bar.update(self._task, description=stage, completed=0, visible=True)
+            self._bar.tasks[0].total = None
+
+    def setting_event(self, name: str, state: str, details: dict[str, Any]) -> None:
+        """Print one line for a setting of a study that is "done", "kept" or "skipped".
+
+        Settings that the budget leaves out are listed at the end of the study instead.
+        """
+        if details.get("beyond"):
+            return
+        duration = f"{details['seconds']:.2f} s" if "seconds" in details else state
+        note = " (cached)" if state == "kept" else ""
+        self.say(f"{duration:>10}   {name}{note} {details.get('why', '')}".rstrip())
+
+    def say(self, line: str) -> None:
+        """Print a line above the bar."""
+        self._console.print(line)

@@ -1,0 +1,139 @@
+"""Options that several verbs share, and parsers of option values with units."""
+
+from __future__ import annotations
+
+import math
+import re
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from egvs.core.errors import InputError
+
+ScenarioPath = Annotated[Path, typer.Argument(metavar="SCENARIO", help="A folder with a scenario.toml, or the file.")]
+Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run.")]
+Out = Annotated[
+    Path | None, typer.Option("--out", metavar="DIR", help="Folder of the run; runs/<scenario name> by default.")
+]
+Set = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Override a scenario key, e.g. traffic.frames=500 (repeatable)."),
+]
+Jobs = Annotated[
+    int | None, typer.Option("--jobs", min=1, help="Number of threads; one per core by default. Same results.")
+]
+Top = Annotated[
+    int | None, typer.Option("--top", metavar="N", min=1, help="Print only the best N sites; all by default.")
+]
+Audit = Annotated[
+    bool, typer.Option("--audit", help="Check the voxel traversal of every beam, and print the worst deviation.")
+]
+
+
+def duration_s(text: str, option: str = "--budget") -> float:
+    """Return seconds from 90s, 10m or 1.5h."""
+    seconds = _parse_quantity(text, {"s": 1.0, "m": 60.0, "h": 3600.0, "": 1.0})
+    if not 0 < seconds < math.inf:
+        raise InputError(option, f"expected a time above 0, got {text!r}", "Use a time such as 90s, 10m or 1.5h.")
+    return seconds
+
+
+def heights_m(text: str) -> tuple[float, float]:
+    """Return the two heights of ``--heights LOW,HIGH`` in metres."""
+    match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?),([0-9]+(?:\.[0-9]+)?)", text)
+    low, high = (float(match[1]), float(match[2])) if match else (0.0, 0.0)
+    if not 0 < low <= high <= 100:
+        raise InputError("--heights", f"expected LOW,HIGH in metres, got {text!r}", "Use heights such as 2,7.")
+    return low, high
+
+
+def model_file(path: Path) -> Path:
+    """Return ``--out`` of ``egvs train``, whose name must end in .onnx."""
+    if path.suffix != ".onnx":
+        raise InputError("--out", f"expected a file that ends in .onnx, got {str(path)!r}", "Use --out model.onnx.")
+    return path
+
+
+def size_bytes(text: str) -> float:
+    """Return the bytes of ``--max``, e.g. 500M or 2G."""
+    size = _parse_quantity(text.removesuffix("B"), {"": 1.0, "K": 1e3, "M": 1e6, "G": 1e9, "T": 1e12})
+    if math.isnan(size):
+        raise InputError("--max", f"expected a size, got {text!r}", "Use a size such as 500M or 2G.")
+    return size
+
+
+def host_and_port(text: str) -> tuple[str, int]:
+    """Return host and port of ``--traci HOST:PORT``."""
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdigit() or not 0 < int(port) < 65536:
+        raise InputError("--traci", f"expected HOST:PORT, got {text!r}", "Use an address such as localhost:8813.")
+    return host, int(port)
+
+
+def latitude_and_longitude(text: str, option: str = "--at") -> tuple[float, float]:
+    """Return latitude and longitude in degrees from LAT,LON."""
+    try:
+        latitude_deg, longitude_deg = (float(part) for part in text.split(","))
+    except ValueError:
+        problem = f"expected LAT,LON in degrees, got {text!r}"
+        raise InputError(option, problem, "Use coordinates such as 50.8704,9.7080.") from None
+    return latitude_deg, longitude_deg
+
+
+def width_mm(text: str, least: float, most: float) -> float:
+    """Return the width of ``--size`` in millimetres, from 85mm or 8.5cm."""
+    width = _parse_quantity(text, {"mm": 1.0, "cm": 10.0, "": 1.0})
+    if not least <= width <= most:
+        problem = f"expected a width of {least:g} to {most:g} mm, got {text[:80]!r}"
+        raise InputError("--size", problem, "Use a width such as 85mm.")
+    return width
+
+
+def radius_m(text: str) -> float | None:
+    """Return the radius of ``--surroundings`` in metres; None for "all"."""
+    from egvs.scenario.fields import MAX_COORDINATE_M
+
+    if text == "all":
+        return None
+    try:
+        radius = float(text)
+    except ValueError:
+        radius = math.nan
+    if not 0 < radius <= MAX_COORDINATE_M:
+        problem = f"expected a length in metres, or all, got {text[:80]!r}"
+        raise InputError("--surroundings", problem, "Use a length such as 300.")
+    return radius
+
+
+def length_m(text: str, option: str) -> float:
+    """Return metres from 1500, 1500m or 2km."""
+    length = _parse_quantity(text, {"m": 1.0, "km": 1000.0, "": 1.0})
+    if not 0 < length < math.inf:
+        raise InputError(option, f"expected a length above 0, got {text[:80]!r}", "Use a length such as 1500m or 2km.")
+    return length
+
+
+def _parse_quantity(text: str, units: Mapping[str, float]) -> float:
+    """Return a plain decimal number times its unit; not a number for anything else."""
+    match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)([A-Za-z]*)", text)
+    if match is None or match[2] not in units:
+        return math.nan
+    return float(match[1]) * units[match[2]]
+
+
+def command_words(verb: str, path: Path, overrides: Sequence[str] | None, out: Path | None = None) -> list[str]:
+    """Return the words of a command."""
+    words = ["egvs", verb, str(path)]
+    for override in overrides or ():
+        words += ["--set", override]
+    if out is not None:
+        words += ["--out", str(out)]
+    return words
+
+
+def command(verb: str, path: Path, overrides: Sequence[str] | None, out: Path | None = None) -> str:
+    """Return a command that can be typed into a shell."""
+    return shlex.join(command_words(verb, path, overrides, out))

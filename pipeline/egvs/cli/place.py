@@ -1,0 +1,185 @@
+"""``egvs place``: plan several sensors, and print the plan and what is proved about it."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from egvs.cli import options
+from egvs.cli.options import Jobs, Out, ScenarioPath, Set
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from egvs.placement.plan import Placement, RefinementSummary
+
+
+def place(
+    scenario: ScenarioPath,
+    out: Out = None,
+    count: Annotated[int | None, typer.Option(metavar="K", help="Find the best plan of at most K sensors.")] = None,
+    budget: Annotated[
+        float | None, typer.Option(metavar="COST", help="Find the best plan within this total cost (see \\[costs]).")
+    ] = None,
+    reach: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SHARE", help="Find the fewest sensors that reach this share of the score of all candidates."
+        ),
+    ] = None,
+    exact: Annotated[
+        bool, typer.Option("--exact", help="Search until the plan is proved to be the best, or the time limit ends.")
+    ] = False,
+    time_limit: Annotated[
+        str, typer.Option(metavar="TIME", help="Time limit of --exact, and of the proof for --reach, e.g. 60s or 5m.")
+    ] = "60s",
+    refine: Annotated[
+        bool,
+        typer.Option(
+            "--refine", help="Then optimise the pose of each sensor within the limits of \\[placement.refine]."
+        ),
+    ] = False,
+    set_: Set = None,
+    jobs: Jobs = None,
+) -> None:
+    """Plan several sensors: which sites together, how many, and a bound on the best possible."""
+    from egvs.cli.console import WIDE, ProgressDisplay, console
+    from egvs.placement import plan
+    from egvs.runs.run import default_folder
+    from egvs.scenario.loading import load
+
+    limit_s = options.duration_s(time_limit, "--time-limit")
+    overrides = list(set_ or ())
+    for key, value in (("count", count), ("budget", budget), ("reach", reach)):
+        if value is not None:
+            overrides.append(f"placement.{key}={value!r}")
+    loaded = load(scenario, overrides)
+    folder = out or default_folder(loaded)
+    with ProgressDisplay("place") as screen:
+        placed = plan.place(
+            loaded, folder, exact=exact, time_limit_s=limit_s, refine=refine, jobs=jobs, progress=screen.progress,
+            listener=screen.stage_event,
+        )  # fmt: skip
+    print_placement(placed)
+    if exact and not (placed.solution.is_best or placed.solution.fewest_is_proved):
+        console(WIDE).print(f"--exact reached its --time-limit of {time_limit} before the best plan was proved")
+
+
+def print_placement(placed: Placement) -> None:
+    """Print the sensors of the plan, the score of each number of sensors, and the certificate."""
+    from egvs.cli.console import WIDE, console
+
+    out = console(WIDE)
+    out.print(_sensor_table(placed))
+    if any(pick.is_forced for pick in placed.sensors):
+        out.print("* already installed")
+    out.print(_curve_table(placed))
+    for zone in placed.zones:
+        sensors = f" by {zone.by} sensors" if zone.by > 1 else ""
+        out.print(f"zone {zone.name}: {zone.seen:.1%} of its entropy seen{sensors}, {zone.share:.1%} required")
+    out.print(describe_plan(placed))
+    if placed.moves is not None:
+        out.print(describe_moves(placed, placed.moves))
+    for path in placed.files:
+        out.print(str(path))
+
+
+def _sensor_table(placed: Placement) -> Table:
+    from egvs.cli.console import Column, make_table
+
+    sensors = placed.sensors
+    columns = [
+        Column[int]("", lambda i: f"{i + 1}*" if sensors[i].is_forced else str(i + 1)),
+        Column[int]("site", lambda i: sensors[i].site.name, "left"),
+        Column[int]("z m", lambda i: f"{sensors[i].site.pose.z_m:g}"),
+        Column[int]("yaw deg", lambda i: f"{sensors[i].site.pose.yaw_deg:.1f}"),
+        Column[int]("pitch deg", lambda i: f"{sensors[i].site.pose.pitch_deg:.1f}"),
+        Column[int]("sensor", lambda i: sensors[i].site.sensor, "left"),
+        Column[int]("gain", lambda i: f"{sensors[i].gain:.6g}"),
+        Column[int]("joint score", lambda i: f"{sensors[i].score:.6g}"),
+        Column[int]("lost if it fails", lambda i: f"{_loss_share(placed, i):.1%}"),
+        Column[int]("cost", lambda i: f"{sensors[i].cost:g}"),
+    ]
+    if placed.moves is not None:
+        columns.append(Column("moved m", lambda i: f"{sensors[i].moved_m:.2f}"))
+        columns.append(Column("gained by moving", lambda i: f"{sensors[i].gain_by_refining:.6g}"))
+    return make_table(columns, range(len(sensors)))
+
+
+def _loss_share(placed: Placement, number: int) -> float:
+    """Return the share of the joint score that is lost if one sensor fails."""
+    if not placed.joint > 0:
+        return 0.0
+    return placed.sensors[number].loss / placed.joint
+
+
+def _curve_table(placed: Placement) -> Table:
+    from egvs.cli.console import Column, make_table
+
+    curve = placed.solution.curve
+    columns = [
+        Column[int]("sensors", lambda i: str(curve[i].count)),
+        Column[int]("joint score", lambda i: f"{curve[i].plan_value.joint:.6g}"),
+        Column[int]("of all candidates", lambda i: f"{_score_share(placed, curve[i].plan_value.joint):.1%}"),
+        Column[int]("proved, of the best possible", lambda i: _format_rounded_down(curve[i].certificate)),
+    ]
+    if any(placed.curve_costs):
+        columns.append(Column("cost", lambda i: f"{placed.curve_costs[i]:g}"))
+    columns.append(Column("sites", lambda i: ", ".join(placed.curve_sites[i]), "left", wrap=True))
+    return make_table(columns, range(len(curve)))
+
+
+def _score_share(placed: Placement, joint: float) -> float:
+    """Return a joint score as a share of that of all candidates together."""
+    if not placed.together > 0:
+        return 0.0
+    return joint / placed.together
+
+
+def describe_plan(placed: Placement) -> str:
+    """Return the plan and its certificate in one sentence."""
+    joint = placed.solution.point.plan_value.joint
+    sites = ", ".join(pick.site.name for pick in placed.sensors) or "no sensor"
+    cost = f" for {placed.curve_costs[-1]:g}" if placed.curve_costs[-1] else ""
+    score = f"{placed.score} {joint:.6g}"
+    if placed.together > 0:
+        share = _score_share(placed, joint)
+        score += f", {share:.1%} of the score of all {placed.candidates} candidates together"
+    return f"{sites}{cost}: {score}; {_describe_proof(placed)}"
+
+
+def _describe_proof(placed: Placement) -> str:
+    solution = placed.solution
+    if solution.fewest_is_proved is not None:
+        fewer = len(placed.sensors) - 1
+        if fewer == 0:
+            return "one sensor is enough"
+        if solution.fewest_is_proved:
+            return f"proved: {fewer} sensors are not enough"
+        return f"not proved that {fewer} sensors are not enough"
+    if solution.is_best:
+        return "proved: no plan within the rules is better"
+    return f"proved: at least {_format_rounded_down(placed.certificate)} of the best possible"
+
+
+def describe_moves(placed: Placement, moves: RefinementSummary) -> str:
+    """Return what the refinement of poses changed."""
+    change = f" ({placed.joint / moves.before - 1.0:+.1%})" if moves.before > 0 else ""
+    cost = f", for {placed.cost:g}" if placed.cost else ""
+    objective = ""
+    if (moves.value_before, moves.value) != (moves.before, placed.joint):
+        objective = f"; objective {moves.value_before:.6g} before, {moves.value:.6g} after"
+    return (
+        f"refined: {placed.score} {moves.before:.6g} before, {placed.joint:.6g} after{change}{objective}{cost}; "
+        f"{moves.tried} poses tried in {moves.turns} turns and {moves.seconds:.1f} s, {moves.impossible} of them "
+        f"infeasible; the proof applies to the candidates at their original poses"
+    )
+
+
+def _format_rounded_down(share: float) -> str:
+    """Return a proved share in per cent, never rounded up."""
+    if share >= 1.0:
+        return "100 %"
+    return f"{math.floor(share * 1e4) / 1e2:.2f} %"

@@ -1,0 +1,414 @@
+"""What a command prints about runs and about what is available.
+
+Runs: ranking, files and costs of a run, findings of a check, results of a verification, a new scenario. What is
+available: sensors, effects and what they change, and the store of cached results.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.table import Table
+
+from egvs.artefacts import parquet
+from egvs.artefacts.readers import DISTINCT_PROBABILITY, PeriodRank, PeriodRanking
+from egvs.artefacts.run_folder import RunRecord
+from egvs.cli.console import NARROW, WIDE, Column, console, format_value, format_values, make_table, print_table
+from egvs.core.errors import collect_warnings
+from egvs.report import sections
+from egvs.report.formatting import SCORE_LABELS, ScoreLabel
+from egvs.report.ranking import Pole, RankedSite, companion_score, group_by_pole
+
+if TYPE_CHECKING:
+    from egvs.importers.openstreetmap import NewScenario
+    from egvs.runs.store import Store, StoreEntry
+    from egvs.sensors.sensor import Sensor
+    from egvs.stages.check import CheckReport
+    from egvs.studies.effect_study import EffectChange, EffectCost, EffectStatus
+
+_RESULT_FILE_WIDTH = 150
+_LIST_FILE_WIDTH = 160
+_ROOMY_WIDTH = 130
+"""Terminals of this width show the entropy seen as well as the score beside the one that ranks."""
+
+
+def print_run(folder: Path, record: RunRecord, *, anything_ran: bool, top: int | None = None) -> None:
+    """Print the ranking, the artefacts, and what each stage cost."""
+    out = console(_RESULT_FILE_WIDTH)
+    _print_scores(out, folder, record, top)
+    columns = [
+        Column[str]("stage", str, "left"),
+        Column[str]("artefact", lambda stage: "\n".join(_artefact_paths(folder, record, stage)), "left", wrap=True),
+        Column[str]("seconds", lambda stage: f"{record.stages[stage].cost.seconds:.2f}"),
+        Column[str]("peak MB", lambda stage: f"{record.stages[stage].cost.peak_mb:.0f}"),
+    ]
+    out.print(make_table(columns, record.stages))
+    if not anything_ran:
+        out.print("nothing to do: no input of any stage changed since the last run")
+
+
+def _artefact_paths(folder: Path, record: RunRecord, stage: str) -> list[str]:
+    return [str(folder / name) for name in record.stages[stage].artefacts]
+
+
+def print_stage(folder: Path, stage: str, record: RunRecord, *, top: int | None = None) -> None:
+    """Print the files that one stage wrote; after the score stage, the ranking too."""
+    out = console(_RESULT_FILE_WIDTH)
+    if stage == "score":
+        _print_scores(out, folder, record, top)
+    clouds = record.stages[stage].summary.get("clouds", ())
+    for path in (*_artefact_paths(folder, record, stage), *(str(folder / name) for name in clouds)):
+        out.print(path)
+
+
+def _print_scores(out: Console, folder: Path, record: RunRecord, top: int | None) -> None:
+    """Print the ranking, the best candidate of each pole, the ranking by period, and the result of an audit."""
+    sites = RankedSite.read(folder / "scores.parquet")
+    summary = record.stages["score"].summary
+    if not any(site.score > 0 for site in sites):
+        for warning in collect_warnings([summary]):
+            out.print(str(warning))
+        return
+
+    out.print(ranking_table(sites, out.width, top))
+    for line in _outcome_sentences(folder, record, sites):
+        out.print(line)
+    if top is not None and len(sites) > top:
+        out.print(f"... and {len(sites) - top} more, listed in {folder / 'scores.parquet'} and without --top")
+    if len({site.pole for site in sites}) < len(sites):
+        out.print(poles_table(sites, top))
+    by_period = PeriodRanking.read(folder)
+    if by_period is not None:
+        out.print(period_table(by_period, top))
+    if missed := summary.get("missed"):
+        out.print(missed)
+    if audit := summary.get("audit"):
+        out.print(
+            f"audit: chord lengths differ from the beam length by at most {audit['worst_sum']:.1e} of it, the longest "
+            f"gap between voxels is {audit['longest_gap_m'] * 1e6:.2f} micrometres, {audit['misplaced_chords']} chords "
+            f"are misplaced, {audit['voxels_visited_twice']} voxels are visited twice"
+        )
+
+
+def _outcome_sentences(folder: Path, record: RunRecord, sites: Sequence[RankedSite]) -> list[str]:
+    """Return what the best site achieves, and where another score prefers other sites."""
+    metadata = parquet.read_metadata(folder / "scores.parquet", "scores")
+    sentences = []
+    best = next((site for site in sites if site.rank == 1), None)
+    if best is not None and best.rank_by != "egvs":
+        sentence = f"{best.site} {best.by.sentence(best.score)}"
+        if best.by.counts_vehicles and "weights" in metadata:
+            sentence += " (weighted by class)"
+        sentences.append(sentence)
+
+    egvs_setting = sections.egvs_setting(
+        float(metadata["gamma"]),
+        metadata["grid"]["voxel_m"],
+        moving_occlusion="moving_occlusion" in record.scenario.get("effects", {}),
+    )
+    if disagreement := sections.ranking_disagreement(sites, egvs_setting):
+        sentences.append(disagreement)
+    return sentences
+
+
+def ranking_table(sites: Sequence[RankedSite], width: int = WIDE, top: int | None = None) -> Table:
+    """Return the ranking as a table.
+
+    Parameters
+    ----------
+    sites
+        All sites, in any order.
+    width
+        Width of the terminal; without poses and sensors where it is narrow.
+    top
+        How many of the best sites are listed; all for None.
+    """
+    by = _ranking_score(sites)
+    companion = companion_score(sites)
+    by_rank = sorted(sites, key=lambda site: site.rank)
+    best_score = max((site.score for site in sites), default=0.0)
+
+    columns: list[Column[RankedSite]] = [
+        Column("rank", lambda site: str(site.rank)),
+        Column("site", lambda site: site.site, "left", wrap=True),
+        Column("x m", lambda site: f"{site.x_m:.2f}", min_width=NARROW),
+        Column("y m", lambda site: f"{site.y_m:.2f}", min_width=NARROW),
+        Column("z m", lambda site: f"{site.z_m:.2f}", min_width=NARROW),
+        Column("sensor", lambda site: site.sensor, "left", min_width=NARROW),
+        _score_column(by),
+    ]
+    if any(site.egvs_se is not None for site in sites):
+        columns.append(Column("std error", lambda site: by.error(site.score, site.score_se)))
+        columns.append(Column("beats next", lambda site: _format_beats_next(site, by_rank[-1])))
+    columns.append(Column("of best", lambda site: f"{site.score / best_score:.1%}" if best_score > 0 else "-"))
+    if companion is not None:
+        columns.append(_score_column(companion))
+    if "entropy seen" not in [column.title for column in columns]:
+        min_width = 0 if companion is None else _ROOMY_WIDTH
+        columns.append(Column("entropy seen", lambda site: f"{site.entropy_seen:.1%}", min_width=min_width))
+    columns.append(Column("beams in ROI", lambda site: str(site.beams_in_roi), min_width=NARROW))
+
+    shown = by_rank[:top]
+    caption = None
+    if not all(site.is_separable for site in shown):
+        chance = f"the chance that it truly scores higher is below {DISTINCT_PROBABILITY:.0%}"
+        caption = f"~ not separable from the next site: {chance}"
+    return make_table(columns, shown, width=width, caption=caption)
+
+
+def _ranking_score(sites: Sequence[RankedSite]) -> ScoreLabel:
+    return SCORE_LABELS[sites[0].rank_by if sites else "egvs"]
+
+
+def _score_column(label: ScoreLabel) -> Column[RankedSite]:
+    return Column(label.head, lambda site: _format_score(label, site))
+
+
+def _format_score(label: ScoreLabel, site: RankedSite) -> str:
+    """Return the value of a score; the EGVS to a tenth of a bit."""
+    value = site.value_of(label.name)
+    if value is None:
+        return "-"
+    if label.name == "egvs":
+        return f"{value:.1f}"
+    return label.value(value)
+
+
+def _format_beats_next(site: RankedSite, last: RankedSite) -> str:
+    if site.beats_next is None or site is last:
+        return "-"
+    mark = "" if site.is_separable else "~ "
+    return f"{mark}{site.beats_next:.0%}"
+
+
+def poles_table(sites: Sequence[RankedSite], top: int | None = None) -> Table:
+    """Return the best candidate of each of the ``top`` poles, how it is mounted, and its lead over the worst one."""
+    by = _ranking_score(sites)
+    columns: list[Column[Pole]] = [
+        Column("rank", lambda pole: str(pole.best.rank)),
+        Column("pole", lambda pole: pole.name, "left", wrap=True),
+        Column("best candidate", lambda pole: pole.best.site, "left", wrap=True),
+        Column("z m", lambda pole: f"{pole.best.z_m:g}"),
+        Column("yaw deg", lambda pole: f"{pole.best.yaw_deg:.1f}"),
+        Column("pitch deg", lambda pole: f"{pole.best.pitch_deg:.1f}"),
+        Column(by.head, lambda pole: _format_score(by, pole.best)),
+        Column("candidates", lambda pole: str(len(pole.sites))),
+        Column("beats worst by", lambda pole: "-" if pole.gain is None else f"{pole.gain:.1%}"),
+    ]
+    poles = group_by_pole(sorted(sites, key=lambda site: site.rank))
+    return make_table(columns, poles[:top], title="best candidate of each pole")
+
+
+def period_table(by_period: PeriodRanking, top: int | None = None) -> Table:
+    """Return the ``top`` sites by their rank in the mix, with rank and share of the best in each period."""
+    columns: list[Column[_PeriodRow]] = [
+        Column("mix", lambda row: str(row[1])),
+        Column("site", lambda row: row[0], "left", wrap=True),
+    ]
+    for number, name in enumerate(by_period.periods):
+        columns.append(Column(name, partial(_format_period, number)))
+    weights = zip(by_period.periods, by_period.shares, strict=True)
+    mix = ", ".join(f"{name} {share:.1%}" for name, share in weights)
+    caption = f"rank and share of the best in each period; in the mix: {mix}"
+    return make_table(columns, by_period.sites[:top], caption=caption)
+
+
+_PeriodRow = tuple[str, int, tuple[PeriodRank, ...]]
+"""Site, rank in the mix, and ranks in each period."""
+
+
+def _format_period(number: int, row: _PeriodRow) -> str:
+    result = row[2][number]
+    return f"{result.rank} ({result.of_best:.1%})"
+
+
+def print_verification(folder: Path, differences: list[str]) -> None:
+    """Print every difference that ``egvs verify`` found."""
+    out = console(_RESULT_FILE_WIDTH)
+    for line in differences:
+        out.print(f"{folder}: {line}")
+    if not differences:
+        out.print(f"{folder}: every artefact is unaltered, and a second run produces the same bytes")
+
+
+def print_check(checked: CheckReport) -> None:
+    """Print all findings of a check: errors first, grouped by rule."""
+    out = console(_RESULT_FILE_WIDTH)
+    for severity, findings in (("error", checked.errors), ("warning", checked.warnings)):
+        if not findings:
+            continue
+        plural = "s" if len(findings) > 1 else ""
+        out.print(f"{len(findings)} {severity}{plural}")
+        for rule in dict.fromkeys(finding.rule for finding in findings):
+            out.print(f"  {rule}")
+            for finding in findings:
+                if finding.rule == rule:
+                    out.print(f"    {finding}")
+    if not checked.findings:
+        out.print("no errors and no warnings")
+    out.print(f"checked {checked.sites} sites, {checked.solids} solids and {checked.lanes} lanes")
+
+
+def print_new_scenario(scenario: NewScenario) -> None:
+    """Print what ``egvs new`` created."""
+    out = console(_RESULT_FILE_WIDTH)
+    description = scenario.to_json()
+    for key, value in description.items():
+        text = format_values(value) if isinstance(value, dict) else format_value(value)
+        out.print(f"{key}: {text}")
+    hourly = description["assumed_traffic"]["vehicles_per_hour"]
+    out.print(
+        f"warning: the traffic is assumed ({hourly:,} vehicles an hour) and affects the ranking. "
+        f"Enter counted traffic under [traffic] of {scenario.folder / 'scenario.toml'} before you rely on it."
+    )
+    out.print(f"next: egvs run {scenario.folder}")
+
+
+def print_sensors(sensors: Iterable[Sensor]) -> None:
+    """Print the sensor catalogue."""
+    columns: list[Column[Sensor]] = [
+        Column("sensor", lambda sensor: sensor.name, "left"),
+        Column("rings", lambda sensor: str(sensor.channels or "-")),
+        Column("elevation deg", lambda sensor: _format_span(sensor.elevation_span_deg)),
+        Column("azimuth deg", lambda sensor: _format_span(sensor.azimuth_span_deg)),
+        Column("step deg", lambda sensor: "-" if sensor.azimuth_step_deg is None else f"{sensor.azimuth_step_deg:.6g}"),
+        Column("beams", lambda sensor: str(sensor.beams)),
+        Column("range m", lambda sensor: f"{sensor.range_m:g}"),
+        Column("rated m", _format_rating),
+        Column("source", _format_sensor_source, "left", wrap=True),
+    ]
+    print_table(columns, sensors, file_width=_LIST_FILE_WIDTH)
+
+
+def _format_span(span_deg: tuple[float, float] | None) -> str:
+    if span_deg is None:
+        return "360"
+    return f"{span_deg[0]:.4g} to {span_deg[1]:.4g}"
+
+
+def _format_rating(sensor: Sensor) -> str:
+    if sensor.rated_range_m is None:
+        return "-"
+    return f"{sensor.rated_range_m:g} at {sensor.rated_reflectivity:.0%}"
+
+
+def _format_sensor_source(sensor: Sensor) -> str:
+    if not sensor.assumed:
+        return sensor.source
+    return f"{sensor.source}. Assumed: {sensor.assumed}"
+
+
+def print_effects(effects: Sequence[EffectStatus], costs: Mapping[str, EffectCost] | None = None) -> None:
+    """Print effects, whether they are on, and why; what each costs and changes, if a study measured it."""
+    columns: list[Column[EffectStatus]] = [
+        Column("effect", lambda effect: effect.name, "left"),
+        Column("acts in", lambda effect: effect.stage, "left", wrap=True, min_width=NARROW),
+        Column("kind", lambda effect: effect.kind, "left", wrap=True, min_width=NARROW),
+        Column("state", lambda effect: effect.state, "left", wrap=True),
+        Column("why", lambda effect: effect.why, "left", wrap=True),
+    ]
+    if any(effect.change for effect in effects):
+        columns.append(Column("expected change", lambda effect: effect.change, "left", wrap=True))
+    if costs is not None:
+        columns.append(Column("costs", lambda effect: _format_cost(costs.get(effect.name)), "left"))
+        columns.append(Column("changes", lambda effect: _format_cost_change(costs.get(effect.name)), "left", wrap=True))
+    columns.append(Column("source", lambda effect: effect.source, "left", wrap=True, min_width=NARROW))
+    print_table(columns, effects, file_width=_LIST_FILE_WIDTH)
+
+
+def _format_cost(cost: EffectCost | None) -> str:
+    if cost is None:
+        return ""
+    return f"{cost.seconds:+.2f} s"
+
+
+def _format_cost_change(cost: EffectCost | None) -> str:
+    if cost is None:
+        return ""
+    best = "same best site" if cost.regret == 0 else f"another best site, regret {cost.regret:.2%}"
+    return f"scores by up to {cost.change:.1%}; {best}; tau {cost.tau:.2f}"
+
+
+def print_ablation(changes: Sequence[EffectChange]) -> None:
+    """Print by how much each effect changes the scores of the plain scene, which is the first of ``changes``."""
+    plain = changes[0]
+    columns = [
+        Column[int]("site", lambda row: "seconds" if row < 0 else plain.sites[row], "left"),
+        Column[int]("plain, bit", lambda row: _format_plain(plain, row)),
+    ]
+    columns += [Column(change.effect, partial(_format_change, plain, change)) for change in changes[1:]]
+    title = "change of each site's score against the plain scene (rank, where it changes)"
+    rows = [*range(len(plain.sites)), _SECONDS_ROW]
+    out = console(_LIST_FILE_WIDTH, soft_wrap=False)
+    out.print(make_table(columns, rows, title=title, truncate=True))
+
+
+_SECONDS_ROW = -1
+"""Row of the ablation table that holds seconds, below those of the sites."""
+
+
+def _format_plain(plain: EffectChange, row: int) -> str:
+    if row == _SECONDS_ROW:
+        return f"{plain.seconds:.2f}"
+    return f"{plain.scores[row]:.1f} ({plain.ranks[row]})"
+
+
+def _format_change(plain: EffectChange, change: EffectChange, row: int) -> str:
+    """Return the relative change of a score, and the ranks before and after where they differ."""
+    if row == _SECONDS_ROW:
+        return f"{change.seconds:.2f}"
+    percent = math.nan
+    if plain.scores[row]:
+        percent = 100 * (change.scores[row] / plain.scores[row] - 1)
+    if change.ranks[row] == plain.ranks[row]:
+        return f"{percent:+.2f} %"
+    return f"{percent:+.2f} % ({plain.ranks[row]} to {change.ranks[row]})"
+
+
+def print_store(store: Store) -> None:
+    """Print the entries of the store, last used first, and their total."""
+    if store.folder is None:
+        console(120).print("EGVS_STORE is empty: results are not cached")
+        return
+    entries = store.entries()
+    now = time.time()
+    columns: list[Column[StoreEntry]] = [
+        Column("stage", lambda entry: entry.stage, "left"),
+        Column("key", lambda entry: entry.key[:12], "left"),
+        Column("size", lambda entry: _format_size(entry.bytes)),
+        Column("age", lambda entry: _format_age(now - entry.created)),
+        Column("last used", lambda entry: f"{_format_age(now - entry.last_used)} ago"),
+    ]
+    out = console(120)
+    out.print(make_table(columns, entries, truncate=True))
+    out.print(f"{store.folder}: {_format_total(entries)}, of at most {_format_size(store.bound_bytes)}")
+
+
+def print_removed(store: Store, removed: list[StoreEntry]) -> None:
+    """Print what was removed from the store, and what is left."""
+    print(f"{store.folder}: removed {_format_total(removed)}; {_format_total(store.entries())} are left")
+
+
+def _format_total(entries: list[StoreEntry]) -> str:
+    size = sum(entry.bytes for entry in entries)
+    return f"{len(entries)} entries, {_format_size(size)}"
+
+
+def _format_size(size_bytes: float) -> str:
+    for unit, unit_bytes in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6), ("KB", 1e3)):
+        if size_bytes >= unit_bytes:
+            return f"{size_bytes / unit_bytes:.3g} {unit}"
+    return f"{size_bytes:.3g} B"
+
+
+def _format_age(seconds: float) -> str:
+    for unit, unit_s in (("d", 86400), ("h", 3600), ("min", 60)):
+        if seconds >= unit_s:
+            return f"{seconds / unit_s:.0f} {unit}"
+    return f"{max(seconds, 0):.0f} s"

@@ -1,0 +1,159 @@
+"""One line per finished stage of a run: its name, its duration, and what it produced.
+
+The numbers come from the stage's summary in ``run.json``. Keys without a sentence of their own are printed as they are,
+so that a new key is never lost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from egvs.artefacts.run_folder import StageRecord
+from egvs.core.errors import WARNINGS_KEY
+from egvs.report.formatting import SCORE_LABELS
+
+_OMITTED_KEYS = frozenset(
+    ("flags", "missed", "overlapping_pairs", "rows", "settled_in_float64", "solids", "sumo_seconds", WARNINGS_KEY)
+)
+"""Entries of a summary that are printed elsewhere, or that only ``run.json`` holds."""
+
+_STAGE_NAMES = {"tpog": "occupancy"}
+"""Stages that are called otherwise than their command."""
+
+
+def stage_lines(stage: str, state: str, record: StageRecord) -> Iterator[str]:
+    """Yield the line of a stage, then one line for each period of its traffic."""
+    duration = f"{record.cost.seconds:.1f} s"
+    if state == "skipped":
+        duration = "unchanged"
+    elif state == "fetched":
+        duration = "from store"
+
+    summary = dict(record.summary)
+    periods = {}
+    if stage == "traffic":
+        periods = summary.pop("periods", {})
+    yield f"{_STAGE_NAMES.get(stage, stage):<10} {duration:>10}   {describe_summary(stage, summary)}"
+    for name, period in periods.items():
+        yield f"{name:>21}   {describe_summary(stage, period)}"
+
+
+def describe_summary(stage: str, summary: dict[str, Any]) -> str:
+    """Return the summary of a stage in one line."""
+    from egvs.cli.console import format_values
+
+    rest = {key: value for key, value in summary.items() if key not in _OMITTED_KEYS}
+    sentences: list[str] = []
+    if stage in _SENTENCES and _REQUIRED_KEYS[stage] <= summary.keys():
+        sentences += _SENTENCES[stage](rest, summary)
+    if rest_text := format_values(rest):
+        sentences.append(rest_text)
+    return "; ".join(sentences)
+
+
+def _check_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[str]:
+    sites, solids, lanes = rest.pop("sites"), summary["solids"], rest.pop("lanes")
+    yield f"{_count(sites, 'site')}, {_count(solids, 'solid')} and {_count(lanes, 'lane')} checked"
+
+
+def _statics_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[str]:
+    yield f"{rest.pop('triangles'):,} triangles in {_count(summary['solids'], 'solid')}"
+    if repaired := rest.pop("mended", None):
+        yield "repaired: " + _describe_counts(repaired)
+    if ignored := rest.pop("left_out", None):
+        yield "left out: " + _describe_counts(ignored)
+
+
+def _scan_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[str]:
+    yield f"{_count(rest.pop('sites'), 'site')} scanned"
+    if not rest.pop("kept", True):
+        yield "scans not kept"
+    elif "beams" in rest:
+        yield f"{rest.pop('returns'):,} returns from {rest.pop('beams'):,} beams towards the region"
+
+
+def _traffic_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[str]:
+    yield _count(rest.pop("frames"), "frame")
+    if "vehicles" in rest:
+        yield describe_vehicles(rest.pop("vehicles"))
+        yield f"mean speed {3.6 * rest.pop('mean_speed_m_s'):.0f} km/h"
+        yield f"{rest.pop('share_standing'):.0%} of the time standing, {rest.pop('longest_standing_s'):g} s at most"
+        yield f"vehicles overlap in {_count(rest.pop('frames_with_overlap'), 'frame')}"
+    if rest.get("collisions") is not None:
+        yield _count(rest.pop("collisions"), "collision")
+    if counts := rest.pop("counts", None):
+        worst = max(count["geh"] for count in counts)
+        yield f"largest GEH against the counts {worst:.1f}"
+    if sumo := rest.pop("sumo", None):
+        yield f"SUMO {sumo}"
+
+
+def _tpog_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[str]:
+    yield f"{_count(rest.pop('occupied_voxels'), 'voxel')} occupied at some time"
+    yield f"{rest.pop('static_voxels'):,} filled by static solids"
+    yield f"{rest.pop('boxes_in_roi'):.1f} vehicles in the region on average"
+    memory = rest.pop("memory_frames")
+    if isinstance(memory, float):
+        memory = f"{memory:.4g}"
+    yield f"autocorrelation time {memory} frames"
+
+
+def _score_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[str]:
+    best = rest.pop("best")
+    by = SCORE_LABELS[rest.pop("rank_by")]
+    limit = rest.pop("egvs_limit")
+    yield f"{_count(rest.pop('sites'), 'site')} ranked by {by.noun}"
+    if best:
+        yield f"best: {', '.join(best)}"
+    if by.name == "egvs":
+        yield f"upper limit {float(limit):,.0f} bit"
+    if errors := rest.pop("standard_errors_from", None):
+        yield f"standard errors from {errors}"
+
+
+def _report_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[str]:
+    rest.pop("best", None)
+    rest.pop("worst", None)
+    yield f"{rest.pop('kilobytes'):,} kB"
+
+
+_SENTENCES: dict[str, Callable[[dict[str, Any], dict[str, Any]], Iterator[str]]] = {
+    "check": _check_sentences,
+    "statics": _statics_sentences,
+    "scan": _scan_sentences,
+    "traffic": _traffic_sentences,
+    "tpog": _tpog_sentences,
+    "score": _score_sentences,
+    "report": _report_sentences,
+}
+"""Each takes the keys that it prints out of its first argument."""
+
+_REQUIRED_KEYS = {
+    "check": {"sites", "solids", "lanes"},
+    "statics": {"triangles", "solids"},
+    "scan": {"sites"},
+    "traffic": {"frames"},
+    "tpog": {"occupied_voxels", "static_voxels", "boxes_in_roi", "memory_frames"},
+    "score": {"sites", "best", "rank_by", "egvs_limit"},
+    "report": {"kilobytes"},
+}
+"""Without these, a summary is printed as it is."""
+
+
+def describe_vehicles(vehicles: dict[str, int]) -> str:
+    """Return how many vehicles there are at a time and in all."""
+    fewest, most = vehicles["fewest"], vehicles["most"]
+    range_text = f"{most:,}"
+    if fewest != most:
+        range_text = f"{fewest:,} to {most:,}"
+    return f"{range_text} vehicles at a time, {vehicles['different']:,} in all"
+
+
+def _describe_counts(counts: dict[str, int]) -> str:
+    return ", ".join(f"{count:,} {what.replace('_', ' ')}" for what, count in counts.items())
+
+
+def _count(number: int, noun: str) -> str:
+    plural = "" if number == 1 else "s"
+    return f"{number:,} {noun}{plural}"

@@ -1,0 +1,298 @@
+"""What ``egvs scores``, ``clouds``, ``validate`` and ``train`` print, and the progress of detector runs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from egvs.cli.console import Column, console, print_table
+from egvs.report.formatting import SCORE_LABELS
+from egvs.scenario.score_config import DEFAULT_SCORE
+from egvs.validation.detection_metrics import ALL_OBJECTS
+from egvs.validation.detector_runs import DetectionListener
+from egvs.validation.results import main_measure
+from egvs.validation.sweeps import POINT_COUNTS_NAME
+
+if TYPE_CHECKING:
+    from egvs.core.runtime import ResourceUsage
+    from egvs.scenario.model import Scenario
+    from egvs.validation.correlation import Correlation
+    from egvs.validation.dataset import WrittenDataset
+    from egvs.validation.detection_metrics import JackknifeEstimate
+    from egvs.validation.plan_validation import PlanValidation
+    from egvs.validation.results import ScoreName, Validation
+    from egvs.validation.surrogates import ParameterValue, ScoreEntry
+
+_FILE_WIDTH = 160
+
+FRAME_MS = {"points": 4.0, "cluster": 17.0, "pointpillars": 80.0}
+"""Time per frame of 57,600 beams and detector, measured on one core of a small cloud machine; ``points`` is the
+simulation of the cloud."""
+
+SITE_S = 0.5
+"""Time of the empty scan of a site."""
+
+_MEASURE_TITLES = {"ap_combined_r40_iou70": "AP BEV + 3D, %", "seen_20": "vehicles with 20 points, %"}
+
+
+def print_scores(entries: Iterable[ScoreEntry]) -> None:
+    """Print all scores with formula and source; for a score that cannot be loaded, the reason."""
+    columns: list[Column[ScoreEntry]] = [
+        Column("score", lambda entry: entry.name, "left"),
+        Column("formula", _format_formula, "left", wrap=True),
+        Column("better", _format_direction, "left"),
+        Column("tried with", _format_sweep, "left", wrap=True),
+        Column("source", _format_source, "left", wrap=True),
+    ]
+    print_table(columns, entries, file_width=_FILE_WIDTH)
+    others = ", ".join(name for name in SCORE_LABELS if name != DEFAULT_SCORE)
+    console(_FILE_WIDTH, soft_wrap=False).print(
+        f"[score] rank_by chooses the score that ranks sites: {DEFAULT_SCORE} (recommended), {others}"
+    )
+
+
+def _format_formula(entry: ScoreEntry) -> str:
+    return entry.problem if entry.score is None else entry.score.formula
+
+
+def _format_direction(entry: ScoreEntry) -> str:
+    if entry.score is None:
+        return "broken"
+    return "more" if entry.score.sign > 0 else "less"
+
+
+def _format_source(entry: ScoreEntry) -> str:
+    if entry.score is None:
+        return ""
+    if entry.package:
+        return f"{entry.score.source} (package {entry.package})"
+    return entry.score.source
+
+
+def _format_sweep(entry: ScoreEntry) -> str:
+    """Return the values of each parameter that the validation tries."""
+    parts = []
+    sweep = {} if entry.score is None else entry.score.sweep
+    for name, values in sweep.items():
+        parts.append(f"{name} {', '.join(map(_format_parameter, values))}")
+    return "; ".join(parts)
+
+
+def _format_parameter(value: ParameterValue) -> str:
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    if isinstance(value, float):
+        return f"{value:g}"
+    return str(value)
+
+
+def print_validation(scenario: Scenario, out: Path, validation: Validation) -> None:
+    """Print what each detector finds from each site, and how well scores predict it."""
+    score = validation.egvs_score(scenario)
+    egvs = validation.values_of(score)
+    sites = sorted(egvs, key=lambda site: -egvs[site])
+    detectors = list(dict.fromkeys(row.detector for row in validation.detections))
+    detections = {(row.site, row.detector): row for row in validation.detections if row.objects_of == ALL_OBJECTS}
+
+    def format_detection(detector: str, site: str) -> str:
+        return _format_percent(detections[site, detector].measures[main_measure(detector)])
+
+    columns = [
+        Column[str]("site", str, "left"),
+        Column[str]("EGVS, kbit", lambda site: f"{egvs[site] / 1e3:.1f}", wrap=True),
+    ]
+    for detector in detectors:
+        title = f"{detector}: {_MEASURE_TITLES[main_measure(detector)]}"
+        columns.append(Column(title, partial(format_detection, detector), wrap=True))
+    print_table(columns, sites, file_width=_FILE_WIDTH)
+    _print_sample(next(iter(detections.values())))
+    print()
+    _print_agreement(validation, score, detectors)
+    for warning in validation.warnings:
+        print(f"warning: {warning}")
+    print(f"{out}: detection.parquet, surrogates.parquet, correlation.parquet, validation.png")
+    if validation.report:
+        print(validation.report)
+
+
+def _print_sample(detection: Any) -> None:
+    """Print the size of the held-out traffic."""
+    print(f"{detection.objects} vehicles in {detection.frames} frames of held-out traffic; ± is a standard error")
+
+
+def _print_agreement(validation: Validation, scenario_score: ScoreName, detectors: Sequence[str]) -> None:
+    """Print Spearman's rho of detection with each score; of the scenario's score, only with its own parameters."""
+    names = [name for name in validation.scores if name == scenario_score or name.score != scenario_score.score]
+
+    def format_rho(detector: str, score: ScoreName) -> str:
+        agreement = validation.agreement(score, detector, main_measure(detector))
+        return _format_interval(agreement.by_kind["spearman"])
+
+    columns: list[Column[ScoreName]] = [Column("Spearman's rho with detection", str, "left")]
+    columns += [Column(detector, partial(format_rho, detector)) for detector in detectors]
+    print_table(columns, names, file_width=_FILE_WIDTH)
+
+
+def _format_interval(correlation: Correlation) -> str:
+    if not math.isfinite(correlation.value):
+        return "-"
+    interval = correlation.interval
+    if not math.isfinite(interval.low):
+        return f"{correlation.value:.2f}"
+    return f"{correlation.value:.2f} ({interval.low:.2f} to {interval.high:.2f})"
+
+
+_BOX_COLUMNS = {
+    "AP BEV .7, %": "ap_bev_r40_iou70",
+    "3D .7": "ap_3d_r40_iou70",
+    "BEV .5": "ap_bev_r40_iou50",
+    "3D .5": "ap_3d_r40_iou50",
+}
+_POINT_COLUMNS = {"seen with 1 point, %": "seen_1", "5": "seen_5", "20": "seen_20"}
+
+
+def print_plan_validation(validation: PlanValidation) -> None:
+    """Print what each detector finds with 1, 2, ... sensors, and the gain from the last one."""
+    rows = [row for row in validation.rows if row.detection.objects_of == ALL_OBJECTS]
+    for detector in dict.fromkeys(row.detection.detector for row in rows):
+        measures, gain_measure = _BOX_COLUMNS, "BEV + 3D .7"
+        if detector == POINT_COUNTS_NAME:
+            measures, gain_measure = _POINT_COLUMNS, "seen_20"
+        columns: list[Column[Any]] = [
+            Column(detector, lambda row: str(len(row.sites))),
+            Column("with", lambda row: f"+ {row.sites[-1]}" if len(row.sites) > 1 else row.sites[0], "left"),
+        ]
+        for title, measure in measures.items():
+            columns.append(Column(title, partial(_format_measure, measure)))
+        columns.append(Column(f"gain, {gain_measure}", _format_gain))
+        detector_rows = [row for row in rows if row.detection.detector == detector]
+        print_table(columns, detector_rows, file_width=_FILE_WIDTH)
+    _print_sample(rows[0].detection)
+    print(f"fused clouds of the plan by {validation.plan.score} in {validation.plan.path}; gain: over one sensor less")
+    for warning in validation.warnings:
+        print(f"warning: {warning}")
+    print(validation.path)
+
+
+def _format_measure(measure: str, row: Any) -> str:
+    return _format_percent(row.detection.measures[measure])
+
+
+def _format_gain(row: Any) -> str:
+    if len(row.sites) == 1:
+        return ""
+    return _format_percent(row.gain)
+
+
+def _format_percent(estimate: JackknifeEstimate) -> str:
+    return f"{100 * estimate.value:.1f} ± {100 * estimate.se:.1f}"
+
+
+def print_training(out: Path, metadata: Mapping[str, Any]) -> None:
+    """Print the average precision on held-out frames during training."""
+    columns = [Column[dict[str, Any]]("step", lambda entry: str(entry["step"]))]
+    measures = ("ap_bev_r40_iou70", "ap_3d_r40_iou70", "ap_bev_r40_iou50", "recall_bev_iou50")
+    columns += [Column(name, partial(_format_precision, name)) for name in measures]
+    print_table(columns, metadata["curve"], file_width=_FILE_WIDTH)
+    print(f"{out}: {metadata['parameters']:,} parameters, trained on {', '.join(metadata['junctions'])}")
+
+
+def _format_precision(name: str, entry: Mapping[str, float]) -> str:
+    return f"{entry[name]:.1%}"
+
+
+def print_export(dataset: WrittenDataset) -> None:
+    """Print what was written for each site."""
+    columns: list[Column[Any]] = [
+        Column("site", lambda site: site.site, "left"),
+        Column("sensor", lambda site: site.sensor, "left", wrap=True),
+        Column("frames", lambda site: str(site.frames)),
+        Column("points", lambda site: str(site.points)),
+        Column("labelled boxes", lambda site: str(site.labelled), wrap=True),
+        Column("vehicles in region", lambda site: str(site.in_roi), wrap=True),
+        Column("of them labelled", lambda site: str(site.in_roi_labelled), wrap=True),
+    ]
+    print_table(columns, dataset.sites, file_width=_FILE_WIDTH)
+    print(f"{dataset.folder}/README.md describes the files ({dataset.kind})")
+
+
+class DetectorRunDisplay(DetectionListener):
+    """Prints the progress of detector runs in lines.
+
+    Parameters
+    ----------
+    say
+        Prints a line.
+    """
+
+    NOUN = "site"
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._say = say
+
+    def clouds(self, name: str) -> int:
+        """Return how many sensors a site or group has."""
+        del name
+        return 1
+
+    def begins(self, missing: Mapping[str, Sequence[str]], frames: int, processes: int) -> None:
+        """Print how much is left to do, and an estimate of the time.
+
+        Parameters
+        ----------
+        missing
+            Detectors that have to run, by site; none for a site whose results are cached.
+        frames
+            Frames per site.
+        processes
+            Worker processes.
+        """
+        pending = {site: detectors for site, detectors in missing.items() if detectors}
+        if not pending:
+            self._say(f"all detections from {len(missing)} {self.NOUN}s were cached")
+            return
+
+        detectors = list(dict.fromkeys(name for names in pending.values() for name in names))
+        clouds = sum(self.clouds(site) for site in pending)
+        runs = {name: sum(name in names for names in pending.values()) for name in detectors}
+        runs["points"] = clouds  # every detector needs the clouds
+        frame_ms = sum(FRAME_MS.get(name, 0.0) * count for name, count in runs.items())
+        seconds = SITE_S * clouds + 1e-3 * frames * frame_ms
+
+        estimate = f"about {_format_duration(seconds / processes)} with a VLP-32C"
+        if unknown := [name for name in detectors if name not in FRAME_MS]:
+            estimate += f", plus the time of {', '.join(unknown)}"
+        cached = ""
+        if len(pending) < len(missing):
+            cached = f" ({len(missing) - len(pending)} of {len(missing)} were cached)"
+        sites = _count(len(pending), self.NOUN)
+        workers = f"{processes} process{'es' if processes > 1 else ''}"
+        self._say(f"{frames} frames from {sites}{cached}, {', '.join(detectors)}, {workers}: {estimate}")
+
+    def site_done(self, site: str, detectors: Sequence[str], cost: ResourceUsage) -> None:
+        """Print one line per site."""
+        self._say(f"{cost.seconds:>8.1f} s   {site}: {', '.join(detectors)}")
+
+
+class PlanRunDisplay(DetectorRunDisplay):
+    """Prints the progress of detector runs on groups of sites."""
+
+    NOUN = "group"
+
+    def clouds(self, name: str) -> int:
+        """Return how many sensors are in a group."""
+        return name.count(" + ") + 1
+
+
+def _count(number: int, noun: str) -> str:
+    plural = "s" if number > 1 else ""
+    return f"{number} {noun}{plural}"
+
+
+def _format_duration(seconds: float) -> str:
+    if seconds < 120.0:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60.0:.0f} min"

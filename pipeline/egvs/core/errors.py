@@ -1,0 +1,213 @@
+"""The errors that reach a user, and diagnostics: errors and warnings about a scenario or a run.
+
+Every error that reaches a user is an :class:`EgvsError`. Its text names the file, the key or row, what is wrong, and
+what to do. ``exit_code`` is the exit code of the command line.
+
+A :class:`Diagnostic` is an error or a warning about a scenario. A stage stores its warnings in its summary under
+:data:`WARNINGS_KEY`, in the form that :meth:`Diagnostic.to_json` returns.
+
+:func:`find_misspelling` finds the known name that a user may have meant.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+MAX_LINE_LENGTH, MAX_LINES = 600, 200
+"""Limits of a message in characters and lines."""
+
+_CONTROL_CHARACTERS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+"""Characters that control a terminal, and lone surrogates, which cannot be encoded."""
+
+
+class EgvsError(Exception):
+    """Base of all errors that this program raises on purpose."""
+
+    exit_code = 1
+
+
+class InputError(EgvsError):
+    """The user's input is wrong: a scenario, a file that it names, an option, or an artefact that was altered.
+
+    Parameters
+    ----------
+    where
+        File and, where known, the key or row, e.g. ``"scenario.toml: roi.voxel_m"``.
+    problem
+        What is wrong, e.g. ``"expected a length above 0 m, got -0.25"``.
+    hint
+        What to do, as a sentence, e.g. ``"Use a length such as 0.25."``.
+    """
+
+    exit_code = 2
+
+    def __init__(self, where: object, problem: str, hint: str = "") -> None:
+        self.where = truncate_text(str(where))
+        self.problem = truncate_text(problem)
+        self.hint = truncate_text(hint)
+        super().__init__(format_problem(self.where, self.problem, self.hint))
+
+    def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
+        return InputError, (self.where, self.problem, self.hint)  # for another process
+
+
+class RunError(EgvsError):
+    """The input is valid, but the run could not do what it asks for (for example: N vehicles in every frame)."""
+
+
+class MissingBackendError(RunError):
+    """A program or library that the run needs is not installed or cannot start."""
+
+
+class MissingExtraError(MissingBackendError):
+    """A feature needs the libraries of an extra of this package that is not installed."""
+
+    exit_code = InputError.exit_code
+
+
+def format_problem(where: str, problem: str, hint: str = "") -> str:
+    """Return ``WHERE: PROBLEM. HINT``."""
+    if not hint:
+        return f"{where}: {problem}"
+    if hint[0].isupper():
+        return f"{where}: {problem}. {hint}"
+    return f"{where}: {problem}; {hint}"
+
+
+def truncate_text(text: str) -> str:
+    """Shorten a text to the length of a message, and escape control characters."""
+    lines = text.split("\n")
+    short = [_truncate_line(line) for line in lines[:MAX_LINES]]
+    if len(lines) > MAX_LINES:
+        short.append(f"... and {len(lines) - MAX_LINES:,} more")
+    return "\n".join(short)
+
+
+def _truncate_line(line: str) -> str:
+    if len(line) > MAX_LINE_LENGTH:
+        end = MAX_LINE_LENGTH // 4
+        line = f"{line[: MAX_LINE_LENGTH - end]} ... ({len(line):,} characters) ... {line[-end:]}"
+    return _CONTROL_CHARACTERS.sub(lambda match: match[0].encode("unicode_escape").decode("ascii"), line)
+
+
+WARNINGS_KEY = "warnings"
+"""The key of a stage's summary that holds its warnings."""
+
+
+@dataclass(frozen=True)
+class Diagnostic:
+    """An error or a warning: what the user should know before trusting a ranking.
+
+    Attributes
+    ----------
+    rule
+        Name of the rule, e.g. ``"sites on lanes"``. It never changes.
+    where
+        File and key or row, or coordinates in the world frame.
+    problem
+        What is wrong, with numbers.
+    hint
+        What to do about it.
+    is_error
+        Whether it stops the run.
+    """
+
+    rule: str
+    where: str
+    problem: str
+    hint: str
+    is_error: bool = False
+
+    def __str__(self) -> str:
+        return format_problem(self.where, self.problem, self.hint)
+
+    @classmethod
+    def of(cls, rule: str, error: InputError) -> Diagnostic:
+        """Convert an InputError."""
+        return cls(rule, error.where, error.problem, error.hint, is_error=True)
+
+    def to_json(self) -> dict[str, Any]:
+        """The form in a stage's summary."""
+        return asdict(self)
+
+
+def collect_warnings(summaries: Iterable[Mapping[str, Any]]) -> list[Diagnostic]:
+    """Return the warnings in the summaries of stages, in their order."""
+    return [Diagnostic(**value) for summary in summaries for value in summary.get(WARNINGS_KEY, ())]
+
+
+def with_relative_paths(folder: Path, summary: dict[str, Any]) -> dict[str, Any]:
+    """Return a stage's summary with the files in its warnings relative to the scenario's folder.
+
+    Reports and cached results must not depend on where that folder is.
+    """
+    prefix = f"{folder}{os.sep}"
+    warnings = [w | {"where": w["where"].removeprefix(prefix)} for w in summary.get(WARNINGS_KEY, ())]
+    if not warnings:
+        return summary
+    return summary | {WARNINGS_KEY: warnings}
+
+
+class DiagnosticsError(InputError):
+    """All errors that prevent a run, at least one.
+
+    Parameters
+    ----------
+    findings
+        The errors.
+    warnings
+        Warnings that were found as well.
+    """
+
+    def __init__(self, findings: Iterable[Diagnostic], warnings: Iterable[Diagnostic] = ()) -> None:
+        self.findings = tuple(findings)
+        self.warnings = tuple(warnings)
+        first, *others = self.findings
+        super().__init__(first.where, first.problem, "\n".join([first.hint, *map(str, others)]))
+
+
+_UNIT_SUFFIX = re.compile(r"[_ ]?(m|deg|rad)$")
+_MIN_SIMILARITY = 0.8
+"""Names that share more of their letters than this are similar."""
+
+
+def find_misspelling(names: Iterable[str], known: Collection[str]) -> tuple[str, str] | None:
+    """Find the first unknown name that is similar to a known one.
+
+    Similar: equal except for the unit, or for a letter or two (``yaw``, ``Yaw_deg`` and ``yaw_dge`` for ``yaw_deg``).
+
+    Parameters
+    ----------
+    names
+        The names that a user wrote.
+    known
+        The names that are allowed; those that are among ``names`` already are not suggested.
+
+    Returns
+    -------
+    tuple of str, or None
+        The unknown name, and the known one.
+    """
+    given = list(names)
+    missing = {name.lower(): name for name in known if name not in given}
+    stems = {_UNIT_SUFFIX.sub("", low): name for low, name in missing.items()}
+    for name in given:
+        if name in known:
+            continue
+        low = name.strip().lower()
+        near = difflib.get_close_matches(low, missing, 1, _MIN_SIMILARITY)
+        if meant := stems.get(_UNIT_SUFFIX.sub("", low)):
+            return name, meant
+        if near and _similarity(low, near[0]) > _MIN_SIMILARITY:
+            return name, missing[near[0]]
+    return None
+
+
+def _similarity(a: str, b: str) -> float:
+    return difflib.SequenceMatcher(None, b, a).ratio()

@@ -1,0 +1,263 @@
+"""Atomic writing, temporary folders, hashes, and JSON records with a checksum.
+
+A file is first written to ``.<name>.partial``, then renamed, so that a killed run leaves no half-written artefact.
+Temporary folders are locked while they are in use, so that the next program removes those of a killed one.
+
+Records of this program contain their own hash, so that any damage is noticed. The checksum is no signature: whoever may
+write the file can compute it anew.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import hashlib
+import io
+import json
+import math
+import os
+import shutil
+import stat
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from egvs.core.errors import InputError
+
+DISK_FULL_ERRNOS = (errno.ENOSPC, errno.EDQUOT)
+"""Error numbers of a full disk or an exhausted quota."""
+
+_TEMP_PREFIX, _MAX_ATTEMPTS = "egvs-work-", 10
+
+
+@contextmanager
+def attach_filename(path: Path) -> Iterator[None]:
+    """Name the file in the error of a full disk, which Python and Arrow leave out."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in DISK_FULL_ERRNOS and error.filename is None:
+            error.filename = str(path)
+        raise
+
+
+@contextmanager
+def atomic_write(path: Path) -> Iterator[Path]:
+    """Yield a path to write to; rename it to ``path`` when the block ends well, remove it when it does not."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.partial")
+    _check_not_folder(path)
+    partial.unlink(missing_ok=True)  # of a killed run, or a link, which must not be followed
+    try:
+        with attach_filename(path):
+            yield partial
+        partial.replace(path)
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise
+
+
+@contextmanager
+def temporary_folder() -> Iterator[Path]:
+    """Yield a temporary folder that is removed at the end; those of killed programs are removed first."""
+    parent = Path(tempfile.gettempdir())
+    _remove_stale_folders(parent)
+    for attempts_left in reversed(range(_MAX_ATTEMPTS)):
+        with tempfile.TemporaryDirectory(prefix=_TEMP_PREFIX, dir=parent, ignore_cleanup_errors=True) as name:
+            lock = _try_lock(Path(name))
+            if lock is None and attempts_left:  # another program took it for an abandoned one before it was locked
+                continue
+            try:
+                with attach_filename(Path(name)):
+                    yield Path(name)
+            finally:
+                if lock is not None:  # None on a file system without locks
+                    os.close(lock)
+            return
+
+
+@cache
+def _remove_stale_folders(parent: Path) -> None:
+    """Remove the temporary folders of killed programs; once in a process."""
+    for folder in parent.glob(f"{_TEMP_PREFIX}*"):
+        lock = _try_lock(folder)
+        if lock is None:
+            continue
+        try:
+            shutil.rmtree(folder, ignore_errors=True)
+        finally:
+            os.close(lock)
+
+
+def _try_lock(folder: Path) -> int | None:
+    """Lock a folder of this user until the descriptor is closed; None where it is not this user's, locked, or gone."""
+    with suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        with suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            status = os.fstat(descriptor)
+            if status.st_uid == os.geteuid() and os.path.samestat(status, folder.stat()):
+                return descriptor
+        os.close(descriptor)
+    return None
+
+
+def ensure_writable_folder(path: Path) -> None:
+    """Make the folder of a file that will be written after long work, and check that it is writable.
+
+    Raises
+    ------
+    InputError
+        When the file could not be written.
+    """
+    check_writable(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _not_writable_error(path, error) from None
+
+
+def check_writable(path: Path) -> None:
+    """Check that a file could be written, in a folder that may not exist yet, without making anything.
+
+    Raises
+    ------
+    InputError
+        When it could not be written.
+    """
+    try:
+        _check_not_folder(path)
+        existing = next(folder for folder in path.parents if folder.exists())
+        with tempfile.TemporaryFile(dir=existing):
+            pass
+    except OSError as error:
+        raise _not_writable_error(path, error) from None
+
+
+def _not_writable_error(path: Path, error: OSError) -> InputError:
+    return InputError(path, f"cannot be written ({error.strerror})", "Choose a folder that you may write to.")
+
+
+def _check_not_folder(path: Path) -> None:
+    if path.is_dir():
+        raise InputError(path, "expected a file, got a folder", "Choose another name, or remove the folder.")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file atomically (UTF-8, line ends unchanged)."""
+    with atomic_write(path) as partial:
+        partial.write_bytes(text.encode("utf-8"))
+
+
+def hash_file(path: Path) -> str:
+    """Return the SHA-256 hex digest of a file; InputError when it does not exist."""
+    if not path.is_file():
+        raise InputError(path, "no such file", f"Run the stage that writes {path.name} first.")
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+_MAX_HELD_BYTES = 128_000_000
+"""Size of all files together that are held in memory."""
+
+
+@dataclass
+class _HeldFiles:
+    """Contents of input files, by path and by the stamp that changes when a file is written."""
+
+    except_in: Path
+    contents: dict[tuple[Path, int, int, int], bytes] = field(default_factory=dict)
+    size: int = 0
+
+
+_HELD_FILES: ContextVar[_HeldFiles | None] = ContextVar("_HELD_FILES", default=None)
+
+
+@contextmanager
+def hold_inputs(*, except_in: Path) -> Iterator[None]:
+    """Read each input file once: within the block, :func:`open_input` holds what it has read in memory.
+
+    So the content that is hashed is the content that is parsed. Files in the folder ``except_in``, which a run writes,
+    and files that do not fit into :data:`_MAX_HELD_BYTES` are read each time.
+    """
+    token = _HELD_FILES.set(_HeldFiles(Path(os.path.realpath(except_in))))
+    try:
+        yield
+    finally:
+        _HELD_FILES.reset(token)
+
+
+def open_input(path: Path) -> io.BufferedReader | io.BytesIO:
+    """Open a file to read its bytes; from memory, where :func:`hold_inputs` holds it."""
+    held = _HELD_FILES.get()
+    if held is None:
+        return path.open("rb")
+    real_path = Path(os.path.realpath(path))
+    status = path.stat()
+    fits = stat.S_ISREG(status.st_mode) and held.size + status.st_size <= _MAX_HELD_BYTES
+    key = (real_path, status.st_mtime_ns, status.st_ino, status.st_size)
+    if key not in held.contents:
+        if not fits or real_path.is_relative_to(held.except_in):
+            return path.open("rb")
+        held.contents[key] = path.read_bytes()
+        held.size += status.st_size
+    return io.BytesIO(held.contents[key])
+
+
+def hash_json(value: Any) -> str:
+    """Return the SHA-256 hex digest of a JSON value, independent of the order of its keys."""
+    return hashlib.sha256(canonical_json(value)).hexdigest()
+
+
+def canonical_json(value: Any) -> bytes:
+    """Return a JSON value as bytes that do not depend on the order of its keys."""
+    return to_json_text(value, sort_keys=True, separators=(",", ":")).encode("utf-8")
+
+
+def to_json_text(value: Any, **options: Any) -> str:
+    """Return a JSON value as text; the numbers that JSON lacks become "inf", "-inf" and "nan".
+
+    Parameters
+    ----------
+    value
+        The value.
+    **options
+        Options of :func:`json.dumps`.
+    """
+    try:
+        return json.dumps(value, ensure_ascii=False, allow_nan=False, **options)
+    except ValueError:
+        return json.dumps(_replace_non_finite(value), ensure_ascii=False, allow_nan=False, **options)
+
+
+def _replace_non_finite(value: Any) -> Any:
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    if isinstance(value, Mapping):
+        return {key: _replace_non_finite(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_replace_non_finite(part) for part in value]
+    return value
+
+
+CHECKSUM_KEY = "own_sha256"
+"""Key of the hash of all other keys of a record."""
+
+
+def add_checksum(value: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a record with its checksum as the last key."""
+    record = {key: part for key, part in value.items() if key != CHECKSUM_KEY}
+    return {**record, CHECKSUM_KEY: hash_json(json.loads(to_json_text(record)))}
+
+
+def has_valid_checksum(value: Any) -> bool:
+    """Return whether a value parsed from JSON is a record with the right checksum."""
+    if not isinstance(value, dict):
+        return False
+    record = {key: part for key, part in value.items() if key != CHECKSUM_KEY}
+    return value.get(CHECKSUM_KEY) == hash_json(record)

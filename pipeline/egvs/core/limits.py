@@ -1,0 +1,135 @@
+"""Upper limits of what a user's files may ask for: file sizes, points, triangles, voxels.
+
+A limit is checked before memory is allocated, so that no file, however small, can ask for more than the machine has.
+Each can be set by an environment variable of its name, to a whole number of its unit. The defaults fit a program of 2
+GB; :attr:`Limit.hint` names the limit in every message, and the variable that raises it.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from egvs.core import files
+from egvs.core.errors import InputError
+
+MB = 1_000_000
+"""Bytes."""
+
+
+@dataclass(frozen=True)
+class Limit:
+    """An upper limit.
+
+    Attributes
+    ----------
+    name
+        Name of the environment variable that sets it.
+    default
+        Value when the variable is not set.
+    unit
+        What is counted: "MB", "points".
+    what
+        What is limited, in words.
+    """
+
+    name: str
+    default: int
+    unit: str
+    what: str
+
+    @property
+    def maximum(self) -> int:
+        """The limit; InputError when the environment variable is not a whole number above 0."""
+        text = os.environ.get(self.name)
+        if text is None:
+            return self.default
+        if not (text.isascii() and text.isdecimal() and 0 < len(text) <= 18 and int(text) > 0):
+            problem = f"expected how many {self.unit} {self.what} may take, got {text!r}"
+            raise InputError(self.name, problem, f"Set a whole number above 0, for example {self.default}.")
+        return int(text)
+
+    @property
+    def expected(self) -> str:
+        """The limit as part of a sentence, for a message."""
+        return f"at most {self.maximum:,} {self.unit}; {self.name}=... raises that"
+
+    @property
+    def hint(self) -> str:
+        """The limit and how to raise it, as a sentence."""
+        return f"The limit is {self.maximum:,} {self.unit}; set {self.name} to raise it."
+
+    def check(self, where: object, amount: float, actual: str = "") -> None:
+        """Raise an InputError when an amount exceeds the limit.
+
+        Parameters
+        ----------
+        where
+            File and key, for the message.
+        amount
+            In the limit's unit.
+        actual
+            The amount in words, for the message.
+        """
+        if not amount <= self.maximum:
+            raise InputError(where, actual or f"has {amount:,.0f} {self.unit}", self.hint)
+
+    def check_bytes(self, where: object, size: float, actual: str = "") -> None:
+        """:meth:`check` for a size in bytes and a limit in MB."""
+        self.check(where, size / MB, actual)
+
+
+DOCUMENT = Limit("EGVS_MAX_DOCUMENT_MB", 64, "MB", "a TOML, JSON, GeoJSON or CSV file that is read as a whole")
+FILE = Limit("EGVS_MAX_FILE_MB", 1000, "MB", "a mesh or a point cloud")
+UNPACKED = Limit("EGVS_MAX_UNPACKED_MB", 1000, "MB", "what a packed file (gzip, 3MF, Parquet) holds")
+ELEMENT = Limit("EGVS_MAX_ELEMENT_MB", 16, "MB", "one element below the root of an XML file, or a line of a text")
+POINTS = Limit("EGVS_MAX_POINTS", 30_000_000, "points", "a point cloud")
+TRIANGLES = Limit("EGVS_MAX_TRIANGLES", 5_000_000, "triangles", "a mesh")
+SITES = Limit("EGVS_MAX_SITES", 100_000, "candidates", "a scenario's sites")
+BEAMS = Limit("EGVS_MAX_BEAMS", 3_000_000, "beams", "one turn of a sensor")
+VOXELS = Limit("EGVS_MAX_VOXELS", 2**30, "voxels", "a region of interest")
+ROWS = Limit("EGVS_MAX_ROWS", 3_000_000, "rows", "the frames of an FCD file that are held at a time")
+MAP_OBJECTS = Limit("EGVS_MAX_MAP_OBJECTS", 5_000_000, "objects", "a map of OpenStreetMap")
+GROUND_POINTS = Limit("EGVS_MAX_GROUND_POINTS", 2_000_000, "points", "the ground that is laid through a network")
+READER_MEMORY = Limit("EGVS_MAX_READER_MB", 2000, "MB", "the program that unpacks a LAZ file")
+
+ALL_LIMITS = (
+    DOCUMENT,
+    FILE,
+    UNPACKED,
+    ELEMENT,
+    POINTS,
+    TRIANGLES,
+    SITES,
+    BEAMS,
+    VOXELS,
+    ROWS,
+    MAP_OBJECTS,
+    GROUND_POINTS,
+    READER_MEMORY,
+)
+
+
+def checked_size(path: Path, limit: Limit, where: object = "") -> int:
+    """Return a file's size in bytes; InputError when it exceeds a limit in MB, or the file cannot be read."""
+    try:
+        size = path.stat().st_size
+    except OSError as error:
+        raise _unreadable_error(where or path, error) from None
+    limit.check_bytes(where or path, size, f"is a file of {size / MB:,.0f} MB")
+    return size
+
+
+def read_bytes(path: Path, limit: Limit, where: object = "") -> bytes:
+    """Return the content of a file; InputError when it exceeds a limit in MB, or cannot be read."""
+    checked_size(path, limit, where)
+    try:
+        with files.open_input(path) as file:
+            return file.read()
+    except OSError as error:
+        raise _unreadable_error(where or path, error) from None
+
+
+def _unreadable_error(where: object, error: OSError) -> InputError:
+    return InputError(where, f"cannot be read ({error.strerror})", "Check the path and the permissions.")

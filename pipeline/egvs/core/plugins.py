@@ -1,0 +1,145 @@
+"""Plug-ins: effects, file formats, detectors and scores, declared as entry points and loaded on first use.
+
+A group, e.g. ``egvs.point_clouds``, is a table of entry points: name -> ``module:object``. The parts of this program
+are declared the same way, in its own ``pyproject.toml``. Where two packages declare one name, this program has
+priority, then the packages in the order of their names; so an installed package cannot replace a part of this program.
+
+https://packaging.python.org/en/latest/specifications/entry-points/
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
+from operator import attrgetter
+from typing import Any
+
+from egvs.core.errors import InputError, MissingBackendError, MissingExtraError
+
+PACKAGE_NAME = "egvs"
+"""The package of this program."""
+
+_REQUIREMENTS = {
+    "egvs.effects": (
+        ("NAME", "SOURCE", "STAGE", "KIND", "Model.of"),
+        "a subclass of Detect or another kind in egvs.effects.base, with NAME, SOURCE and Model",
+    ),
+    "egvs.detectors": (
+        ("NAME", "SOURCE", "settings", "at"),
+        "a class with NAME, SOURCE, settings and at, see egvs.validation.detectors.base",
+    ),
+    "egvs.scores": (
+        ("name", "formula", "source", "sign", "function"),
+        "a SurrogateScore, see egvs.validation.surrogates",
+    ),
+    "egvs.point_clouds": (("read",), "a module or an object with a function read"),
+}
+"""Required attributes of the objects of each group, and a description for messages."""
+
+_PACKAGES = {"sklearn": "scikit-learn", "torch": "PyTorch"}
+"""Names of packages that differ from the name that is imported."""
+
+
+def require_libraries(what: str, extra: str, *libraries: str) -> None:
+    """Check, before any work is done, that the libraries of an extra are installed; none is imported.
+
+    Parameters
+    ----------
+    what
+        The feature, for the message.
+    extra
+        The extra of this package that installs the libraries.
+    *libraries
+        Names of modules.
+
+    Raises
+    ------
+    MissingExtraError
+        Names all missing libraries, and how to install them.
+    """
+    missing = [_PACKAGES.get(name, name) for name in libraries if find_spec(name) is None]
+    if not missing:
+        return
+    verb = "is" if len(missing) == 1 else "are"
+    names = f"{', '.join(missing)}, which {verb} not installed"
+    raise MissingExtraError(f"{what} needs {names}: pip install '{PACKAGE_NAME}[{extra}]'")
+
+
+def plugin_names(group: str) -> list[str]:
+    """Return the names that a group declares, sorted; nothing is imported."""
+    return sorted(_entry_points_by_name(group))
+
+
+def plugin_module(group: str, name: str) -> str:
+    """Return the module of an entry point without importing it; KeyError when the group declares no such name."""
+    entry = _entry_points_by_name(group)[name]
+    if EntryPoint.pattern.match(entry.value) is None:
+        raise plugin_error(group, name, "it names no module")
+    return entry.module
+
+
+def plugin_package(group: str, name: str) -> str:
+    """Return the package that declares an entry point; KeyError when the group declares no such name."""
+    return _distribution_name(_entry_points_by_name(group)[name])
+
+
+def plugin_error(group: str, name: str, problem: str) -> MissingBackendError:
+    """Make the error for an entry point whose object cannot be used; it names the package and the entry point."""
+    entry = _entry_points_by_name(group)[name]
+    origin = f"entry point {entry.value!r} of the package {_distribution_name(entry)}"
+    return MissingBackendError(f"{name!r} of {group} cannot be loaded: {problem} ({origin})")
+
+
+@cache
+def load_plugin(group: str, name: str) -> Any:
+    """Return the object of an entry point; its module is imported at the first call.
+
+    Raises
+    ------
+    InputError
+        When the group declares no such name.
+    MissingBackendError
+        When the object cannot be imported, or lacks an attribute that its group requires: names the package that
+        declares it, and its entry point.
+    """
+    entry = _entry_points_by_name(group).get(name)
+    if entry is None:
+        known = ", ".join(plugin_names(group)) or "none"
+        raise InputError(group, f"knows no {name!r}", f"Choose one of {known}.")
+    try:
+        plugin = entry.load()
+    except (ImportError, AttributeError, SyntaxError) as error:
+        raise plugin_error(group, name, str(error)) from error
+    except (Exception, SystemExit) as error:  # a foreign module may do anything when it is imported
+        raise plugin_error(group, name, f"its module ended with {error!r}") from error
+    required, description = _REQUIREMENTS.get(group, ((), ""))
+    missing = [attribute for attribute in required if not _has_attribute(plugin, attribute)]
+    if missing:
+        raise plugin_error(group, name, f"it has no {', '.join(missing)}; expected {description}")
+    return plugin
+
+
+@cache
+def _entry_points_by_name(group: str) -> dict[str, EntryPoint]:
+    def priority(entry: EntryPoint) -> tuple[bool, str, str]:
+        package = _distribution_name(entry)
+        return package != PACKAGE_NAME, package, entry.value
+
+    entries = sorted(entry_points(group=group), key=priority)
+    return {entry.name: entry for entry in reversed(entries)}
+
+
+def _distribution_name(entry: EntryPoint) -> str:
+    if entry.dist is None or "Name" not in entry.dist.metadata:  # the backport of importlib.metadata raises for it
+        return "?"
+    return entry.dist.metadata["Name"] or "?"
+
+
+def _has_attribute(plugin: object, attribute: str) -> bool:
+    """Return whether an object has an attribute, which may be nested (``a.b``)."""
+    try:
+        attrgetter(attribute)(plugin)
+    except AttributeError:
+        return False
+    return True

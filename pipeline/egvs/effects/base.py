@@ -1,0 +1,234 @@
+r"""Base classes of effects: name, source and parameters, and the method through which each kind acts.
+
+The plain scene has straight beams, opaque static geometry and no weather. Everything beyond it is an *effect*: a table
+``[effects.<name>]`` in the scenario, and one module, imported only when the scenario names it. An effect acts in one
+stage, in one of these ways:
+
+============= ======== ========================================================================================
+base class    stage    what it does
+============= ======== ========================================================================================
+Expand        scan     turns a beam into weighted sub-beams; the weights of a beam add up to 1
+TransmitScan  scan     cuts a cast beam into parts; each is the share of the beam that ends at another range
+TransmitScore score    gives the share of a beam that reaches each voxel that it crosses
+Detect        score    gives the probability that the return of a target at a given range is detected
+Traffic       traffic  changes who is on the road, and how boxes are made from it
+============= ======== ========================================================================================
+
+.. math:: hits(v) = \sum_{beams} \sum_{sub} w_{sub} \cdot transmit(beam, v) \cdot detect(range(v))
+
+Weights are expectations; nothing is drawn at random. Without effects each factor is 1, and hits are numbers of beams.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
+
+import numpy as np
+
+from egvs.core.errors import InputError
+from egvs.scenario.effects_config import EffectParameters
+from egvs.sensors.beam_hooks import BeamCutter, BeamExpander
+from egvs.traffic.vehicle_boxes import TrafficHook
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from egvs.artefacts.tpog import Tpog
+    from egvs.core.grid import FloatArray, Grid
+    from egvs.scenario.model import Scenario
+    from egvs.sensors.scene import Scene
+    from egvs.sensors.sensor import Sensor
+    from egvs.sensors.voxel_crossings import Crossings, TransmittanceSteps
+
+
+P = TypeVar("P", bound=EffectParameters)
+
+_SAMPLES = 8
+"""Points along each side of the region of interest over which a probability is averaged."""
+
+
+@dataclass(frozen=True)
+class Effect(Generic[P]):
+    """Base of all effects.
+
+    Attributes
+    ----------
+    parameters
+        Validated parameters of the scenario.
+    NAME, SOURCE
+        Name of the effect, and the publication of its model.
+    STAGE, KIND
+        The stage in which it acts, and how; set by the base classes below.
+    Model
+        The class of ``parameters``.
+    QUALITY
+        Parameters that trade time for accuracy, with values from coarse to fine; the accuracy study varies them.
+    TRIAL
+        Values for parameters without a default, for ``egvs effects`` to try the effect on a scene that does not name
+        it.
+    DECIDED_BY
+        What decides whether the effect is needed but is not in the scene, e.g. "the weather"; empty where the scene
+        tells.
+    """
+
+    parameters: P
+    NAME: ClassVar[str]
+    SOURCE: ClassVar[str]
+    STAGE: ClassVar[str]
+    KIND: ClassVar[str]
+    Model: ClassVar[type[EffectParameters]]
+    QUALITY: ClassVar[dict[str, tuple[Any, ...]]] = {}
+    TRIAL: ClassVar[dict[str, Any]] = {}
+    DECIDED_BY: ClassVar[str] = ""
+
+    def why_idle(self, scene: Scene) -> str | None:
+        """Return why the effect provably cannot change the result in this scene; None when it can."""
+        del scene
+        return None
+
+    def refusal(self, scene: Scene) -> InputError | None:
+        """Return the error with which a run of this scene would stop; None when nothing is missing."""
+        del scene
+        return None
+
+    def summary(self, scene: Scene) -> str:
+        """Return what in the scene the effect acts on, with numbers; empty where there is nothing to say."""
+        del scene
+        return ""
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """Artefacts that the effect reads in addition to those of its stage."""
+        return ()
+
+
+class Expand(Effect[P], BeamExpander):
+    """Turns a beam into weighted sub-beams."""
+
+    STAGE: ClassVar[str] = "scan"
+    KIND: ClassVar[str] = "expand"
+
+
+class TransmitScan(Effect[P], BeamCutter):
+    """Lets part of a beam through static surfaces."""
+
+    STAGE: ClassVar[str] = "scan"
+    KIND: ClassVar[str] = "transmit"
+
+
+class TransmitScore(Effect[P]):
+    """Gives the share of a beam that reaches a voxel."""
+
+    STAGE: ClassVar[str] = "score"
+    KIND: ClassVar[str] = "transmit"
+
+    def prepare(self, scene: Scene, tpog: Tpog, trajectories: Path | None) -> TransmitScore[P]:
+        """Return the effect with the data that :meth:`share` needs, read once before any site is scored.
+
+        Parameters
+        ----------
+        scene
+            The scene that is scored.
+        tpog
+            The occupancy grid of the traffic.
+        trajectories
+            ``trajectories.parquet``; None where there is none, which is an error for an effect that :attr:`reads` it.
+        """
+        raise NotImplementedError
+
+    def for_sensor(self, sensor_m: FloatArray, grid: Grid) -> TransmitScore[P]:
+        """Return the effect for one sensor (3,) in the grid frame, with all that does not depend on its beams.
+
+        Called from several threads.
+        """
+        del sensor_m, grid
+        return self
+
+    def share(self, crossings: Crossings) -> FloatArray:
+        """Return the share of its beam, 0 to 1, that reaches each crossing, (k,). Called from several threads."""
+        raise NotImplementedError
+
+    def falls(self, ends_m: FloatArray) -> Iterator[TransmittanceSteps] | None:
+        """Yield where the transmitted shares of beams drop, some beams at a time.
+
+        This is the information of :meth:`share` without a list of crossings; None where the effect needs that list.
+
+        Parameters
+        ----------
+        ends_m
+            Ends of all beams relative to the sensor, (n, 3).
+        """
+        del ends_m
+        return None
+
+
+class Detect(Effect[P]):
+    """Gives the probability that a return is detected."""
+
+    STAGE: ClassVar[str] = "score"
+    KIND: ClassVar[str] = "detect"
+
+    def refusal(self, scene: Scene) -> InputError | None:
+        """Return the error for a sensor that lacks a value which the effect needs."""
+        try:
+            for sensor in scene.used_sensors.values():
+                self.detect(np.ones(1), sensor)
+        except InputError as error:
+            return error
+        return None
+
+    def noticed_shares(self, scene: Scene) -> tuple[float, float]:
+        """Return the mean detection probability over the region of interest, at its worst and its best site."""
+        low = np.asarray(scene.roi.origin_m)
+        size = np.asarray(scene.roi.size_m)
+        ticks = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+        points = low + size * np.stack(np.meshgrid(ticks, ticks, ticks), axis=-1).reshape(-1, 3)
+        shares = []
+        for site in scene.sites:
+            range_m = np.sqrt(((points - site.pose.position_m) ** 2).sum(axis=1))
+            shares.append(self.detect(range_m, scene.sensor(site.sensor)).mean())
+        return float(min(shares)), float(max(shares))
+
+    def summary(self, scene: Scene) -> str:
+        """Return the share of returns from the region of interest that is detected, as a sentence."""
+        worst, best = (f"{share:.0%}" for share in self.noticed_shares(scene))
+        shares = best if worst == best else f"{worst} to {best}"
+        return f"by its formula, {shares} of returns from the region are detected"
+
+    def detect(self, range_m: FloatArray, sensor: Sensor) -> FloatArray:
+        """Return the detection probability (n,), 0 to 1, of targets at ``range_m`` (n,) metres from the sensor.
+
+        It is not called for each beam and voxel, see :mod:`egvs.scoring.visibility`.
+        """
+        raise NotImplementedError
+
+
+class Traffic(Effect[P], TrafficHook):
+    """Changes who is on the road, and how boxes are made.
+
+    An effect with a method ``ground`` also is a :class:`egvs.world.terrain.GroundSource`.
+    """
+
+    STAGE: ClassVar[str] = "traffic"
+    KIND: ClassVar[str] = "traffic"
+    SELF_ACTING: ClassVar[bool] = False
+    """Whether it also acts where the scenario does not name it; then :meth:`acts` alone decides."""
+
+    def acts(self, scenario: Scenario) -> tuple[bool, str]:
+        """Return whether the effect can change anything, from the scenario alone, and the reason."""
+        return True, "named"
+
+    def why_idle(self, scene: Scene) -> str | None:
+        """Return the reason of :meth:`acts` where the effect does not act."""
+        on, reason = self.acts(scene.scenario)
+        return None if on else reason
+
+    def refusal(self, scene: Scene) -> InputError | None:
+        """Return the error of ``refuses``."""
+        return self.refuses(scene.scenario)
+
+    def config_key(self, scenario: Scenario) -> str:
+        """Return the file and key that messages point to."""
+        return f"{scenario.file}: effects.{self.NAME}"

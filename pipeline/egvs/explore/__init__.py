@@ -1,0 +1,1 @@
+"""The interactive 3D page of a run."""

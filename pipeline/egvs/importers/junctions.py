@@ -1,0 +1,560 @@
+r"""Choose a junction of a street network, its region of interest, poles along its kerbs, and flows through it.
+
+Steps: :func:`read_streets` turns a SUMO network into :class:`Streets`; :func:`choose_junction`; :func:`region_around`
+it; :func:`kerbside_poles` along the edge of the carriageway; :func:`assumed_flows` through the region.
+
+World frame: the network's own x (east), y (north) in metres. Longitude and latitude become x, y by the network's
+``<location>``, as in netconvert:
+
+    (x, y) = projection(lon, lat) + netOffset
+
+Assumed flows: nobody has counted the vehicles at a junction taken from a map. Scores depend on the flow through the
+region of interest, so this flow is fixed: the number of vehicles per hour from each street that enters the region to
+each street that leaves it. It depends on these streets alone. (With a fixed number of vehicles in the whole network,
+the flow through the junction would fall as the simulated area grows.)
+
+The gates are the streets where vehicles enter or leave the region. Each lane of a gate carries
+:data:`LANE_FLOW_PER_H` vehicles per hour, by road class. Doubly constrained growth factors (Furness,
+https://archive.nptel.ac.in/content/storage2/courses/105101087/08-Ltexhtml/p6/p.html) balance the flows between gates:
+
+.. math:: q_{ij} = a_i \, b_j \, w_{ij}, \qquad \sum_j q_{ij} = q_i, \qquad
+          \sum_i q_{ij} \approx q_j \sum_i q_i / \sum_j q_j,
+
+where w is 1 if one can drive from gate i to gate j without turning back, and 0 otherwise. The inflows are met exactly,
+the outflows as well as possible.
+"""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Sequence, Set
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import shapely
+from shapely.geometry import LineString, Point, Polygon, box
+from shapely.geometry.base import BaseGeometry
+
+from egvs.core.grid import FloatArray
+from egvs.formats.georeference import WorldFrame
+from egvs.scenario.traffic_config import CountConfig
+from egvs.traffic import network as road_network
+from egvs.traffic.network import Edge, Network
+from egvs.world.geolocation import network_world_frame
+
+XY = tuple[float, float]
+"""x, y in metres."""
+
+ROI_MIN_M, ROI_MAX_M, ROI_STEP_M, ROI_HEIGHT_M = 60.0, 120.0, 10.0, 5.0
+
+APPROACH_M = 20.0
+"""Minimum length of each approach inside the region of interest."""
+
+SPACING_M = 10.0
+KERB_M = 1.0
+KERB_MIN_M = 0.5
+CLEARANCE_M = 1.0
+BEYOND_ROI_M = 5.0
+HEIGHTS_M = (3.0, 4.5, 6.0)
+MAX_POLES = 12
+
+LANE_FLOW_PER_H = {
+    "motorway": 600.0, "trunk": 400.0, "primary": 250.0, "secondary": 200.0, "tertiary": 150.0, "unclassified": 60.0,
+    "residential": 40.0, "living_street": 20.0, "service": 10.0,
+}  # fmt: skip
+"""Vehicles per hour and lane by OpenStreetMap road class, on an ordinary day outside the peak hours.
+
+Round figures of the usual order of magnitude in traffic planning; they are assumptions without a source.
+"""
+
+_TOLERANCE_M = 0.01
+_SEARCH_M = 50.0
+_ISLAND_M2 = 100.0
+_SLIDES_M = (0.0, 1.0, -1.0, 2.0, -2.0, 3.0, -3.0, 4.0, -4.0)
+
+_OTHER_FLOW_PER_H = 40.0
+_CAR = "passenger"
+_MIN_AREA_M2 = 10.0
+
+_ITERATIONS = 3
+"""Further rounds would empty whole turns where the outgoing lanes cannot take all that comes in."""
+
+
+@dataclass(frozen=True)
+class StreetJunction:
+    """A junction of the network.
+
+    Attributes
+    ----------
+    id
+        SUMO's id.
+    at_m
+        x, y of the junction's node.
+    area
+        Outline, seen from above.
+    lanes_in
+        Number of incoming lanes for vehicles.
+    arms
+        Number of neighbouring nodes that a street leads to.
+    signalised
+        Whether it has traffic lights.
+    names
+        Names of the streets that meet there, sorted.
+    """
+
+    id: str
+    at_m: XY
+    area: BaseGeometry
+    lanes_in: int
+    arms: int
+    signalised: bool
+    names: tuple[str, ...]
+
+    @property
+    def title(self) -> str:
+        """A description such as ``"signalised junction of A Street and B Road"``."""
+        kind = "signalised junction" if self.signalised else "junction without signals"
+        if not self.names:
+            return kind
+        if len(self.names) == 1:
+            return f"{kind} in {self.names[0]}"
+        return f"{kind} of {', '.join(self.names[:-1])} and {self.names[-1]}"
+
+
+@dataclass(frozen=True)
+class Streets:
+    """A network, its junctions, and the carriageway.
+
+    Attributes
+    ----------
+    network
+        The SUMO network.
+    areas
+        The carriageway by edge id: the lanes of each edge at full width, including edges inside junctions.
+    junctions
+        Junctions with incoming lanes, without dead ends.
+    """
+
+    network: Network
+    areas: dict[str, BaseGeometry]
+    junctions: tuple[StreetJunction, ...]
+
+    @property
+    def lane_length_m(self) -> float:
+        """Total length of all lanes outside junctions, without pavements."""
+        lanes = (lane for road in self.network.edges for lane in road.lanes)
+        return math.fsum(lane.length_m for lane in lanes if not lane.is_pavement)
+
+    def to_xy(self, lons_deg: Sequence[float], lats_deg: Sequence[float]) -> list[XY]:
+        """World-frame x, y in metres of positions in degrees."""
+        xy_m = self._frame.from_degrees(np.column_stack([lons_deg, lats_deg]))
+        return [(x, y) for x, y in xy_m.tolist()]
+
+    def to_degrees(self, points_m: Sequence[XY]) -> list[tuple[float, float]]:
+        """Longitude and latitude in degrees of positions in the world frame."""
+        degrees = self._frame.to_degrees(np.array(points_m))
+        return [(lon, lat) for lon, lat in degrees.tolist()]
+
+    def near(self, window: BaseGeometry) -> Streets:
+        """Return the part that touches a window, in the same order and without connections.
+
+        It contains everything that kerbs inside the window depend on.
+        """
+        area_ids = list(self.areas)
+        nearby_areas = sorted(self._areas_tree.query(window, predicate="intersects"))
+        areas = {area_ids[index]: self.areas[area_ids[index]] for index in nearby_areas}
+        nearby_junctions = sorted(self._junctions_tree.query(window, predicate="intersects"))
+        junctions = tuple(self.junctions[index] for index in nearby_junctions)
+
+        edges = tuple(edge for edge in self.network.all_edges if edge.id in areas)
+        nodes = tuple(node for node in self.network.junctions if window.intersects(Point(node.at_m)))
+        network = replace(self.network, all_edges=edges, connections=(), junctions=nodes)
+        return Streets(network, areas, junctions)
+
+    @cached_property
+    def _areas_tree(self) -> shapely.STRtree:
+        return shapely.STRtree(list(self.areas.values()))
+
+    @cached_property
+    def _junctions_tree(self) -> shapely.STRtree:
+        return shapely.STRtree([junction.area for junction in self.junctions])
+
+    @property
+    def _frame(self) -> WorldFrame:
+        frame = network_world_frame(self.network.location)
+        assert frame is not None, "netconvert writes a location"
+        return frame
+
+
+@dataclass(frozen=True)
+class JunctionRegion:
+    """The region of interest seen from above; it reaches from z = 0 to ``ROI_HEIGHT_M``."""
+
+    center_m: XY
+    size_m: XY
+
+    @property
+    def area(self) -> Polygon:
+        """The rectangle."""
+        x, y = self.center_m
+        width, depth = self.size_m
+        return box(x - width / 2, y - depth / 2, x + width / 2, y + depth / 2)
+
+
+@dataclass(frozen=True)
+class KerbsidePole:
+    """A location for a pole: x, y in metres."""
+
+    x_m: float
+    y_m: float
+
+
+def read_streets(path: Path) -> Streets:
+    """Read a network that netconvert wrote from OpenStreetMap.
+
+    Parameters
+    ----------
+    path
+        A ``.net.xml``.
+
+    Returns
+    -------
+    Streets
+        The network with its carriageway and junctions.
+
+    Raises
+    ------
+    InputError
+        When the network has no road.
+    """
+    network = road_network.read_net_xml(path)
+    internal_edges = [edge for edge in network.all_edges if edge.function == "internal"]
+    areas = {edge.id: _lane_area(edge) for edge in (*network.edges, *internal_edges)}
+
+    lanes_for_vehicles = set()
+    roads_at_node: dict[str, list[Edge]] = {}
+    for road in network.edges:
+        for index, lane in enumerate(road.lanes):
+            if not lane.is_pavement:
+                lanes_for_vehicles.add(f"{road.id}_{index}")
+        for node_id in dict.fromkeys(_ends(road)):
+            roads_at_node.setdefault(node_id, []).append(road)
+
+    nodes = [node for node in network.junctions if node.incoming_lanes and node.type not in ("internal", "dead_end")]
+    junctions = [_make_junction(node, roads_at_node.get(node.id, []), lanes_for_vehicles) for node in nodes]
+    return Streets(network, areas, tuple(junctions))
+
+
+def _lane_area(edge: Edge) -> BaseGeometry:
+    """Return the area of an edge's lanes at full width, without pavements."""
+    strips = []
+    for lane in edge.lanes:
+        if lane.is_pavement or len(np.unique(lane.shape_m, axis=0)) < 2:
+            continue
+        half_width_m = (lane.width_m or road_network.LANE_WIDTH_M) / 2
+        strips.append(LineString(lane.shape_m[:, :2]).buffer(half_width_m, cap_style="flat"))
+    return shapely.union_all(strips)
+
+
+def _make_junction(node: road_network.Junction, roads: Sequence[Edge], lanes_for_vehicles: Set[str]) -> StreetJunction:
+    """Make a junction from a node of the network and the roads that meet there."""
+    corners_m = node.shape_m[:, :2]
+    area = Point(node.at_m).buffer(1.0)
+    if len(corners_m) >= 3:
+        area = shapely.make_valid(Polygon(corners_m))
+
+    neighbours = {end for road in roads for end in _ends(road)} - {node.id}
+    names = {html.unescape(road.name) for road in roads if road.name}  # netconvert escapes names twice
+    return StreetJunction(
+        node.id,
+        node.at_m,
+        area,
+        lanes_in=sum(lane in lanes_for_vehicles for lane in node.incoming_lanes),
+        arms=len(neighbours),
+        signalised=node.type.startswith("traffic_light"),
+        names=tuple(sorted(names)),
+    )
+
+
+def _ends(road: Edge) -> tuple[str, str]:
+    return road.from_node, road.to_node
+
+
+def choose_junction(streets: Streets, at_m: XY | None) -> StreetJunction | None:
+    """Choose the junction nearest to a position, or the largest one.
+
+    Signalised junctions where at least three streets meet come first, so that pedestrian-only signals are ignored.
+    Where there are none, any signals count, then any junction of three streets, then any junction.
+
+    Parameters
+    ----------
+    streets
+        The streets to choose from.
+    at_m
+        World-frame x, y; None for the junction with the most incoming lanes.
+
+    Returns
+    -------
+    StreetJunction or None
+        None where the streets have no junction.
+    """
+    crossings = [j for j in streets.junctions if j.arms >= 3]
+    signalised = [j for j in streets.junctions if j.signalised]
+    signalised_crossings = [j for j in crossings if j.signalised]
+    candidates = signalised_crossings or signalised or crossings or streets.junctions
+    if not candidates:
+        return None
+    if at_m is None:
+        return min(candidates, key=lambda j: (-j.lanes_in, -j.area.area, j.id))
+    position = Point(at_m)
+    return min(candidates, key=lambda j: (position.distance(j.area), math.dist(at_m, j.at_m), j.id))
+
+
+def region_around(junction: StreetJunction) -> JunctionRegion:
+    """Return a box around the junction and a piece of each approach, with corners at whole metres."""
+    x0, y0, x1, y1 = junction.area.bounds
+    center_m = float(round((x0 + x1) / 2)), float(round((y0 + y1) / 2))
+    return JunctionRegion(center_m, (_region_side_m(x1 - x0), _region_side_m(y1 - y0)))
+
+
+def _region_side_m(junction_side_m: float) -> float:
+    steps = math.ceil((junction_side_m + 2 * APPROACH_M) / ROI_STEP_M)
+    return min(max(steps * ROI_STEP_M, ROI_MIN_M), ROI_MAX_M)
+
+
+def kerbside_poles(
+    streets: Streets, junction: StreetJunction, roi: JunctionRegion, objects: Sequence[BaseGeometry]
+) -> list[KerbsidePole]:
+    """Find locations for poles along the kerbs of a junction and its approaches.
+
+    Poles are ``KERB_M`` outside the carriageway (rounded to 0.1 m, never nearer than ``KERB_MIN_M``) and at least
+    ``CLEARANCE_M`` from every object. Along the kerb they are about ``SPACING_M`` apart, never less than half of it.
+    Traffic islands below 100 m2 count as carriageway.
+
+    Parameters
+    ----------
+    streets, junction
+        The carriageway and the junction.
+    roi
+        The region of interest; poles are inside it or up to ``BEYOND_ROI_M`` outside.
+    objects
+        Areas of static objects, world frame, metres.
+
+    Returns
+    -------
+    list of KerbsidePole
+        The ``MAX_POLES`` locations nearest to the junction, counter-clockwise around it.
+    """
+    window = box(*roi.area.buffer(BEYOND_ROI_M, join_style="mitre").bounds)
+    surroundings = window.buffer(_SEARCH_M)
+    pieces = [*streets.areas.values(), *(j.area for j in streets.junctions)]
+    carriageway = shapely.union_all([piece for piece in pieces if piece.intersects(surroundings)])
+
+    junction_area = shapely.union_all([junction.area, *_approaches(streets, junction, window)]).buffer(1.5 * KERB_M)
+    kerb = _without_islands(carriageway).buffer(KERB_M).boundary
+    kerb = shapely.intersection(kerb, window.intersection(junction_area))
+
+    obstacles = [o.buffer(CLEARANCE_M + _TOLERANCE_M) for o in objects if o.intersects(surroundings)]
+    forbidden = shapely.union_all([carriageway.buffer(KERB_MIN_M + _TOLERANCE_M), *obstacles])
+    shapely.prepare(forbidden)
+
+    free: list[XY] = []
+    for line in _lines(kerb):
+        free += _free_points_along(line, forbidden, window)
+
+    center = junction.area.centroid
+    poles = _nearest_poles(free, (center.x, center.y))
+    poles.sort(key=lambda p: (math.degrees(math.atan2(center.y - p[1], center.x - p[0])), *p))
+    return [KerbsidePole(x, y) for x, y in poles]
+
+
+def _approaches(streets: Streets, junction: StreetJunction, window: BaseGeometry) -> list[BaseGeometry]:
+    """Return the streets that can be reached from the junction, in either direction, without leaving the window."""
+    roads = streets.network.edges
+    inside = {node.id for node in streets.network.junctions if window.covers(Point(node.at_m))}
+
+    reached = {junction.id}
+    while True:
+        passable = reached & inside
+        neighbours: set[str] = set()
+        for road in roads:
+            if not passable.isdisjoint(_ends(road)):
+                neighbours.update(_ends(road))
+        if neighbours <= reached:
+            break
+        reached |= neighbours
+
+    start_nodes = reached & inside | {junction.id}
+    return [streets.areas[road.id] for road in roads if not start_nodes.isdisjoint(_ends(road))]
+
+
+def _without_islands(area: BaseGeometry) -> BaseGeometry:
+    """Fill the small holes of an area."""
+    filled = []
+    for polygon in shapely.get_parts(area):
+        if isinstance(polygon, Polygon):
+            large_holes = [hole for hole in polygon.interiors if Polygon(hole).area >= _ISLAND_M2]
+            filled.append(Polygon(polygon.exterior, large_holes))
+    return shapely.union_all(filled)
+
+
+def _lines(kerb: BaseGeometry) -> list[LineString]:
+    if kerb.geom_type == "MultiLineString":
+        kerb = shapely.line_merge(kerb)
+    return [line for line in shapely.get_parts(shapely.normalize(kerb)) if isinstance(line, LineString)]
+
+
+def _free_points_along(line: LineString, forbidden: BaseGeometry, window: BaseGeometry) -> list[XY]:
+    """Return evenly spaced free points on a line; a point that is not free moves a little along it."""
+    count = round(line.length / SPACING_M)
+    points = []
+    for index in range(count):
+        middle_m = (index + 0.5) * line.length / count
+        for slide_m in _SLIDES_M:
+            on_line = line.interpolate(min(max(middle_m + slide_m, 0.0), line.length))
+            point = Point(round(on_line.x, 1), round(on_line.y, 1))
+            if window.covers(point) and not forbidden.intersects(point):
+                points.append((point.x, point.y))
+                break
+    return points
+
+
+def _nearest_poles(points: Sequence[XY], center: XY) -> list[XY]:
+    """Return the points nearest to the center that keep their distance from each other."""
+    poles: list[XY] = []
+    for point in sorted(points, key=lambda p: (math.dist(p, center), p)):
+        if all(math.dist(point, pole) >= SPACING_M / 2 for pole in poles):
+            poles.append(point)
+    return poles[:MAX_POLES]
+
+
+@dataclass(frozen=True)
+class _Gates:
+    """The edges by which vehicles enter and leave a region.
+
+    ``connected`` has shape (n_entries, n_exits): 1 where one can drive from the entry to the exit, otherwise 0.
+    """
+
+    entries: list[Edge]
+    exits: list[Edge]
+    connected: FloatArray
+
+
+def assumed_flows(streets: Streets, roi: JunctionRegion) -> list[CountConfig]:
+    """Assume the traffic through a region from the classes of its streets.
+
+    Parameters
+    ----------
+    streets
+        The streets in and around the region.
+    roi
+        The region of interest.
+
+    Returns
+    -------
+    list of CountConfig
+        Vehicles per hour from each gate to each other gate; empty where no street leads through the region.
+    """
+    gates = _find_gates(streets, roi)
+    inflow_per_h = [edge_flow_h(edge) for edge in gates.entries]
+    outflow_per_h = [edge_flow_h(edge) for edge in gates.exits]
+    flows_per_h = balance_flows(gates.connected, inflow_per_h, outflow_per_h)
+
+    counts = []
+    for row, entry in enumerate(gates.entries):
+        for column, exit_edge in enumerate(gates.exits):
+            per_hour = float(round(flows_per_h[row, column]))
+            if per_hour == 0:
+                continue
+            if entry is exit_edge:
+                counts.append(CountConfig(edge=entry.id, per_hour=per_hour))
+            else:
+                counts.append(CountConfig(from_edge=entry.id, to_edge=exit_edge.id, per_hour=per_hour))
+    return counts
+
+
+def edge_flow_h(edge: Edge) -> float:
+    """Return the assumed vehicles per hour on all lanes of a street, by its road class.
+
+    netconvert writes a street with tram tracks as ``"highway.secondary|railway.tram"``.
+    """
+    flows_per_h = []
+    for part in edge.type.split("|"):
+        if part.startswith("highway."):
+            road_class = part.removeprefix("highway.").removesuffix("_link")
+            flows_per_h.append(LANE_FLOW_PER_H.get(road_class, _OTHER_FLOW_PER_H))
+    return max(flows_per_h, default=_OTHER_FLOW_PER_H) * edge.lanes_for(_CAR)
+
+
+def balance_flows(connected: FloatArray, inflow_per_h: Sequence[float], outflow_per_h: Sequence[float]) -> FloatArray:
+    """Distribute the inflows over the exits by doubly constrained growth factors.
+
+    Parameters
+    ----------
+    connected
+        Shape (n_entries, n_exits), float64; 0 where no vehicle can go.
+    inflow_per_h, outflow_per_h
+        Vehicles per hour at each entry and each exit.
+
+    Returns
+    -------
+    numpy.ndarray
+        Vehicles per hour, shape (n_entries, n_exits). Rows add up to the inflows; columns, where possible, to shares
+        proportional to the outflows.
+    """
+    flows = connected.copy()
+    inflow = np.array(inflow_per_h, dtype=np.float64)
+    outflow = np.array(outflow_per_h, dtype=np.float64)
+    for _ in range(_ITERATIONS):
+        flows = flows * _growth_factors(outflow, flows.sum(axis=0))[None, :]
+        flows = flows * _growth_factors(inflow, flows.sum(axis=1))[:, None]
+    return flows
+
+
+def _growth_factors(target: FloatArray, current: FloatArray) -> FloatArray:
+    """Return target / current, and 0 where nothing flows."""
+    return np.divide(target, current, out=np.zeros_like(target), where=current > 0)
+
+
+def _find_gates(streets: Streets, roi: JunctionRegion) -> _Gates:
+    edges = streets.network.edges
+    successors: dict[int, list[int]] = {index: [] for index in _roads_inside(streets, roi)}
+    entered = set()
+    for source, target, is_turnaround in streets.network.links(_CAR).tolist():
+        if not is_turnaround and source in successors and target in successors:
+            successors[source].append(target)
+            entered.add(target)
+
+    entries = [index for index in successors if index not in entered]
+    exits = [index for index, following in successors.items() if not following]
+    connected = np.zeros((len(entries), len(exits)))
+    for row, entry in enumerate(entries):
+        reachable = _reachable(entry, successors)
+        for column, exit_index in enumerate(exits):
+            turns_back = edges[exit_index].to_node == edges[entry].from_node
+            connected[row, column] = exit_index in reachable and not turns_back
+    return _Gates([edges[i] for i in entries], [edges[i] for i in exits], connected)
+
+
+def _roads_inside(streets: Streets, roi: JunctionRegion) -> list[int]:
+    """Return the positions of the roads for cars that cover part of the region."""
+    region = roi.area
+    indices = []
+    for index, edge in enumerate(streets.network.edges):
+        if edge.lanes_for(_CAR) and streets.areas[edge.id].intersection(region).area >= _MIN_AREA_M2:
+            indices.append(index)
+    return indices
+
+
+def _reachable(start: int, successors: dict[int, list[int]]) -> set[int]:
+    reached = {start}
+    queue = [start]
+    while queue:
+        for index in successors[queue.pop()]:
+            if index not in reached:
+                reached.add(index)
+                queue.append(index)
+    return reached

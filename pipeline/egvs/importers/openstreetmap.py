@@ -1,0 +1,438 @@
+"""Make a scenario from a town on OpenStreetMap.
+
+Steps of :func:`create_scenario`: read the extract; run netconvert on its streets; choose a junction and put the region
+of interest around it; take buildings, trees, barriers and poles as solids; find candidate sites along the kerbs; write
+
+    network.net.xml    the streets                                       (traffic)
+    statics.geojson    footprints with heights, and import counts        (statics)
+    sites.csv          candidate sites                                   (scan, score)
+    scenario.toml      the scenario that names them
+
+World frame: the network's x (east), y (north) in metres; the ground is z = 0 (hills, bridges and tunnels are flat).
+The same extract gives the same bytes: no dates, no paths, objects sorted.
+
+The functions that make the parts of a scenario file are also used for the junctions of a city.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import shutil
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+from pydantic import TypeAdapter, ValidationError
+
+from egvs.core import files
+from egvs.core.errors import InputError
+from egvs.formats import osm as osm_files
+from egvs.formats.osm import OsmExtract
+from egvs.importers import junctions, osm_network, osm_solids
+from egvs.importers.junctions import XY, JunctionRegion, KerbsidePole, StreetJunction, Streets
+from egvs.importers.osm_network import ATTRIBUTION, NETWORK_FILE
+from egvs.importers.osm_solids import ImportCounts, MappedSolid
+from egvs.scenario.fields import Name
+from egvs.scenario.loading import load
+from egvs.scenario.model import SCENARIO_FILE, RoiConfig
+from egvs.scenario.score_config import DEFAULT_SCORE, ScoreConfig
+from egvs.scenario.traffic_config import DEFAULT_FRAMES, DEFAULT_WARMUP_S, CountConfig, TrafficConfig
+
+STATICS_FILE, SITES_FILE = "statics.geojson", "sites.csv"
+SENSOR = "VLP-32C"
+
+PITCHES_DEG: tuple[float | str, ...] = (0.0, -10.0, "aim")
+"""Tilts to try at each height; the best one depends on sensor, height and junction."""
+
+SURROUNDINGS_MIN_M = 100.0
+SURROUNDINGS_M = 300.0
+"""How far from the junction streets are simulated: enough for the queues and platoons that reach it."""
+
+PEOPLE_HINT = (
+    "pedestrians are added with --set effects.pedestrians_bicycles.pedestrians_per_h=300 (bicycles: bicycles_per_h)"
+)
+
+TomlTable = tuple[str, dict[str, Any]]
+"""A comment, and the keys of a table."""
+
+_KEY_COMMENTS = {
+    ("score", "rank_by"): "the expected share of vehicles that detectors find; docs/validity.md",
+    ("sites", "aim"): "sensors face the centre of the region",
+    ("sites", "pitch_deg"): "each height with each tilt is a candidate; 'aim': the central ray points at the centre",
+}
+
+
+@dataclass(frozen=True)
+class NewScenario:
+    """What :func:`create_scenario` made.
+
+    Attributes
+    ----------
+    folder
+        The scenario's folder.
+    junction, roi
+        The junction, and the region of interest around it.
+    streets
+        The simulated streets.
+    poles
+        Number of locations for poles.
+    statics
+        What happened to the objects of the map.
+    notes
+        What to know before trusting the scenario.
+    """
+
+    folder: Path
+    junction: StreetJunction
+    roi: JunctionRegion
+    streets: Streets
+    poles: int
+    statics: ImportCounts
+    notes: tuple[str, ...]
+
+    @property
+    def sites(self) -> int:
+        """Number of candidates: each pole with each height and each tilt."""
+        return self.poles * len(junctions.HEIGHTS_M) * len(PITCHES_DEG)
+
+    @cached_property
+    def flows(self) -> tuple[CountConfig, ...]:
+        """The assumed traffic through the region of interest; empty where no street leads through it."""
+        return tuple(junctions.assumed_flows(self.streets, self.roi))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return a summary as plain JSON, the most interesting keys first."""
+        junction, streets = self.junction, self.streets
+        _, roi = roi_table(self.roi)
+        return {
+            "folder": str(self.folder),
+            "attribution": ATTRIBUTION,
+            "junction": {
+                "title": junction.title, "id": junction.id, "signalised": junction.signalised,
+                "x_m": junction.at_m[0], "y_m": junction.at_m[1], "lanes_in": junction.lanes_in, "arms": junction.arms,
+            },
+            "roi": roi,
+            "network": {
+                "edges": len(streets.network.edges), "lane_length_m": round(streets.lane_length_m),
+                "signalised_junctions": sum(j.signalised for j in streets.junctions),
+            },
+            "assumed_traffic": {
+                "flows": len(self.flows), "vehicles_per_hour": round(math.fsum(f.per_hour for f in self.flows)),
+            },
+            "poles": self.poles,
+            "sites": self.sites,
+            "statics": self.statics.to_json(),
+            "notes": list(self.notes),
+        }  # fmt: skip
+
+
+def create_scenario(
+    folder: Path, osm: Path, at: tuple[float, float] | None = None, lefthand: bool = False, walk: bool = False,
+    surroundings_m: float | None = SURROUNDINGS_M,
+) -> NewScenario:  # fmt: skip
+    """Make a scenario folder from an OpenStreetMap extract.
+
+    Parameters
+    ----------
+    folder
+        Created by this function; may exist if it is empty.
+    osm
+        An OpenStreetMap file: XML (plain or gzipped) or PBF.
+    at
+        Latitude, longitude in degrees: choose the nearest signalised junction; without it, the largest one.
+    lefthand
+        Whether traffic drives on the left.
+    walk
+        Whether the network gets sidewalks and crossings, which pedestrians need.
+    surroundings_m
+        Distance from the junction at which streets end; None for the complete extract.
+
+    Returns
+    -------
+    NewScenario
+        A summary of the new scenario.
+
+    Raises
+    ------
+    InputError
+        When the folder is not empty, the file is damaged or has no drivable streets, ``at`` is outside the extract, or
+        no site is possible. Nothing is written then.
+    """
+    name = check_new_folder(folder)
+    if surroundings_m is not None and surroundings_m < SURROUNDINGS_MIN_M:
+        raise InputError(
+            "--surroundings",
+            f"expected at least {SURROUNDINGS_MIN_M:g} m, got {surroundings_m:g} m",
+            "Choose a distance that includes the junction and its approaches.",
+        )
+    extract = osm_files.read_osm(osm)
+    check_inside_extract(extract, at)
+
+    flags = osm_network.netconvert_flags(extract, lefthand=lefthand, walk=walk)
+    network, streets = osm_network.build_network(extract, osm, flags)
+    near = streets.to_xy([at[1]], [at[0]])[0] if at else None
+    junction = _choose_junction(streets, osm, near)
+    solids, counts = osm_solids.map_solids(extract, streets)
+
+    if surroundings_m is not None:
+        network, streets = osm_network.crop_network(extract, osm, flags, streets, junction, surroundings_m)
+        junction = _choose_junction(streets, osm, junction.at_m)
+    roi = junctions.region_around(junction)
+    poles = junctions.kerbside_poles(streets, junction, roi, [solid.area for solid in solids])
+    if not poles:
+        problem = f"there is no free location for a pole along the kerbs of the {junction.title}"
+        raise InputError(osm, problem, "Choose another junction with --at LAT,LON.")
+
+    notes = _junction_notes(junction, roi, counts)
+    if walk:
+        notes.append(PEOPLE_HINT)
+    scenario = NewScenario(folder, junction, roi, streets, len(poles), counts, tuple(notes))
+    texts = {
+        NETWORK_FILE: network,
+        STATICS_FILE: solids_geojson(solids, counts),
+        SITES_FILE: sites_csv(poles),
+        SCENARIO_FILE: _scenario_toml(name, scenario),
+    }
+    publish_folder(folder, texts.items(), load)
+    return scenario
+
+
+def check_new_folder(folder: Path) -> str:
+    """Check that a new folder can be made.
+
+    Parameters
+    ----------
+    folder
+        Where the scenario or city will be.
+
+    Returns
+    -------
+    str
+        A name for the scenario if the folder's own name is not a valid one, otherwise an empty string.
+
+    Raises
+    ------
+    InputError
+        When there is a file or a folder with content.
+    """
+    hint = "Name a folder that does not exist yet, so that nothing is overwritten."
+    if folder.exists() and not folder.is_dir():
+        raise InputError(folder, "expected a new folder, got an existing file", hint)
+    if folder.is_dir() and any(folder.iterdir()):
+        raise InputError(folder, "expected a new folder, got one that is not empty", hint)
+    name = folder.resolve().name
+    try:
+        TypeAdapter(Name).validate_python(name)
+    except ValidationError:
+        return re.sub(r"[\s/\\:*?\"<>|]+", "-", name).strip("-") or "junction"
+    return ""
+
+
+def check_inside_extract(extract: OsmExtract, at: tuple[float, float] | None, option: str = "--at") -> None:
+    """Raise an InputError if a position (latitude, longitude in degrees) of an option is outside the extract."""
+    if at is None or extract.bounds.contains(*at):
+        return
+    b = extract.bounds
+    bounds = f"latitude {b.south_deg:g} to {b.north_deg:g}, longitude {b.west_deg:g} to {b.east_deg:g}"
+    raise InputError(
+        option, f"{at[0]:g},{at[1]:g} is outside the extract", f"Choose a position inside the extract: {bounds}."
+    )
+
+
+def _choose_junction(streets: Streets, osm: Path, near: XY | None) -> StreetJunction:
+    junction = junctions.choose_junction(streets, near)
+    if junction is None:
+        raise InputError(osm, "the streets of the extract have no junction", "Choose an extract with a junction.")
+    return junction
+
+
+def _junction_notes(junction: StreetJunction, roi: JunctionRegion, counts: ImportCounts) -> list[str]:
+    notes = []
+    if not junction.signalised:
+        notes.append("no junction in the extract has signals; the one with the most incoming lanes was chosen")
+    return notes + scenario_notes(roi.area.covers(junction.area), counts)
+
+
+def scenario_notes(junction_fits: bool, counts: ImportCounts) -> list[str]:
+    """Return what to know before trusting a scenario.
+
+    Parameters
+    ----------
+    junction_fits
+        Whether the junction is inside its region of interest.
+    counts
+        What happened to the objects of the map.
+    """
+    notes = []
+    if not junction_fits:
+        notes.append(f"the junction is larger than the region of interest (at most {junctions.ROI_MAX_M:g} m)")
+    heights = counts.heights.get("building", Counter())
+    if heights["default"]:
+        notes.append(
+            f"{heights['default']} of {heights.total()} buildings have neither height nor levels:"
+            f" {osm_solids.DEFAULT_BUILDING_M:g} m assumed"
+        )
+    return notes
+
+
+def solids_geojson(solids: Sequence[MappedSolid], counts: ImportCounts) -> str:
+    """Return GeoJSON in world-frame metres, one feature per line, with the import counts in its head."""
+    head = {
+        "type": "FeatureCollection",
+        "attribution": ATTRIBUTION,
+        "frame": f"metres, x and y of {NETWORK_FILE}; not longitude and latitude",
+        "crs": None,
+        "summary": counts.to_json(),
+    }
+    opening = json.dumps(head, indent=1, ensure_ascii=False).removesuffix("\n}")
+    lines = ",\n".join(json.dumps(solid.to_geojson(), ensure_ascii=False) for solid in solids)
+    return f'{opening},\n "features": [\n{lines}\n]}}\n'
+
+
+def sites_csv(poles: Sequence[KerbsidePole]) -> str:
+    """Return the table of candidate sites."""
+    rows = [f"k{number:02d},{pole.x_m},{pole.y_m}" for number, pole in enumerate(poles, 1)]
+    return "\n".join(["site,x_m,y_m", *rows, ""])
+
+
+def roi_table(roi: JunctionRegion) -> TomlTable:
+    """Return ``[roi]`` without the voxel size."""
+    comment = "the box in which visibility counts; its size is a whole number of voxels along each axis"
+    height_m = junctions.ROI_HEIGHT_M
+    return comment, {"center_m": [*roi.center_m, height_m / 2], "size_m": [*roi.size_m, height_m]}
+
+
+def voxel_keys() -> dict[str, Any]:
+    """Return the keys of ``[roi]`` that set the voxel size."""
+    return {"voxel_m": RoiConfig.model_fields["voxel_m"].default}
+
+
+def statics_table() -> TomlTable:
+    """Return ``[statics]``."""
+    comment = "buildings, trees, barriers, poles; the summary in the file counts what was assumed about them"
+    return comment, {"footprints": [STATICS_FILE]}
+
+
+def sites_table() -> TomlTable:
+    """Return ``[sites]`` without the keys of :func:`mount_keys`."""
+    comment = f"poles {junctions.KERB_M:g} m behind the kerbs of the junction; add or remove rows as you like"
+    return comment, {"file": SITES_FILE}
+
+
+def mount_keys() -> dict[str, Any]:
+    """Return the keys of ``[sites]`` that set sensor, heights and tilts of the candidates."""
+    return {"sensor": SENSOR, "heights_m": list(junctions.HEIGHTS_M), "aim": "roi", "pitch_deg": list(PITCHES_DEG)}
+
+
+def score_table() -> TomlTable:
+    """Return ``[score]``."""
+    return "", {"gamma": ScoreConfig.model_fields["gamma"].default, "rank_by": DEFAULT_SCORE}
+
+
+def toml_document(comments: Sequence[str], values: Mapping[str, Any], tables: Mapping[str, TomlTable]) -> Any:
+    """Make a TOML document.
+
+    Parameters
+    ----------
+    comments
+        Lines at the top.
+    values
+        Keys above all tables.
+    tables
+        Tables by name.
+
+    Returns
+    -------
+    tomlkit.TOMLDocument
+    """
+    document = tomlkit.document()
+    for comment in comments:
+        document.add(tomlkit.comment(comment))
+    document.add(tomlkit.nl())
+    document.update(values)
+    for table_name, (comment, keys) in tables.items():
+        table = tomlkit.item(keys)
+        if comment:
+            table.comment(comment)
+        document.add(tomlkit.nl()).add(table_name, table)
+        for key in keys:
+            if (table_name, key) in _KEY_COMMENTS:
+                table[key].comment(_KEY_COMMENTS[table_name, key])
+    return document
+
+
+def _scenario_toml(name: str, scenario: NewScenario) -> str:
+    title = scenario.junction.title
+    values: dict[str, Any] = {"description": title[0].upper() + title[1:], "seed": 1}
+    if name:
+        values = {"name": name} | values
+
+    roi_comment, roi = roi_table(scenario.roi)
+    sites_comment, sites = sites_table()
+    traffic = {
+        "network": NETWORK_FILE,
+        "frames": DEFAULT_FRAMES,
+        "frame_period_s": TrafficConfig.model_fields["frame_period_s"].default,
+        "warmup_s": DEFAULT_WARMUP_S,
+    }
+    tables = {
+        "roi": (roi_comment, roi | voxel_keys()),
+        "traffic": ("SUMO", traffic),
+        "statics": statics_table(),
+        "sites": (sites_comment, sites | mount_keys()),
+        "score": score_table(),
+    }
+    comments = [
+        f"A scenario made from OpenStreetMap. Map data {ATTRIBUTION} (openstreetmap.org/copyright).",
+        f"World frame: x east, y north in metres as in {NETWORK_FILE}, z up from the flat ground.",
+    ]
+    document = toml_document(comments, values, tables)
+    if scenario.flows:
+        document["traffic"].update({"counts": _counts_array(scenario.flows)})
+        document["traffic"]["counts"].comment("assumed from the road classes: replace them by real counts")
+    return tomlkit.dumps(document)
+
+
+def _counts_array(flows: Sequence[CountConfig]) -> Any:
+    """Return a TOML array with one flow per line."""
+    rows = tomlkit.array()
+    for flow in flows:
+        row = tomlkit.inline_table()
+        row.update(flow.model_dump(exclude_defaults=True))
+        rows.add_line(row)
+    rows.add_line(indent="")
+    return rows
+
+
+def publish_folder(folder: Path, texts: Iterable[tuple[str, str]], check: Callable[[Path], object]) -> None:
+    """Write files to a temporary folder, check it, and rename it: the folder appears complete or not at all.
+
+    Parameters
+    ----------
+    folder
+        Does not exist yet, or is empty.
+    texts
+        Name and content of each file.
+    check
+        Called with the temporary folder; raises if something is wrong with it.
+    """
+    target = folder.resolve()
+    partial = target.with_name(f".{target.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    try:
+        for name, text in texts:
+            files.write_text(partial / name, text)
+        check(partial)
+        if folder.is_dir():
+            folder.rmdir()
+        partial.replace(target)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise

@@ -1,0 +1,1 @@
+"""Running stages: order, cache, locks, and what makes a stage run again."""

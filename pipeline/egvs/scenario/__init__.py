@@ -1,0 +1,1 @@
+"""The scenario file ``scenario.toml``: its keys as typed models, and loading."""

@@ -1,0 +1,1 @@
+"""Scores of scans: EGVS, scores over vehicles, standard errors, blind spots."""

@@ -1,0 +1,204 @@
+r"""The published score: entropy of a TPOG, and the Entropy-Guided Visibility Score (EGVS) of a scan.
+
+.. math:: H(p) = -p \log_2 p - (1 - p) \log_2 (1 - p), \qquad
+          EGVS = \sum_v H(p(v)) \, \min(\gamma, hits(v))
+
+(arXiv 2504.06772, Eq. 2 and 4), with :math:`p = c / T` from integers. Voxels with equal counts share one entropy, so
+hits are first added up for each count (integers, no rounding). The sum over counts is taken in exact integer arithmetic
+and rounded once. The score is therefore the same for any order of voxels, beams, threads and sites.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from decimal import Decimal, localcontext
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egvs.core.errors import InputError
+from egvs.core.grid import FloatArray, Grid, IntArray
+from egvs.kernels import traversal
+
+Hits = NDArray[np.uint32] | NDArray[np.int64]
+"""Hits of each voxel, flat, (nx * ny * nz,): whole beams, or multiples of a fraction of a beam."""
+
+_DIGITS = 40
+_SCALE = 128
+"""Entropies are whole multiples of 2**-128: the smallest above 0, for T = 2**32 - 1, is 8e-9 with 53 bits."""
+
+
+def binary_entropy(count: int, frames: int) -> float:
+    """Return H(count / frames) in bits, correctly rounded (40 decimal digits inside, so equal on every machine).
+
+    Raises
+    ------
+    ValueError
+        Unless 0 <= count <= frames and frames >= 1.
+    """
+    if not 0 <= count <= frames or frames < 1:
+        raise ValueError(f"expected 0 <= count <= frames and frames >= 1, got count = {count} and frames = {frames}")
+    return float(_entropies([min(count, frames - count)], frames)[0])
+
+
+def _entropies(counts: list[int], frames: int) -> FloatArray:
+    """H of each count, correctly rounded: T log T - c log c - (T - c) log(T - c), over T log 2, in 40 digits."""
+    entropies = np.empty(len(counts))
+    with localcontext() as context:
+        context.prec = _DIGITS
+        t_ln_t = _n_ln_n(frames)
+        scale = frames * Decimal(2).ln()
+        for i, count in enumerate(counts):
+            entropies[i] = float((t_ln_t - _n_ln_n(count) - _n_ln_n(frames - count)) / scale)
+    return entropies
+
+
+def _n_ln_n(n: int) -> Decimal:
+    if n == 0:
+        return Decimal(0)
+    return n * Decimal(n).ln()
+
+
+@dataclass(frozen=True)
+class Score:
+    """``egvs`` in bits; ``entropy_seen``: share of the entropy in voxels crossed at least once."""
+
+    egvs: float
+    entropy_seen: float
+
+
+class ClassHits(NamedTuple):
+    """Hits added up by class of voxel, (classes,) int64 each.
+
+    ``capped``: voxels with at least ``cap`` hits; ``below``: sum of the hits in all others; ``crossed``: voxels with
+    any hit.
+    """
+
+    capped: IntArray
+    below: IntArray
+    crossed: IntArray
+
+
+def sum_hits_by_class(hits: Hits, cells: IntArray, classes: IntArray, n_classes: int, cap: float) -> ClassHits:
+    """Add up hits by class.
+
+    Parameters
+    ----------
+    hits
+        Of all voxels, flat.
+    cells, classes
+        Flat index and class of the voxels to sum, (n,) int64.
+    n_classes
+        Number of classes.
+    cap
+        In the unit of ``hits``; may be fractional or infinite.
+    """
+    sums = ClassHits(*(np.zeros(n_classes, dtype=np.int64) for _ in ClassHits._fields))
+    traversal.sum_by_class(hits, cells, classes, cap, *sums)
+    return sums
+
+
+@dataclass(frozen=True)
+class EntropyField:
+    """The entropy of a TPOG.
+
+    Attributes
+    ----------
+    grid
+        The grid of the voxels.
+    cells
+        Flat index of each voxel with entropy, (n,) int64, ascending.
+    classes
+        Which of ``entropies_bit`` each voxel has, (n,) int64.
+    entropies_bit
+        Entropy of each class, float64, above 0.
+    sizes
+        Number of voxels of each class, int64.
+    """
+
+    grid: Grid
+    cells: IntArray
+    classes: IntArray
+    entropies_bit: FloatArray
+    sizes: IntArray
+
+    @classmethod
+    def of(cls, counts: IntArray, frames: int, grid: Grid) -> EntropyField:
+        """Return the entropy of voxels that are occupied in ``counts`` (nx, ny, nz) int64 of ``frames`` frames."""
+        flat = counts.ravel()
+        largest = int(flat.max(initial=0))
+        if largest > frames:
+            raise InputError(
+                "tpog",
+                f"a voxel is occupied in {largest} of {frames} frames",
+                "Make the TPOG again from the trajectories.",
+            )
+
+        cells = np.flatnonzero((flat > 0) & (flat < frames))
+        folded = np.minimum(flat[cells], frames - flat[cells])
+        values, classes, sizes = np.unique(folded, return_inverse=True, return_counts=True)
+        entropies = _entropies(values.tolist(), frames)
+        return cls(grid, cells, classes.astype(np.int64), entropies, sizes.astype(np.int64))
+
+    @property
+    def per_cell_bit(self) -> FloatArray:
+        """Entropy of each voxel in ``cells``."""
+        return self.entropies_bit[self.classes]
+
+    @cached_property
+    def total_bit(self) -> float:
+        """The TPOG's entropy: the sum of H over all voxels."""
+        return self.limit(1.0)
+
+    def score(self, hits: Hits, gamma: float, unit: int = 1) -> Score:
+        """Return the score of one site.
+
+        Parameters
+        ----------
+        hits
+            Beams that cross each voxel, flat, (nx * ny * nz,) uint32, or int64 in multiples of 1 / ``unit``.
+        gamma
+            Cap, 0 or above, may be fractional or infinite.
+        unit
+            Hits that a whole beam adds to a voxel.
+        """
+        sums = sum_hits_by_class(hits, self.cells, self.classes, len(self.sizes), gamma * unit)
+        egvs = self._sum(gamma, sums.capped, sums.below, unit)
+        share = 0.0
+        if len(self.cells):
+            share = self._sum(1.0, sums.crossed, np.zeros_like(sums.crossed)) / self.total_bit
+        return Score(egvs, share)
+
+    def limit(self, gamma: float) -> float:
+        """Return the score with at least ``gamma`` hits in every voxel: no site can reach more."""
+        if not np.isinf(gamma):
+            return self._sum(gamma, self.sizes, np.zeros_like(self.sizes))
+        if len(self.cells):
+            return float("inf")
+        return 0.0
+
+    @cached_property
+    def _scaled(self) -> list[int]:
+        """Entropy of each class times 2**_SCALE, a whole number."""
+        scaled = []
+        for entropy in self.entropies_bit.tolist():
+            numerator, denominator = entropy.as_integer_ratio()
+            scaled.append((numerator << _SCALE) // denominator)
+        return scaled
+
+    def _sum(self, gamma: float, capped: IntArray, below: IntArray, unit: int = 1) -> float:
+        """Sum over classes of H * (gamma * capped + below / unit), exact, rounded once."""
+        numerator, denominator = 0, 1  # with an infinite gamma, no voxel is capped
+        if not np.isinf(gamma):
+            numerator, denominator = gamma.as_integer_ratio()
+
+        total = 0
+        for entropy, n_capped, hits_below in zip(self._scaled, capped.tolist(), below.tolist(), strict=True):
+            total += entropy * (numerator * unit * n_capped + denominator * hits_below)
+
+        try:
+            return float(total / (denominator * unit << _SCALE))
+        except OverflowError:  # a gamma near the largest float64, times the voxels
+            return float("inf")

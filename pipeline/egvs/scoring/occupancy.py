@@ -1,0 +1,286 @@
+r"""Occupied voxels of a record, the autocorrelation time of its traffic, and warnings about both.
+
+A voxel is occupied at a frame when a vehicle's box, made 0.1 mm smaller on each side, shares positive volume with it.
+The Traffic Probabilistic Occupancy Grid (arXiv 2504.06772, section III) is :math:`p(v) = c(v) / T`, with :math:`c(v)`
+the sum of counts over blocks and :math:`T` the number of frames. A voxel that static geometry fills has p = 1 and so no
+entropy; it is left out. Memory holds one block's counters and one batch of frames, however many frames there are.
+
+With :math:`\rho(t)` the autocorrelation at lag t of the number of boxes near the region, frame by frame, the integrated
+autocorrelation time is
+
+.. math:: \tau(M) = 1 + 2 \sum_{t=1}^{M} \rho(t)
+
+A mean over T frames is as accurate as one over :math:`T / \tau` independent frames. The window is Sokal's, the smallest
+:math:`M \ge 5 \tau(M)` (A. Sokal, Monte Carlo Methods in Statistical Mechanics, Cargese lectures, 1996, section 3),
+with one departure: :math:`\tau(M)` is the largest of the sums up to M. A signal makes the autocorrelation swing through
+negative values within a cycle; the plain sum then cancels, the window closes at half a cycle, and the correlation over
+full cycles is missed. The standard deviation of the estimate is :math:`\tau \sqrt{2 (2 M + 1) / T}` (equation 3.19
+there).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egvs.artefacts import parquet
+from egvs.artefacts.traffic_frames import FrameBoxes
+from egvs.core.errors import Diagnostic
+from egvs.core.grid import FloatArray, Grid, IntArray
+from egvs.kernels import occupancy
+from egvs.scenario.model import SCENARIO_FILE
+from egvs.world import clearances
+from egvs.world.mesh import World
+
+if TYPE_CHECKING:
+    from egvs.artefacts.tpog import Tpog
+    from egvs.sensors.sites import Site
+
+MEMORY_WINDOW = 5.0
+"""Sokal's c: the window in autocorrelation times."""
+
+_MEMORY_DIGITS = 3
+"""Decimals of an autocorrelation time: the last bits of an FFT depend on the machine."""
+
+
+class BlockCounts(NamedTuple):
+    """Frames in which each voxel is occupied, (nx, ny, nz) int32; boxes near the grid by frame, (frames,) int64."""
+
+    counts: NDArray[np.int32]
+    boxes_per_frame: IntArray
+
+
+def count_occupancy(batch: FrameBoxes, grid: Grid, frames: int) -> NDArray[np.int32]:
+    """Return in how many frames each voxel is occupied, (nx, ny, nz) int32.
+
+    ``batch`` holds the boxes (grid frame) of frames 0 to frames - 1.
+    """
+    return next(count_blocks(iter([batch]), grid, frames, 1)).counts
+
+
+def count_blocks(batches: Iterator[FrameBoxes], grid: Grid, block_frames: int, blocks: int) -> Iterator[BlockCounts]:
+    """Count the occupancy of one block of ``block_frames`` frames after another."""
+    nx, ny, nz = grid.shape
+    shape = np.asarray(grid.shape, dtype=np.int64)
+    steps = np.zeros((nz + 1, nx, ny), dtype=np.int32)
+    last_frame = np.full((3, nx, ny), -1, dtype=np.int64)
+    batch = FrameBoxes(np.empty(0, dtype=np.int64), np.empty((0, 8)))
+    for block in range(blocks):
+        start, end = block * block_frames, (block + 1) * block_frames
+        boxes_per_frame = np.zeros(block_frames, dtype=np.int64)
+        steps[:] = 0
+        while True:
+            in_block = int(np.searchsorted(batch.frame, end))
+            near = near_grid(batch.values[:in_block], grid)
+            frame = batch.frame[:in_block][near]
+            boxes_per_frame += np.bincount(frame - start, minlength=block_frames)
+            occupancy.count_boxes(frame, batch.values[:in_block][near], shape, grid.voxel_m, steps, last_frame)
+
+            batch = FrameBoxes(batch.frame[in_block:], batch.values[in_block:])
+            if len(batch.frame):
+                break  # the rest belongs to later blocks
+            next_batch = next(batches, None)
+            if next_batch is None:
+                break
+            batch = next_batch
+        occupancy.sum_layers(steps)
+        yield BlockCounts(np.ascontiguousarray(steps[:-1].transpose(1, 2, 0)), boxes_per_frame)
+
+
+def near_grid(values: FloatArray, grid: Grid) -> NDArray[np.bool_]:
+    """Return which boxes (n, 8), as ``FrameBoxes.values``, have a circumscribed ball that meets the grid."""
+    radius = 0.5 * np.sqrt((values[:, 5:8] ** 2).sum(axis=1))
+    centre = values[:, :3]
+    size = np.asarray(grid.roi.size_m)
+    near: NDArray[np.bool_] = ((centre + radius[:, None] > 0) & (centre - radius[:, None] < size)).all(axis=1)
+    return near
+
+
+def static_voxels(world: World, grid: Grid) -> NDArray[np.bool_]:
+    """Return the voxels that static geometry fills, wholly or in part (deeper than 0.1 mm), (nx, ny, nz) bool."""
+    shape = np.asarray(grid.shape, dtype=np.int64)
+    triangles = grid.to_grid_m(world.triangles_m)
+
+    # A winding number needs the triangles above the grid too, so only their plan is compared.
+    corners = triangles[:, :, :2]
+    size = np.asarray(grid.roi.size_m)[:2]
+    near = ((corners.max(axis=1) >= 0) & (corners.min(axis=1) <= size)).all(axis=1)
+
+    filled = np.zeros(grid.shape, dtype=np.bool_)
+    occupancy.mark_triangle_voxels(triangles[near], shape, grid.voxel_m, filled)
+
+    closed = near & world.closed[world.solid_of_face]
+    signs = world.signs[world.solid_of_face[closed]]
+    winding = np.zeros((*grid.shape[:2], grid.shape[2] + 1), dtype=np.int32)
+    occupancy.add_winding_numbers(triangles[closed], signs, shape, grid.voxel_m, winding)
+    filled |= np.cumsum(winding, axis=2)[:, :, :-1] != 0
+    return filled
+
+
+def autocorrelation_time(series: IntArray | FloatArray) -> float:
+    """Return the integrated autocorrelation time of a series (T,), in frames, at least 1; 1 for a constant series.
+
+    A time that is longer than the series can show is underestimated.
+    """
+    centred = np.asarray(series, dtype=np.float64) - np.mean(series)
+    frames = len(centred)
+    if frames < 2 or not centred.any():
+        return 1.0
+
+    spectrum = np.fft.rfft(centred, 2 * frames)
+    covariance = np.fft.irfft(spectrum.real**2 + spectrum.imag**2)[:frames]
+    sums = np.maximum.accumulate(2.0 * np.cumsum(covariance / covariance[0]) - 1.0)
+    closed = np.arange(frames) >= MEMORY_WINDOW * sums
+    window = frames - 1
+    if closed.any():
+        window = int(closed.argmax())
+    return round(float(sums[window]), _MEMORY_DIGITS)
+
+
+def memory_upper_bound(memory: float, frames: int) -> float:
+    """Return an autocorrelation time one standard deviation above the estimate from a record of so many frames."""
+    return memory * (1.0 + math.sqrt(2.0 * (2.0 * MEMORY_WINDOW * memory + 1.0) / frames))
+
+
+def standard_error_inflation(memory: float, frames: int, groups: int) -> float:
+    r"""Return the factor by which the scatter of consecutive groups of frames underestimates a standard error.
+
+    For an autocorrelation that decays as :math:`e^{-2 t / \tau}`, a mean over n frames has the variance
+
+    .. math:: \sigma^2 \tau f(n) / n, \qquad f(n) = 1 - (1 - e^{-x}) / x, \qquad x = 2 n / \tau
+
+    (Priestley, Spectral Analysis and Time Series, 1981, section 5.3). Groups are then correlated, and their scatter
+    underestimates the variance of the mean: of k groups with variance V each and V_T of all frames, it gives
+    (V - V_T) / (k - 1) instead of V_T.
+
+    Parameters
+    ----------
+    memory
+        Autocorrelation time of the traffic, in frames.
+    frames
+        Frames of the record.
+    groups
+        Number of groups that the record was cut into, at least 2.
+
+    Returns
+    -------
+    float
+        Factor for the standard error, at least 1; for the longest memory that the record does not exclude
+        (:func:`memory_upper_bound`).
+    """
+    longest = memory_upper_bound(memory, frames)
+    ratio = groups * _variance_share(2.0 * frames / groups / longest) / _variance_share(2.0 * frames / longest)
+    return max(1.0, math.sqrt((groups - 1.0) / (ratio - 1.0)))
+
+
+def _variance_share(x: float) -> float:
+    return 1.0 + math.expm1(-x) / x
+
+
+def warn_empty_region(boxes: float, trajectories: Path) -> Iterator[Diagnostic]:
+    """Warn where fewer than two vehicles are in the region of interest on average.
+
+    Where there is none at all, the warning says where ``trajectories.parquet`` has vehicles instead.
+    """
+    rule = "traffic in the region"
+    if boxes >= clearances.MIN_MEAN_VEHICLES:
+        return
+    if boxes == 0:
+        problem = f"no vehicle ever enters the region{_traffic_extent(trajectories)}: the sites cannot be ranked"
+        hint = "Move the region to where vehicles drive, add traffic, or check that both use the same coordinates."
+        yield Diagnostic(rule, "roi", problem, hint)
+    else:
+        problem = f"{boxes:.2g} vehicles are in the region on average: the ranking is based on very little traffic"
+        hint = "Add vehicles in [traffic], or use a region that covers more of the road."
+        yield Diagnostic(rule, "roi", problem, hint)
+
+
+def _traffic_extent(trajectories: Path) -> str:
+    """Where recorded vehicles are, in words; empty where there is none."""
+    table, _ = parquet.read_artefact(trajectories, "trajectories", ["x_m", "y_m"])
+    if not table.num_rows:
+        return ""
+    x, y = table.column("x_m").to_numpy(), table.column("y_m").to_numpy()
+    return f", all are between ({x.min():.0f}, {y.min():.0f}) and ({x.max():.0f}, {y.max():.0f})"
+
+
+def warn_empty_periods(boxes: Mapping[str, float]) -> Iterator[Diagnostic]:
+    """Warn about each period without a vehicle in the region, where another has some; boxes per frame by period."""
+    if not any(boxes.values()):
+        return
+    for period, mean in boxes.items():
+        if mean == 0:
+            yield Diagnostic(
+                "traffic in the region",
+                f"{SCENARIO_FILE}: traffic.periods ({period})",
+                "no vehicle ever enters the region of interest: the period only lowers the entropy of the mix",
+                "Check that all periods use the same coordinates and that their traffic passes through the region.",
+            )
+
+
+def warn_traffic_through_solids(
+    hidden: IntArray, visible: int, voxels: IntArray, grid: Grid, world: World
+) -> Iterator[Diagnostic]:
+    """Warn where vehicles occupy what static geometry fills.
+
+    Parameters
+    ----------
+    hidden
+        In how many frames each voxel that static geometry fills is occupied, (k,).
+    visible
+        The same, summed over all other voxels.
+    voxels
+        Flat index of the voxels that static geometry fills, (k,).
+    grid, world
+        Grid of the voxels, and static geometry.
+    """
+    share = int(hidden.sum()) / max(1, int(hidden.sum()) + visible)
+    if share <= clearances.MAX_SHARE_IN_SOLIDS:
+        return
+    worst = np.array(np.unravel_index(voxels[int(np.argmax(hidden))], grid.shape))
+    at_m = np.asarray(grid.origin_m) + (worst + 0.5) * grid.voxel_m
+    point = ", ".join(f"{value:.1f}" for value in at_m)
+    problem = f"{share:.1%} of the volume that vehicles occupy is inside solids, most often at ({point})"
+    solid = _solid_at(world, at_m, grid.voxel_m)
+    if solid:
+        problem += f", in {solid}"
+    yield Diagnostic("traffic through solids", "statics", problem, "Move the solids, or check the coordinates of both.")
+
+
+def _solid_at(world: World, at_m: FloatArray, within_m: float) -> str:
+    """The first solid whose triangles come so near to a point along each axis that they may fill its voxel."""
+    corners = world.triangles_m
+    near = (corners.min(axis=1) <= at_m + within_m).all(axis=1) & (corners.max(axis=1) >= at_m - within_m).all(axis=1)
+    for solid in np.unique(world.solid_of_face[near]):
+        name, kind = world.solids[solid]
+        if kind != "ground":
+            return f"{name} ({kind})"
+    return ""
+
+
+def warn_sites_in_traffic(sites: Iterable[Site], tpog: Tpog) -> Iterator[Diagnostic]:
+    """Warn about each site that is, no higher than the clearance, where vehicles drive in some frame."""
+    grid = tpog.grid
+    for site in sites:
+        at_m = np.array(site.pose.position_m)
+        ix, iy, _ = np.floor((at_m - grid.origin_m) / grid.voxel_m).astype(np.int64)
+        if not (0 <= ix < grid.shape[0] and 0 <= iy < grid.shape[1]):
+            continue
+        column = tpog.counts[ix, iy]
+        layers = np.flatnonzero(column)
+        if not len(layers):
+            continue
+        height_m = at_m[2] - (grid.origin_m[2] + layers[0] * grid.voxel_m)
+        if height_m <= clearances.CLEARANCE_M:
+            share = column.max() / tpog.frames
+            yield Diagnostic(
+                "sites on the road",
+                f"site {site.name}",
+                f"vehicles drive through its position ({at_m[0]:g}, {at_m[1]:g}) in {share:.1%} of the frames",
+                f"Move it beside the road, or more than {clearances.CLEARANCE_M:g} m above it.",
+            )

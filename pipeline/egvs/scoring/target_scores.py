@@ -1,0 +1,255 @@
+r"""Scores over vehicles: points on target, share seen well, expected detections.
+
+Each score is the weighted mean of a function of what a site sees of each of the N vehicle-frames of a record
+(:func:`egvs.scoring.targets.weighted_mean`).
+
+*Points*: a concave gain g of the points :math:`n_i` on a vehicle, with everything else in the way.
+
+.. math:: \frac{1}{N} \sum_{i=1}^{N} g(n_i)
+
+A first point on a vehicle is worth more than a hundredth, so that one vehicle seen very well does not make up for one
+that is missed. g(0) = 0: a vehicle without a point is in a blind spot of the site.
+
+*Expected detections*: the probability that a detector finds the vehicle, from what the site sees of it.
+
+.. math:: \frac{1}{N} \sum_{i=1}^{N} p(x_i), \qquad p(x) = \frac{1}{1 + e^{-b - \sum_t f_t(x)}}
+
+x are :data:`FEATURES`, f_t the trees of a boosted model. The model rises with points, points on sides, spans and the
+gap to the neighbour, and falls with the hole between points and with steepness (:data:`MONOTONICITY`); it is free in
+range, length and the angle of view. A vehicle without any point is never detected.
+
+The parameters of the model are data, ``target_scores.json`` beside this module. They were learnt from what each
+detector found, and missed, on junctions that no result is quoted for (``benchmarks/detectability`` fits them again;
+docs/validity.md shows how well they hold elsewhere). A detection is a box that overlaps the vehicle by more than 0.7,
+in the mean of the overlaps in plan and in space.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.special import expit
+
+from egvs.core.grid import FloatArray, IntArray
+from egvs.kernels.vehicle_visibility import add_trees
+from egvs.scoring.blindspots import SpotVisibility
+from egvs.scoring.targets import SEEN_WELL_POINTS, VisibleTargets, weighted_mean
+
+Gain = Callable[[FloatArray], FloatArray]
+"""Gain of points (n,) on vehicles, (n,)."""
+
+TargetScore = Callable[[VisibleTargets], FloatArray]
+"""Score of each vehicle-frame that a site sees, (n,)."""
+
+MODEL_FILE = Path(__file__).with_name("target_scores.json")
+
+DETECTORS = ("cluster", "pointpillars")
+"""Detectors that have a model."""
+
+ISOLATED_GAP_M = 20.0
+"""A neighbour farther away than this has no influence."""
+
+MONOTONICITY = {
+    "log_points": 1,
+    "log_points_on_sides": 1,
+    "length_share": 1,
+    "width_share": 1,
+    "hole_m": -1,
+    "gap_m": 1,
+    "depression_deg": -1,
+    "length_m": 0,
+    "range_m": 0,
+    "side": 0,
+}
+"""For each feature, whether the probability rises with it (1), falls (-1), or may do either (0)."""
+
+FEATURES = tuple(MONOTONICITY)
+"""Features of the model, see :class:`egvs.scoring.targets.VisibleTargets`: logarithms of 1 + points, gaps of at most
+:data:`ISOLATED_GAP_M`."""
+
+
+@dataclass(frozen=True)
+class SiteTargetScores:
+    """The scores of one site over vehicles, by name.
+
+    Attributes
+    ----------
+    scores
+        Of all vehicle-frames, then with each group of frames left out, (1 + k,) float64; (1,) without standard errors.
+        NaN where no vehicle counts.
+    by_period
+        Scores in each period alone, in their order; empty without periods.
+    missed
+        Where the site misses vehicles; None unless requested.
+    """
+
+    scores: Mapping[str, FloatArray]
+    by_period: tuple[Mapping[str, float], ...] = ()
+    missed: SpotVisibility | None = None
+
+
+def log_points(points: FloatArray) -> FloatArray:
+    r"""Return :math:`g(n) = \ln(1 + n)`."""
+    gain: FloatArray = np.log1p(points)
+    return gain
+
+
+def saturating_gain(points: FloatArray) -> FloatArray:
+    r"""Return :math:`g(n) = 1 - e^{-n / n_0}`, from 0 to 1, with :data:`SEEN_WELL_POINTS`."""
+    gain: FloatArray = -np.expm1(-points / SEEN_WELL_POINTS)
+    return gain
+
+
+def points_on_target(visible: VisibleTargets, gain: Gain = log_points, weight: FloatArray | None = None) -> float:
+    """Return the mean gain of a site's points; NaN without any vehicle.
+
+    Parameters
+    ----------
+    visible
+        What the site sees.
+    gain
+        Gain of the points on a vehicle.
+    weight
+        Weight of each vehicle-frame, (n,) float64, 0 or above; equal weights where it is None.
+    """
+    return weighted_mean(gain(visible.points), weight)
+
+
+def seen_well(visible: VisibleTargets, weight: FloatArray | None = None) -> float:
+    """Return the share of vehicles that a site sees well, 0 to 1; parameters as in :func:`points_on_target`."""
+    return points_on_target(visible, saturating_gain, weight)
+
+
+def expected_detections(
+    visible: VisibleTargets, detectors: Sequence[str] = DETECTORS, weight: FloatArray | None = None
+) -> float:
+    """Return the share of vehicles that detectors are expected to find, 0 to 1; NaN without any vehicle.
+
+    Parameters
+    ----------
+    visible
+        What the site sees.
+    detectors
+        Detectors whose probabilities are averaged.
+    weight
+        Weight of each vehicle-frame, (n,) float64, 0 or above; equal weights where it is None.
+    """
+    if not len(visible):
+        return math.nan
+    return weighted_mean(detection_chances(visible, detectors), weight)
+
+
+def detection_chances(visible: VisibleTargets, detectors: Sequence[str] = DETECTORS) -> FloatArray:
+    """Return the probability that each vehicle-frame is detected, averaged over detectors, (n,) float64, 0 to 1.
+
+    Raises
+    ------
+    KeyError
+        For a detector without a model.
+    """
+    features = detectability_features(visible)
+    chances: FloatArray = np.mean([detectability_model(name).chances(features) for name in detectors], axis=0)
+    return np.where(visible.points > 0.0, chances, 0.0)
+
+
+def detectability_features(visible: VisibleTargets) -> FloatArray:
+    """Return :data:`FEATURES` of what a site sees, (n, f) float64."""
+    return np.column_stack([
+        np.log1p(visible.points),
+        np.log1p(visible.points_on_sides),
+        visible.length_share,
+        visible.width_share,
+        visible.hole_m,
+        np.minimum(visible.record.gap_m, ISOLATED_GAP_M),
+        visible.depression_deg,
+        visible.record.boxes[:, 3],
+        visible.range_m,
+        visible.side,
+    ])  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class DetectabilityModel:
+    """Boosted trees over :data:`FEATURES`, as :func:`egvs.kernels.vehicle_visibility.add_trees` takes them.
+
+    Attributes
+    ----------
+    base
+        b, the logit before any tree.
+    starts
+        Nodes starts[t] to starts[t + 1] are those of tree t, (trees + 1,) int64.
+    feature, threshold
+        Index of the feature that a node splits, -1 for a leaf, (nodes,) int64; and where, (nodes,) float64.
+    left, right
+        Children of each node, counted from the first of its tree, (nodes,) int64.
+    value
+        Value of each leaf, (nodes,) float64.
+    """
+
+    base: float
+    starts: IntArray
+    feature: IntArray
+    threshold: FloatArray
+    left: IntArray
+    right: IntArray
+    value: FloatArray
+
+    @classmethod
+    def of(cls, entry: dict[str, Any]) -> DetectabilityModel:
+        """Parse an entry of the file: a tree is a list of nodes [feature, threshold, left, right] or [value]."""
+        starts = np.append(0, np.cumsum([len(tree) for tree in entry["trees"]], dtype=np.int64))
+        feature = np.full(starts[-1], -1, dtype=np.int64)
+        left, right = np.zeros(starts[-1], dtype=np.int64), np.zeros(starts[-1], dtype=np.int64)
+        threshold, value = np.zeros(starts[-1]), np.zeros(starts[-1])
+        nodes = [node for tree in entry["trees"] for node in tree]
+        for i, node in enumerate(nodes):
+            if len(node) == 4:
+                feature[i], threshold[i], left[i], right[i] = node
+            else:
+                value[i] = node[0]
+        return cls(entry["base"], starts, feature, threshold, left, right, value)
+
+    def chances(self, features: FloatArray) -> FloatArray:
+        """Return the probability for each row of :data:`FEATURES` (n, f), (n,), 0 to 1."""
+        columns = np.ascontiguousarray(features.T)
+        logit = np.full(len(features), self.base)
+        nodes = self.feature, self.threshold, self.left, self.right, self.value
+        add_trees(columns, self.starts, *nodes, logit)
+        chance: FloatArray = expit(logit)
+        return chance
+
+
+@cache
+def detectability_model(detector: str) -> DetectabilityModel:
+    """Return the model of one of :data:`DETECTORS`."""
+    return DetectabilityModel.of(json.loads(MODEL_FILE.read_text(encoding="utf-8"))["detectors"][detector])
+
+
+def _score_detection(visible: VisibleTargets) -> FloatArray:
+    """Probability of detection; for people, for whom no model is calibrated, the gain that saturates."""
+    if not len(visible):
+        return np.empty(0)
+    return np.where(visible.record.are_people, saturating_gain(visible.points), detection_chances(visible))
+
+
+def _score_points(visible: VisibleTargets) -> FloatArray:
+    return log_points(visible.points)
+
+
+def _score_seen_well(visible: VisibleTargets) -> FloatArray:
+    return saturating_gain(visible.points)
+
+
+TARGET_SCORES: Mapping[str, TargetScore] = {
+    "expected_detections": _score_detection,
+    "points_on_target": _score_points,
+    "seen_well": _score_seen_well,
+}
+"""Scores of vehicle-frames by the names that ``[score] rank_by`` and ``additional`` use."""

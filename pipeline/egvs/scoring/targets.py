@@ -1,0 +1,584 @@
+r"""Vehicles of recorded frames, and what a site sees of each of them.
+
+Steps: read some frames of ``trajectories.parquet``, evenly spread over the record; arrange their boxes for the kernels;
+compute once for all sites what depends on traffic alone (:class:`TargetRecord`); count for each site the beams that
+meet each vehicle first (:func:`visible_targets`); average over vehicles (:func:`weighted_mean`), over all of them and
+with each group of frames left out (:class:`FrameGroups`).
+
+Targets are the boxes of :meth:`egvs.artefacts.traffic_frames.TrafficFrame.target_rows`: centre in the region of
+interest, one box for each part of an articulated vehicle, pedestrians and bicycles only on request. Each such box in a
+frame is one *vehicle-frame*, a row here. All other boxes of a frame only occlude.
+
+Visibility follows from the empty scan alone: the boxes of a frame are put into it, and a beam ends on the first box
+that it enters (made 0.1 mm smaller on each side, as everywhere). Boxes are plain boxes here, as for the TPOG.
+
+Limits: beams that cannot meet the region of interest were not cast, so the part of a vehicle outside the region gets no
+or few points, and vehicles entirely beyond the region occlude nothing. (At ingolstadt it would change 6 of 24,888
+counts.) Where effects lose returns, the points of an unoccluded vehicle are thinned by the probability at the range of
+its centre.
+
+Standard errors of means over vehicle-frames: neighbouring vehicle-frames are correlated, so errors come from the blocks
+of frames that the TPOG was counted in, joined to groups as for the EGVS (:mod:`egvs.scoring.standard_errors`). A mean
+over vehicle-frames is a ratio of two sums, of values and of vehicles. Traffic changes both, so the group is left out of
+both,
+
+.. math:: S_{(g)} = \frac{\sum_i v_i - \sum_{i \in g} v_i}{N - N_g}
+
+and :class:`egvs.scoring.standard_errors.ScoreUncertainty` computes standard errors, intervals and comparisons from
+them. Where traffic is a mix of records (periods), a vehicle-frame counts as often as the mix takes its frame, divided
+by the share of frames that are replayed; the rest of a record without a group keeps the record's weight.
+
+``[score.weights]`` weights each vehicle-frame: the weight of its kind times that of every zone that contains its
+centre.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egvs.artefacts import parquet, traffic_frames
+from egvs.artefacts.tpog import PeriodBlocks, read_periods
+from egvs.artefacts.traffic_frames import NON_VEHICLE_KINDS, TrafficFrame
+from egvs.core.errors import Diagnostic
+from egvs.core.grid import FloatArray, Grid, IntArray
+from egvs.effects.base import Detect
+from egvs.kernels import occlusion, vehicle_visibility
+from egvs.scenario.model import SCENARIO_FILE
+from egvs.scenario.score_config import WeightsConfig
+from egvs.scoring.standard_errors import BlockGroups, block_groups
+from egvs.scoring.visibility import Beams
+from egvs.sensors.scene import Scene
+from egvs.sensors.sensor import Sensor
+
+Floats = FloatArray
+
+REPLAYED_FRAMES = 250
+"""Number of frames that are replayed, evenly spread over the record."""
+
+SEEN_WELL_POINTS = 20.0
+"""n0: a vehicle with this many points is seen well by 63 %, with three times as many by 95 %."""
+
+_KERNEL_ORDER = [0, 1, 2, 6, 7, 3, 4, 5]
+"""Columns of ``traffic_frames.BOX_COLUMNS`` and pitch, as kernels take a box: centre, yaw, pitch, sizes."""
+
+_BANDS = 16
+"""Number of bands of slopes that beams are sorted into."""
+
+_SAME_SLOPE = 1e-9
+"""Slopes of one ring of a sensor differ by rounding alone, and belong to one band."""
+
+_MAX_HITS = 2**17
+"""Hits that are listed at once: bounds the memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class AllBoxes:
+    """Every box of the replayed frames, as kernels take them, in the grid's frame.
+
+    Attributes
+    ----------
+    starts
+        Boxes starts[f] to starts[f + 1] are those of frame f, (frames + 1,) int64.
+    values
+        Centre, yaw, pitch, length, width, height, (b, 8) float64, metres and radians.
+    low, high
+        Corners of the axis-aligned bounding box of each, (b, 3) float64, metres.
+    """
+
+    starts: IntArray
+    values: FloatArray
+    low: FloatArray
+    high: FloatArray
+
+    @classmethod
+    def of(cls, frames: Sequence[TrafficFrame], grid: Grid) -> AllBoxes:
+        """Collect the boxes of frames, which are in the world frame."""
+        rows = [np.column_stack([frame.boxes, frame.pitch_rad])[:, _KERNEL_ORDER] for frame in frames]
+        values = np.ascontiguousarray(np.concatenate([np.empty((0, 8)), *rows]))
+        values[:, :3] = grid.to_grid_m(values[:, :3])
+        low, high = np.empty((len(values), 3)), np.empty((len(values), 3))
+        occlusion.box_bounds(values, low, high)
+        ends = np.cumsum([len(frame_rows) for frame_rows in rows], dtype=np.int64)
+        return cls(np.append(0, ends), values, low, high)
+
+
+@dataclass(frozen=True, eq=False)
+class TargetRecord:
+    """Vehicle-frames, frame after frame, in the order of the trajectories; n of them.
+
+    Attributes
+    ----------
+    grid
+        Vehicles in its region of interest are the targets.
+    numbers
+        Numbers of the replayed frames in their record, (frames,) int64, ascending; with or without vehicles.
+    frame
+        Index into ``numbers`` of each row, (n,) int64, ascending.
+    vehicles, vehicle
+        SUMO's identifiers, sorted; and the index of each row's, (n,) int64.
+    kinds, kind
+        SUMO's vClasses, sorted; and the index of each row's, (n,) int64.
+    part
+        0, or 1.. for the rear parts of an articulated vehicle, (n,) int64.
+    boxes
+        Centre in the world frame, length, width, height, heading, (n, 7) float64, as
+        :data:`egvs.artefacts.traffic_frames.BOX_COLUMNS`.
+    pitch_rad
+        Nose up, (n,) float64.
+    gap_m
+        Smallest distance in plan from the box's rectangle to that of any other vehicle of the frame, in the region or
+        not, (n,) float64; 0 where they overlap, infinity where there is none. The parts of an articulated vehicle are
+        neighbours of each other, as they are separate boxes; people are not neighbours.
+    all_boxes, row
+        Every box of the frames, and the index of each row's box, (n,) int64.
+    """
+
+    grid: Grid
+    numbers: IntArray
+    frame: IntArray
+    vehicles: tuple[str, ...]
+    vehicle: IntArray
+    kinds: tuple[str, ...]
+    kind: IntArray
+    part: IntArray
+    boxes: FloatArray
+    pitch_rad: FloatArray
+    gap_m: FloatArray
+    all_boxes: AllBoxes
+    row: IntArray
+
+    def __len__(self) -> int:
+        """Number of vehicle-frames."""
+        return len(self.row)
+
+    @property
+    def are_people(self) -> NDArray[np.bool_]:
+        """Which rows are on foot or on a bicycle, (n,)."""
+        return np.array([kind in NON_VEHICLE_KINDS for kind in self.kinds], dtype=np.bool_)[self.kind]
+
+    @classmethod
+    def read(cls, path: Path, grid: Grid, frames: int = REPLAYED_FRAMES, people: Collection[str] = ()) -> TargetRecord:
+        """Read ``trajectories.parquet``.
+
+        Parameters
+        ----------
+        path
+            The file.
+        grid
+            Its region of interest contains the targets.
+        frames
+            Number of frames, evenly spread over the record; all for 0, or for more than there are.
+        people
+            vClasses of pedestrians and bicycles that are targets too.
+
+        Raises
+        ------
+        InputError
+            For a file that is corrupt or out of order.
+        """
+        recorded = int(parquet.read_metadata(path, "trajectories")["frames"])
+        numbers = traffic_frames.spaced_frames(recorded, frames)
+        return cls.of(list(traffic_frames.read_frames(path, numbers)), grid, people)
+
+    @classmethod
+    def of(cls, frames: Sequence[TrafficFrame], grid: Grid, people: Collection[str] = ()) -> TargetRecord:
+        """Collect the targets of frames, in the order of their record; parameters as in :meth:`read`."""
+        boxes = AllBoxes.of(frames, grid)
+        no_index = np.empty(0, dtype=np.int64)
+        rows_by_frame = [frame.target_rows(grid.roi, people) for frame in frames]
+        frame_index = np.repeat(np.arange(len(frames), dtype=np.int64), [len(rows) for rows in rows_by_frame])
+        row = boxes.starts[frame_index] + np.concatenate([no_index, *rows_by_frame])
+
+        names: list[str] = []
+        kind_names: list[str] = []
+        for frame, rows in zip(frames, rows_by_frame, strict=True):
+            names += [frame.vehicles[i] for i in rows]
+            kind_names += [frame.kinds[i] for i in rows]
+        vehicles, vehicle = _index_names(names)
+        kinds, kind = _index_names(kind_names)
+
+        is_vehicle = np.concatenate([np.empty(0, dtype=np.bool_), *(frame.are_vehicles() for frame in frames)])
+        return cls(
+            grid=grid,
+            numbers=np.array([frame.number for frame in frames], dtype=np.int64),
+            frame=frame_index,
+            vehicles=vehicles,
+            vehicle=vehicle,
+            kinds=kinds,
+            kind=kind,
+            part=np.concatenate([no_index, *(frame.part for frame in frames)])[row],
+            boxes=np.concatenate([np.empty((0, 7)), *(frame.boxes for frame in frames)])[row],
+            pitch_rad=boxes.values[row, 4],
+            gap_m=_neighbour_gaps(boxes, row, is_vehicle),
+            all_boxes=boxes,
+            row=row,
+        )
+
+
+def _index_names(names: Sequence[str]) -> tuple[tuple[str, ...], IntArray]:
+    """The distinct names, sorted, and the index of each name among them."""
+    distinct = sorted(set(names))
+    index = {name: i for i, name in enumerate(distinct)}
+    return tuple(distinct), np.array([index[name] for name in names], dtype=np.int64)
+
+
+def _neighbour_gaps(boxes: AllBoxes, row: IntArray, is_vehicle: NDArray[np.bool_]) -> FloatArray:
+    """Gap in plan from the boxes in ``row`` to their nearest neighbours, metres."""
+    footprints, gap_m = np.empty((len(boxes.values), 6)), np.empty(len(boxes.values))
+    vehicle_visibility.footprints(boxes.values, footprints)
+    is_target = np.zeros(len(boxes.values), dtype=np.bool_)
+    is_target[row] = True
+    vehicle_visibility.neighbour_distances(boxes.starts, footprints, is_target, is_vehicle, gap_m)
+    return gap_m[row]
+
+
+@dataclass(frozen=True, eq=False)
+class VisibleTargets:
+    """What one site sees of the vehicle-frames of a record, row by row, n of them.
+
+    Attributes
+    ----------
+    record
+        The vehicle-frames.
+    points
+        Beams that meet the vehicle first, with the static world and all other boxes in the way, (n,) float64: a whole
+        number; an expectation where effects weight beams or lose returns.
+    points_alone
+        The same with no other box in the way, (n,) float64.
+    points_on_sides
+        Those of ``points`` that are not on its roof (or, from below, its underside), (n,) float64.
+    length_share, width_share
+        Share of the vehicle's length and of its width between the outermost of its points, along the box's axes, (n,)
+        float64, 0 to 1; 0 without a point. Where effects weight beams or lose returns, a beam whose point has any
+        probability at all counts in full.
+    hole_m
+        Longest stretch of the vehicle's length, between its outermost points, without a point, (n,) float64, to 1/64 of
+        its length; 0 without a point. Counted as the shares are.
+    range_m
+        From the sensor to the box's centre, (n,) float64.
+    depression_deg
+        Angle of the box's centre below the sensor's horizon, (n,) float64, -90 to 90.
+    side
+        Sine of the angle in plan between the line of sight and the vehicle's length, (n,) float64: 0 from ahead or
+        behind, 1 broadside.
+    """
+
+    record: TargetRecord
+    points: FloatArray
+    points_alone: FloatArray
+    points_on_sides: FloatArray
+    length_share: FloatArray
+    width_share: FloatArray
+    hole_m: FloatArray
+    range_m: FloatArray
+    depression_deg: FloatArray
+    side: FloatArray
+
+    def __len__(self) -> int:
+        """Number of vehicle-frames."""
+        return len(self.points)
+
+
+def visible_targets(
+    record: TargetRecord, beams: Beams, noticed: Callable[[FloatArray], FloatArray] | None = None
+) -> VisibleTargets:
+    """Return what a site sees of the vehicle-frames of a record.
+
+    Parameters
+    ----------
+    record
+        Recorded traffic; the same for all sites.
+    beams
+        The site's empty scan.
+    noticed
+        Probability that a return from each range (n,) is detected; 1 where it is None.
+    """
+    row, boxes = record.row, record.all_boxes.values[record.row]
+    length_m, yaw_rad = boxes[:, 5], boxes[:, 3]
+    sensor_m = record.grid.to_grid_m(np.asarray(beams.pose.position_m))
+    away_m = boxes[:, :3] - sensor_m
+    range_m = np.sqrt((away_m**2).sum(axis=1))
+    run_m = np.hypot(away_m[:, 0], away_m[:, 1])
+    across_m = np.abs(away_m[:, 1] * np.cos(yaw_rad) - away_m[:, 0] * np.sin(yaw_rad))
+
+    hits = _count_points(record, sensor_m, beams, noticed)
+    points_alone = hits.alone[row]
+    if noticed is not None:
+        points_alone = points_alone * noticed(range_m)
+    low, high = hits.low[row], hits.high[row]
+    has_points = high >= low
+    spans = np.zeros((len(row), 2))
+    spans[has_points] = (high[has_points] - low[has_points]) / boxes[:, 5:7][has_points]
+    hole = np.zeros(len(row))
+    vehicle_visibility.longest_slice_gaps(hits.slices[row], hole)
+    return VisibleTargets(
+        record=record,
+        points=hits.points[row],
+        points_alone=points_alone,
+        points_on_sides=hits.on_sides[row],
+        length_share=spans[:, 0],
+        width_share=spans[:, 1],
+        hole_m=hole * length_m,
+        range_m=range_m,
+        depression_deg=np.degrees(np.arctan2(-away_m[:, 2], run_m)),
+        side=np.divide(across_m, run_m, out=np.zeros(len(row)), where=run_m > 0.0),
+    )
+
+
+def detection_probability(scene: Scene, sensor: Sensor) -> Callable[[FloatArray], FloatArray] | None:
+    """Return the probability that a return from each range (n,) is detected, with all effects of a scene.
+
+    None where no effect loses returns.
+    """
+    effects: tuple[Detect[Any], ...] = scene.acting(Detect, "score")
+    if not effects:
+        return None
+
+    def probability(range_m: FloatArray) -> FloatArray:
+        product = np.ones(len(range_m))
+        for effect in effects:
+            product = product * effect.detect(range_m, sensor)
+        return product
+
+    return probability
+
+
+class _BoxHits(NamedTuple):
+    """Points on every box of a record, (b,); ``low`` and ``high`` bound them along the box's axes, (b, 2), metres."""
+
+    alone: FloatArray
+    """With no other box in the way and every return detected."""
+    points: FloatArray
+    on_sides: FloatArray
+    slices: NDArray[np.uint64]
+    """Which slices of the box's length have points, as bits."""
+    low: FloatArray
+    high: FloatArray
+
+
+def _count_points(
+    record: TargetRecord, sensor_m: FloatArray, site: Beams, noticed: Callable[[FloatArray], FloatArray] | None
+) -> _BoxHits:
+    boxes, count = record.all_boxes, len(record.all_boxes.values)
+    bands = 1  # then shares are added in the order of azimuths alone
+    if site.weight is None and noticed is None:
+        bands = _BANDS
+    beams = _sort_into_bands(site, bands)
+    is_target = np.zeros(count, dtype=np.bool_)
+    is_target[record.row] = True
+    all_boxes = boxes.starts, boxes.values, boxes.low, boxes.high, is_target
+
+    bounds = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
+    result = _BoxHits(np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count, dtype=np.uint64), *bounds)
+    owner = np.full(len(beams.weight), -1, dtype=np.int32)
+    range_m = beams.length_m.copy()
+    capacity = 0
+    if noticed is not None:
+        capacity = max(_MAX_HITS, len(beams.weight))
+    hits = (np.empty(capacity, dtype=np.int64), np.empty(capacity, dtype=np.int64), *np.empty((3, capacity)))
+
+    size_m = np.asarray(record.grid.roi.size_m)
+    frame = 0
+    while frame < len(record.numbers):
+        frame, filled = vehicle_visibility.first_hits(
+            frame, sensor_m, size_m, all_boxes, tuple(beams), owner, range_m, tuple(result), hits
+        )
+        if noticed is not None:
+            box, row, hit_range_m, along_m, across_m = (column[:filled] for column in hits)
+            weight = beams.weight[row] * noticed(hit_range_m)
+            vehicle_visibility.accumulate_hits(box, weight, along_m, across_m, boxes.values, tuple(result[1:]))
+    return result
+
+
+class _SortedBeams(NamedTuple):
+    """Beams as :func:`egvs.kernels.vehicle_visibility.first_hits` takes them."""
+
+    starts: IntArray
+    slopes: FloatArray
+    azimuth_rad: FloatArray
+    directions: FloatArray
+    length_m: FloatArray
+    weight: FloatArray
+
+
+def _sort_into_bands(beams: Beams, bands: int) -> _SortedBeams:
+    """Sort beams into bands of slopes with as many beams in each, and by azimuth in a band."""
+    ends = beams.ends_m
+    azimuth = np.arctan2(ends[:, 1], ends[:, 0])
+    run_m = np.sqrt(ends[:, 0] ** 2 + ends[:, 1] ** 2)
+    length_m = np.sqrt((ends[:, 0] ** 2 + ends[:, 1] ** 2) + ends[:, 2] ** 2)
+    with np.errstate(invalid="ignore", divide="ignore"):  # a beam without length meets nothing; one may be vertical
+        slope = np.nan_to_num(ends[:, 2] / run_m)
+        directions = ends.T / length_m
+
+    limits = slope
+    if len(slope):
+        limits = np.sort(slope)[len(slope) * np.arange(1, bands) // bands]
+    band = np.searchsorted(np.unique(limits), slope + _SAME_SLOPE)
+    rows = np.lexsort((azimuth, band))
+    starts = np.flatnonzero(np.diff(band[rows], prepend=-1))
+    slopes = np.column_stack([np.minimum.reduceat(slope[rows], starts), np.maximum.reduceat(slope[rows], starts)])
+    weight = np.ones(len(rows))
+    if beams.weight is not None:
+        weight = beams.weight[rows]
+    # np.take, not directions[:, rows]: the kernel's loops need each axis contiguous.
+    directions = np.take(directions, rows, axis=1)
+    return _SortedBeams(np.append(starts, len(rows)), slopes, azimuth[rows], directions, length_m[rows], weight)
+
+
+def weighted_mean(values: FloatArray, weight: FloatArray | None = None) -> float:
+    """Return the mean over vehicle-frames (n,), independent of their order; NaN without any weight."""
+    if weight is None:
+        weight = np.ones(len(values))
+    total = math.fsum(weight)
+    if not total > 0.0:
+        return math.nan
+    return math.fsum(values * weight) / total
+
+
+def recorded_frames(trajectories: Path) -> list[int]:
+    """Return how many frames ``trajectories.parquet`` has of each record; one record where there are no periods."""
+    metadata = parquet.read_metadata(trajectories, "trajectories")
+    return [int(record["frames"]) for record in metadata.get("periods", [metadata])]
+
+
+def weights_in_mix(periods: Sequence[PeriodBlocks], recorded: Sequence[int], record: TargetRecord) -> FloatArray:
+    """Return the weight of each vehicle-frame in a mix of periods, (n,) float64; 1 without a mix.
+
+    ``recorded`` is the number of frames of each period.
+    """
+    weight = np.ones(len(record.numbers))
+    start = 0
+    for period, frames in zip(periods, recorded, strict=True):
+        in_period = (record.numbers >= start) & (record.numbers < start + frames)
+        if len(periods) > 1 and in_period.any():
+            weight[in_period] = period.times * period.frames / in_period.sum()
+        start += frames
+    return weight[record.frame]
+
+
+@dataclass(frozen=True, eq=False)
+class FrameGroups:
+    """Groups of blocks that the vehicle-frames of a record belong to, for standard errors of means.
+
+    Attributes
+    ----------
+    groups
+        Groups of each record of the mix; one record where there are no periods.
+    ends
+        Vehicle-frames ends[g] to ends[g + 1] are those of group g, counted over all records, (k + 1,) int64.
+    weight
+        Weight of each vehicle-frame in the mix, (n,) float64; 1 where there are no periods.
+    """
+
+    groups: tuple[BlockGroups, ...]
+    ends: IntArray
+    weight: FloatArray
+
+    @classmethod
+    def read(cls, tpog: Path, trajectories: Path, record: TargetRecord) -> FrameGroups | None:
+        """Read the groups from ``tpog.parquet`` and the ``trajectories.parquet`` that it was counted from.
+
+        None where a record has one block only, since its scatter is unknown.
+        """
+        periods = read_periods(tpog)
+        if any(period.blocks < 2 for period in periods):
+            return None
+        return cls.of(periods, recorded_frames(trajectories), record)
+
+    @classmethod
+    def of(cls, periods: Sequence[PeriodBlocks], recorded: Sequence[int], record: TargetRecord) -> FrameGroups:
+        """Make the groups from the blocks of each record, two or more, and its number of recorded frames.
+
+        Frames at the end of a record that fill no block belong to its last group. A record of which no frame is
+        replayed has no weight.
+        """
+        groups = tuple(block_groups(period) for period in periods)
+        offsets = np.append(0, np.cumsum(recorded[:-1]))
+        starts = []
+        for offset, period_groups in zip(offsets, groups, strict=True):
+            starts.append(offset + np.append(0, np.cumsum(period_groups.frames[:-1])))
+        first_rows = np.searchsorted(record.numbers[record.frame], np.concatenate(starts))
+        return cls(groups, np.append(first_rows, len(record)), weights_in_mix(periods, recorded, record))
+
+    def means(self, values: FloatArray, weight: FloatArray | None = None) -> FloatArray:
+        """Return the mean of all vehicle-frames, and with each group left out, (1 + k,) float64.
+
+        :meth:`egvs.scoring.standard_errors.ScoreUncertainty.of` takes such rows of all sites. NaN where nothing is
+        left.
+
+        Parameters
+        ----------
+        values
+            Of vehicle-frames, (n,) float64.
+        weight
+            Weight of each beside that in the mix, (n,) float64; equal weights where it is None.
+        """
+        weights = self.weight
+        if weight is not None:
+            weights = self.weight * weight
+        sums = np.array([self._sum_by_group(values * weights), self._sum_by_group(weights)])
+
+        sums_left_out = []
+        first = 0
+        for record in self.groups:
+            in_record = slice(first, first + len(record.frames))
+            other_records = np.delete(sums, in_record, axis=1).sum(axis=1)
+            for group, frames in enumerate(record.frames.tolist()):
+                remaining = np.delete(sums[:, in_record], group, axis=1).sum(axis=1)
+                sums_left_out.append(other_records + record.total / (record.total - frames) * remaining)
+            first = in_record.stop
+        total, count = np.array(sums_left_out).T
+        left_out = np.divide(total, count, out=np.full(len(total), math.nan), where=count > 0.0)
+        return np.append(weighted_mean(values, weights), left_out)
+
+    def _sum_by_group(self, values: FloatArray) -> FloatArray:
+        bounds = zip(self.ends[:-1], self.ends[1:], strict=True)
+        return np.array([math.fsum(values[start:end]) for start, end in bounds])
+
+
+def weighted_people(config: WeightsConfig) -> frozenset[str]:
+    """Return the vClasses of pedestrians and bicycles that have a weight, and so are targets."""
+    return NON_VEHICLE_KINDS & set(config.kinds)
+
+
+def target_weights(config: WeightsConfig, record: TargetRecord) -> FloatArray:
+    """Return the weight of each vehicle-frame, (n,) float64, 1 by default. A centre on a zone's edge is in it."""
+    weight: FloatArray = np.ones(len(record))
+    if record.kinds:
+        by_kind = np.array([config.kinds.get(kind, 1.0) for kind in record.kinds])  # type: ignore[call-overload]
+        weight = by_kind[record.kind]
+    for zone in config.zones.values():
+        weight = np.where(_in_polygon(zone.polygon_m, record), weight * zone.weight, weight)
+    return weight
+
+
+def warn_unused_weights(config: WeightsConfig, record: TargetRecord) -> Iterator[Diagnostic]:
+    """Warn about each weight that applies to no vehicle."""
+    hint = "Remove it, or check its name and the traffic."
+    sample = f"in the {len(record.numbers)} frames examined"
+    for kind in config.kinds:
+        if kind not in record.kinds:
+            problem = f"no {kind} has its centre in the region of interest {sample}"
+            yield Diagnostic("weights", f"{SCENARIO_FILE}: score.weights.kinds.{kind}", problem, hint)
+    for name, zone in config.zones.items():
+        if not _in_polygon(zone.polygon_m, record).any():
+            problem = f"no vehicle has its centre in the zone {sample}"
+            yield Diagnostic("weights", f"{SCENARIO_FILE}: score.weights.zones.{name}", problem, hint)
+
+
+def _in_polygon(polygon_m: Any, record: TargetRecord) -> NDArray[np.bool_]:
+    """Which vehicle-frames have their centre in a polygon or on its edge."""
+    import shapely
+
+    inside: NDArray[np.bool_] = shapely.intersects_xy(
+        shapely.Polygon(polygon_m), record.boxes[:, 0], record.boxes[:, 1]
+    )
+    return inside

@@ -1,0 +1,453 @@
+r"""LiDAR sensors: beam directions, range and optics; the catalogue; beam tables.
+
+A sensor is either a set of rings or a table of beams. Rings have one elevation and one azimuth offset each, a common
+azimuth step and, optionally, a limited field of view; beam ``k`` of ring ``r`` at azimuth index ``a`` is
+:math:`k = a \cdot channels + r`. The beams of a table come in the order of its rows; a table is read from a CSV file or
+computed from a scan pattern (:func:`beams_from_pattern`).
+
+The direction of a beam in the sensor frame (x forward, z up) is
+
+.. math:: (\cos\epsilon \cos\alpha,\; \cos\epsilon \sin\alpha,\; \sin\epsilon)
+
+with elevation :math:`\epsilon` and azimuth :math:`\alpha`, counter-clockwise from the sensor's x axis. The mount
+rotates it: first roll about x, then pitch (nose up positive), then yaw (counter-clockwise).
+
+Angles stay in degrees until ``cosdg`` and ``sindg``, which are exact at multiples of 90 degrees, take their cosine and
+sine; azimuths are rounded to 1e-6 degree first. A beam at 180 degrees therefore has y = 0 exactly and stays in its
+plane.
+
+The catalogue is ``catalogue.toml`` beside this module. An entry has the keys of ``[sensors.<name>]``, its source, and
+the values that are assumed because the source does not state them.
+"""
+
+from __future__ import annotations
+
+import csv
+import difflib
+import hashlib
+import math
+import tomllib
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cache, lru_cache
+from pathlib import Path
+
+import numpy as np
+from pydantic import Field
+from scipy.special import cosdg, sindg
+
+from egvs.core import files, limits
+from egvs.core.errors import InputError
+from egvs.core.grid import FloatArray
+from egvs.scenario.model import Scenario
+from egvs.scenario.sensor_config import BeamPatternConfig, SensorConfig
+
+BEAM_COLUMNS = ("elevation_deg", "azimuth_deg")
+_MAX_ANGLE_DEG = {"elevation_deg": 90.0, "azimuth_deg": 360.0}
+_GOLDEN_RATIO = (math.sqrt(5.0) - 1.0) / 2.0
+_BEAM_DIGITS = 6
+_GAP_DEG = 5.0
+"""A beam table without a wider gap between azimuths covers the full circle."""
+_GAP_TOLERANCE_DEG = 1e-6
+"""Gaps whose widths differ by less are equally wide."""
+
+
+class BeamTable:
+    """Elevation and azimuth of each beam in the sensor frame, degrees; immutable and hashable.
+
+    Two tables are equal if their angles are equal.
+
+    Parameters
+    ----------
+    elevation_deg, azimuth_deg
+        One value per beam, (n,) float64 each, n > 0.
+    """
+
+    def __init__(self, elevation_deg: FloatArray, azimuth_deg: FloatArray) -> None:
+        self.elevation_deg = np.array(elevation_deg, dtype=np.float64)
+        self.azimuth_deg = np.array(azimuth_deg, dtype=np.float64)
+        self.elevation_deg.flags.writeable = False
+        self.azimuth_deg.flags.writeable = False
+        self._digest = hashlib.sha256(self.elevation_deg.tobytes() + self.azimuth_deg.tobytes()).digest()
+
+    def __len__(self) -> int:
+        return len(self.elevation_deg)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, BeamTable) and self._digest == other._digest
+
+    def __hash__(self) -> int:
+        return hash(self._digest)
+
+    @property
+    def azimuth_span_deg(self) -> tuple[float, float] | None:
+        """First and last azimuth of the smallest arc that holds all beams, counter-clockwise; None for a full circle.
+
+        The circle is full where no gap is wide, or where several gaps are equally wide, as in a coarse table of a whole
+        turn.
+        """
+        azimuths = np.unique(np.mod(self.azimuth_deg, 360.0))
+        gaps = np.diff(azimuths, append=azimuths[0] + 360.0)
+        widest = int(np.argmax(gaps))
+        n_widest = np.count_nonzero(gaps > gaps[widest] - _GAP_TOLERANCE_DEG)
+        if gaps[widest] <= _GAP_DEG or n_widest > 1:
+            return None
+        first = float(azimuths[(widest + 1) % len(azimuths)])
+        if first > 180.0:
+            first -= 360.0
+        return first, first + 360.0 - float(gaps[widest])
+
+
+def repeated_beams(table: BeamTable) -> list[tuple[int, int]]:
+    """Return (beam, earlier beam) for each beam that repeats the direction of an earlier one, to 1e-6 degree."""
+    steps_per_degree = 10**_BEAM_DIGITS
+    full_turn = 360 * steps_per_degree
+    elevation = np.rint(table.elevation_deg * steps_per_degree).astype(np.int64)
+    azimuth = np.rint(table.azimuth_deg * steps_per_degree).astype(np.int64)
+    is_vertical = np.abs(elevation) == 90 * steps_per_degree  # there the azimuth does not matter
+    direction = elevation * full_turn + np.where(is_vertical, 0, azimuth % full_turn)
+    _, first, inverse = np.unique(direction, return_index=True, return_inverse=True)
+    earlier = first[inverse]
+    repeated = np.flatnonzero(earlier != np.arange(len(table)))
+    return [(int(beam), int(earlier[beam])) for beam in repeated]
+
+
+def read_beam_table(path: Path) -> BeamTable:
+    """Read a CSV with the columns ``elevation_deg`` and ``azimuth_deg``, one row per beam; other columns are ignored.
+
+    Raises
+    ------
+    InputError
+        Naming file, row and value.
+    """
+    return _read_cached(path, files.hash_file(path))
+
+
+@lru_cache(maxsize=4)
+def _read_cached(path: Path, _content_hash: str) -> BeamTable:
+    angles: list[tuple[float, float]] = []
+    max_beams = limits.BEAMS.maximum
+    limits.checked_size(path, limits.FILE)
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            rows = csv.DictReader(file, skipinitialspace=True)
+            names = list(rows.fieldnames or ())
+            _check_beam_columns(path, names)
+            for number, row in enumerate(rows):
+                if None in row:  # e.g. a decimal comma, which shifts all following values by one column
+                    n_values = len(names) + len(row[None])
+                    problem = f"expected {len(names)} values, one per column, got {n_values}"
+                    raise InputError(f"{path}: beam {number}", problem, "Write numbers with decimal points.")
+                elevation_deg = _parse_angle(path, number, "elevation_deg", row["elevation_deg"])
+                azimuth_deg = _parse_angle(path, number, "azimuth_deg", row["azimuth_deg"])
+                angles.append((elevation_deg, azimuth_deg))
+                if len(angles) > max_beams:
+                    raise InputError(path, f"the file has more than {max_beams:,} beams", limits.BEAMS.expected)
+    except (UnicodeDecodeError, csv.Error) as error:
+        hint = "Save it as UTF-8 text with a header row."
+        raise InputError(path, f"the file cannot be read as CSV ({error})", hint) from None
+    if not angles:
+        raise InputError(path, "expected at least one beam, got none", "Write one row per beam.")
+    table = np.array(angles)
+    return BeamTable(table[:, 0], table[:, 1])
+
+
+def _check_beam_columns(path: Path, names: list[str]) -> None:
+    hint = f"The header needs the columns {', '.join(BEAM_COLUMNS)}, separated by commas."
+    for column in BEAM_COLUMNS:
+        if column not in names:
+            raise InputError(path, f"the file has no column {column}", hint)
+        if names.count(column) > 1:
+            raise InputError(path, f"the file has {names.count(column)} columns {column}", hint)
+
+
+def _parse_angle(path: Path, number: int, column: str, text: str | None) -> float:
+    limit_deg = _MAX_ANGLE_DEG[column]
+    try:
+        angle = float(text or "")
+    except ValueError:
+        angle = math.nan
+    if not abs(angle) <= limit_deg:
+        problem = f"expected a number between {-limit_deg:g} and {limit_deg:g}, got {text!r}"
+        raise InputError(f"{path}: beam {number}: {column}", problem)
+    return angle
+
+
+def beams_from_pattern(pattern: BeamPatternConfig) -> BeamTable:
+    r"""Return one frame of a sensor whose scan pattern does not repeat.
+
+    With :math:`n` beams, and :math:`u, v` from 0 to 1 across the field of view in azimuth and elevation:
+
+    - *rosette* (``turns``): two prisms of equal deflection that turn :math:`p` and :math:`q` times in a frame steer the
+      beam along :math:`2u - 1 = (\cos 2\pi p t + \cos 2\pi q t) / 2`,
+      :math:`2v - 1 = (\sin 2\pi p t + \sin 2\pi q t) / 2`, with :math:`t = (k + 1/2) / n` (a Risley pair at small
+      angles: Marshall 1999, Risley prism scan patterns, Proc. SPIE 3787);
+    - *even*: :math:`u = (k + 1/2) / n`, :math:`v = frac(1/2 + k (\sqrt 5 - 1) / 2)`, a Kronecker lattice.
+
+    Angles are rounded to 1e-6 degree.
+    """
+    k = np.arange(pattern.samples)
+    if pattern.turns is not None:
+        first_prism, second_prism = (
+            np.mod(360.0 * turns * (k + 0.5) / pattern.samples, 360.0) for turns in pattern.turns
+        )
+        u = 0.5 + 0.25 * (cosdg(first_prism) + cosdg(second_prism))
+        v = 0.5 + 0.25 * (sindg(first_prism) + sindg(second_prism))
+    else:
+        u = (k + 0.5) / pattern.samples
+        v = np.mod(0.5 + k * _GOLDEN_RATIO, 1.0)
+    return BeamTable(_interpolate_deg(pattern.elevation_deg, v), _interpolate_deg(pattern.azimuth_deg, u))
+
+
+def _interpolate_deg(span_deg: tuple[float, float], share: FloatArray) -> FloatArray:
+    low, high = span_deg
+    angles: FloatArray = np.round(low + (high - low) * share, _BEAM_DIGITS)
+    return angles
+
+
+_DEFAULTS = SensorConfig.model_fields
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A LiDAR: rings over the full circle or a field of view, or a table of beams.
+
+    Defaults of the optics are those of ``[sensors.<name>]``.
+
+    Attributes
+    ----------
+    elevations_deg, azimuth_offsets_deg
+        One value per ring, in the order of the table.
+    azimuths
+        Number of azimuths of a ring.
+    range_m
+        Maximum range.
+    source
+        Document that the values are from.
+    wavelength_nm
+        Wavelength of the laser. Used by effects only.
+    divergence_mrad
+        Full divergence angle at 1/e^2, across and along the elevation, in milliradians. Used by effects only.
+    rated_range_m, rated_reflectivity
+        A target of this reflectivity (0 to 1) is still detected at this range at normal incidence. Used by effects
+        only.
+    range_sigma_m
+        Standard deviation of a measured range. Used only by point clouds with traffic.
+    azimuth_deg
+        First and last azimuth of a ring; None for the full circle, from 0.
+    table
+        Angles of each beam, instead of rings (there are none then).
+    assumed
+        Which values are assumed, not the maker's.
+    """
+
+    name: str
+    elevations_deg: tuple[float, ...]
+    azimuth_offsets_deg: tuple[float, ...]
+    azimuths: int
+    range_m: float
+    source: str
+    wavelength_nm: float = _DEFAULTS["wavelength_nm"].default
+    divergence_mrad: tuple[float, float] = _DEFAULTS["divergence_mrad"].default
+    rated_range_m: float | None = _DEFAULTS["rated_range_m"].default
+    rated_reflectivity: float = _DEFAULTS["rated_reflectivity"].default
+    range_sigma_m: float = _DEFAULTS["range_sigma_m"].default
+    azimuth_deg: tuple[float, float] | None = None
+    table: BeamTable | None = None
+    assumed: str = ""
+
+    @property
+    def channels(self) -> int:
+        """Number of rings; 0 for a sensor with a beam table."""
+        return len(self.elevations_deg)
+
+    @property
+    def beams(self) -> int:
+        """Number of beams of one turn or frame."""
+        if self.table is not None:
+            return len(self.table)
+        return self.channels * self.azimuths
+
+    @property
+    def elevation_span_deg(self) -> tuple[float, float]:
+        """Lowest and highest elevation."""
+        if self.table is not None:
+            return float(min(self.table.elevation_deg)), float(max(self.table.elevation_deg))
+        return float(min(self.elevations_deg)), float(max(self.elevations_deg))
+
+    @property
+    def azimuth_span_deg(self) -> tuple[float, float] | None:
+        """Ends of the field of view, counter-clockwise, without the rings' offsets; None for the full circle."""
+        if self.table is not None:
+            return self.table.azimuth_span_deg
+        return self.azimuth_deg
+
+    @property
+    def azimuth_step_deg(self) -> float | None:
+        """Angle between two beams of a ring; None for a table, or a single beam."""
+        if self.azimuth_deg is not None:
+            first, last = self.azimuth_deg
+            return (last - first) / (self.azimuths - 1) if self.azimuths > 1 else None
+        return 360.0 / self.azimuths if self.azimuths else None
+
+    @property
+    def middle_deg(self) -> tuple[float, float]:
+        """Elevation and azimuth of the middle ray, the ray that an aim points at its target.
+
+        It lies halfway between the lowest and the highest elevation, and between the ends of the field of view; its
+        azimuth is 0 for a sensor with a full circle.
+        """
+        low, high = self.elevation_span_deg
+        azimuth_deg = 0.0
+        if self.azimuth_span_deg is not None:
+            azimuth_deg = 0.5 * (self.azimuth_span_deg[0] + self.azimuth_span_deg[1])
+        return 0.5 * (low + high), azimuth_deg
+
+    def directions(self, yaw_deg: float = 0.0, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> FloatArray:
+        """Return the unit vectors of all beams along the world axes, (beams, 3) float64, for a mounted sensor."""
+        is_upright = pitch_deg == 0.0 and roll_deg == 0.0
+        elevation, azimuth = self._angles_deg(yaw_deg if is_upright else 0.0)
+        flat = cosdg(elevation)
+        x = flat * cosdg(azimuth)
+        y = flat * sindg(azimuth)
+        z = np.broadcast_to(sindg(elevation), x.shape)
+        rays = np.stack([x, y, z], axis=-1).reshape(-1, 3) + 0.0  # + 0.0 turns -0 into 0
+        if is_upright:
+            return rays
+        matrix = rotation_world_sensor(yaw_deg, pitch_deg, roll_deg)
+        # Written out: a BLAS may sum in another order on another machine.
+        return rays[:, :1] * matrix[:, 0] + rays[:, 1:2] * matrix[:, 1] + rays[:, 2:] * matrix[:, 2]
+
+    def _angles_deg(self, yaw_deg: float) -> tuple[FloatArray, FloatArray]:
+        """Elevations and azimuths that broadcast to all beams in order, turned by ``yaw_deg``."""
+        azimuth: FloatArray
+        if self.table is not None:
+            azimuth = np.mod(self.table.azimuth_deg + yaw_deg, 360.0).round(6)
+            return self.table.elevation_deg, azimuth
+        if self.azimuth_deg is None:
+            steps = np.arange(self.azimuths) * (360.0 / self.azimuths)
+        else:
+            steps = self.azimuth_deg[0] + np.arange(self.azimuths) * (self.azimuth_step_deg or 0.0)
+        offsets = np.asarray(self.azimuth_offsets_deg) + yaw_deg
+        azimuth = np.mod(steps[:, None] + offsets[None, :], 360.0).round(6)
+        return np.asarray(self.elevations_deg)[None, :], azimuth
+
+
+def rotation_world_sensor(yaw_deg: float, pitch_deg: float, roll_deg: float) -> FloatArray:
+    """Return the matrix R_world_sensor, (3, 3) float64: roll about x, then pitch (nose up positive), then yaw."""
+    cy, sy = cosdg(yaw_deg), sindg(yaw_deg)
+    cp, sp = cosdg(pitch_deg), sindg(pitch_deg)
+    cr, sr = cosdg(roll_deg), sindg(roll_deg)
+    yaw = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
+    pitch = np.array([[cp, 0.0, -sp], [0.0, 1.0, 0.0], [sp, 0.0, cp]])
+    roll = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
+    matrix: FloatArray = yaw @ pitch @ roll
+    return matrix
+
+
+CATALOGUE_FILE = Path(__file__).with_name("catalogue.toml")
+
+
+class CatalogueEntry(SensorConfig):
+    """A sensor of the catalogue."""
+
+    source: str = Field(min_length=1, description="The maker's document, or another source of the values")
+    assumed: str = Field("", description="Which values the source does not state")
+
+
+@cache
+def catalogue_entries() -> dict[str, CatalogueEntry]:
+    """Return all entries by name, in the order of the file."""
+    with CATALOGUE_FILE.open("rb") as file:
+        document = tomllib.load(file)
+    return {name: CatalogueEntry.of(values) for name, values in document.items()}
+
+
+def catalogue_digest(name: str) -> str:
+    """Return the hash of an entry's beams and optics; the range noise is left out, since empty scans have none."""
+    entry = catalogue_entries()[name]
+    return files.hash_json(entry.model_dump(mode="json", exclude={"source", "assumed", "range_sigma_m"}))
+
+
+class _Catalogue(Mapping[str, Sensor]):
+    """The sensors of ``catalogue.toml``, each made at its first use."""
+
+    def __init__(self) -> None:
+        self._sensors: dict[str, Sensor] = {}
+
+    def __getitem__(self, name: str) -> Sensor:
+        if name not in self._sensors:
+            entry = catalogue_entries()[name]
+            sensor = _sensor_from_config(name, entry, entry.source, Path)
+            self._sensors[name] = replace(sensor, assumed=entry.assumed)
+        return self._sensors[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(catalogue_entries())
+
+    def __len__(self) -> int:
+        return len(catalogue_entries())
+
+
+CATALOGUE: Mapping[str, Sensor] = _Catalogue()
+"""The built-in sensors. A new one needs an entry in ``catalogue.toml``, its number of beams in
+``tests/sensors/test_sensor.py``, and a row in ``docs/effects.md`` with the source of its rated range."""
+
+
+def scenario_sensor(name: str, scenario: Scenario, where: str) -> Sensor:
+    """Return the sensor called ``name``, see :func:`resolve_sensor`; beam tables are relative to the scenario."""
+    return resolve_sensor(name, scenario.sensors, where, lambda file: scenario.find(file, f"sensors.{name}.beams"))
+
+
+def resolve_sensor(
+    name: str, custom: Mapping[str, SensorConfig], where: str, find: Callable[[str], Path] = Path
+) -> Sensor:
+    """Return the sensor called ``name``: a user's ``[sensors.<name>]`` takes precedence over the catalogue.
+
+    Parameters
+    ----------
+    name
+        Name of the sensor.
+    custom
+        The user's sensors, by name.
+    where
+        File and key, for messages.
+    find
+        Finds the file of a custom sensor's beam table.
+
+    Raises
+    ------
+    InputError
+        When there is no such sensor, with the nearest name that exists; or when a beam table is invalid.
+    """
+    if name in custom:
+        return _sensor_from_config(name, custom[name], "the scenario", find)
+    if name in CATALOGUE:
+        return CATALOGUE[name]
+    known = [*custom, *CATALOGUE]
+    similar = difflib.get_close_matches(name, known, 1, 0.4)
+    hint = f"Did you mean {similar[0]}?" if similar else f"Known sensors are {', '.join(known)}."
+    raise InputError(where, f"unknown sensor {name!r}", hint)
+
+
+def _sensor_from_config(name: str, config: SensorConfig, source: str, find: Callable[[str], Path]) -> Sensor:
+    elevations = tuple(config.elevations_deg)
+    table = None
+    if config.beams is not None:
+        table = read_beam_table(find(config.beams))
+    elif config.pattern is not None:
+        table = beams_from_pattern(config.pattern)
+    elif config.channels not in (None, len(elevations)):
+        first, last = elevations
+        elevations = tuple(np.round(np.linspace(first, last, config.rings), 9).tolist())
+    return Sensor(
+        name=name,
+        elevations_deg=elevations,
+        azimuth_offsets_deg=tuple(config.azimuth_offsets_deg) or (0.0,) * len(elevations),
+        azimuths=config.azimuths,
+        range_m=config.range_m,
+        source=source,
+        azimuth_deg=config.azimuth_deg,
+        table=table,
+        **config.optics,
+    )

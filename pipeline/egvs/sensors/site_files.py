@@ -1,0 +1,308 @@
+"""Rows of CSV and GeoJSON files of candidate sites, with coordinates in the world frame.
+
+The column names of a CSV say what its coordinates are: ``x_m, y_m``, or longitude and latitude (WGS 84, degrees) under
+one of the names of :data:`LONGITUDE` and :data:`LATITUDE`. Where a row has both, they must agree. The coordinates of a
+GeoJSON file are metres, degrees, or what the file declares.
+
+Further columns belong to the user (``fid``, ``owner``, ``note``) and are carried through to the scores. A column whose
+name is nearly one of the program's, which the file lacks, is rejected as misspelt.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import re
+import reprlib
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from egvs.core.errors import InputError, find_misspelling
+from egvs.core.grid import FloatArray
+from egvs.core.reading import read_json
+from egvs.formats.georeference import WGS84, CoordinateReading, Georeference, declared_crs, geojson_coordinates
+
+REQUIRED_COLUMNS = ("site", "x_m", "y_m", "z_m")
+AIM_COLUMNS = ("aim_x_m", "aim_y_m", "aim_z_m")
+NUMBER_COLUMNS = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg", *AIM_COLUMNS)
+TEXT_COLUMNS = ("sensor", "points", "aim")
+KNOWN_COLUMNS = ("site", *NUMBER_COLUMNS, *TEXT_COLUMNS)
+
+LONGITUDE = ("lon", "lng", "longitude", "lon_deg", "longitude_deg")
+LATITUDE = ("lat", "latitude", "lat_deg", "latitude_deg")
+
+_TOLERANCE_M = 0.1
+_MAX_M = 1e8  # larger values are not on Earth; they are rejected when the row is parsed
+_EXPECTED_COLUMNS = "columns x_m, y_m in metres of the world frame, or longitude, latitude in degrees"
+
+_COLUMN_NAME = re.compile(r"[^\x00-\x1f]{1,80}")
+_PLAIN_NUMBER = re.compile(r"-?(0|[1-9][0-9]{0,17})(\.[0-9]+)?")  # "007" is a name
+
+ColumnValue = str | int | float | bool | None
+
+
+@dataclass(frozen=True)
+class SiteRow:
+    """A row of a file, or a point of a rule.
+
+    Attributes
+    ----------
+    where
+        File and row, for messages.
+    columns
+        Values by column; x_m and y_m are in the world frame.
+    heights_m
+        Heights that a rule gives to the point.
+    """
+
+    where: str
+    columns: dict[str, Any]
+    heights_m: tuple[float, ...] = ()
+
+
+def read_csv(path: Path, world: Georeference) -> Iterator[SiteRow]:
+    """Yield the rows of a CSV; InputError with file and row for a malformed one."""
+    located = []
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            reader = csv.DictReader(file, skipinitialspace=True)
+            _check_header(path, list(reader.fieldnames or ()))
+            for values in reader:
+                where = f"{path}: row {values.get('site') or '?'}"
+                if None in values or None in values.values():
+                    raise InputError(where, "the row has more or fewer values than the header has columns")
+                located.append(SiteRow(where, dict(values)))
+    except (UnicodeDecodeError, csv.Error) as error:
+        hint = "Save it as UTF-8 text with a header row."
+        raise InputError(path, f"the file cannot be read as CSV ({error})", hint) from None
+    rows = parse_numeric_columns(locate_rows(located, path, world), KNOWN_COLUMNS)
+    for row, columns in zip(located, rows, strict=True):
+        yield SiteRow(row.where, columns)
+
+
+def _check_header(path: Path, names: list[str]) -> None:
+    if len(names) == 1:
+        for separator in (";", "\t", "|"):
+            if separator in names[0]:
+                hint = "Use commas, and decimal points in the numbers."
+                raise InputError(path, f"the columns are separated by {separator!r}", hint)
+    duplicates = sorted({name for name in names if names.count(name) > 1})
+    if duplicates:
+        raise InputError(path, f"the column {duplicates[0]!r} occurs twice", "Name each column once.")
+
+
+def read_geojson(path: Path, world: Georeference) -> Iterator[SiteRow]:
+    """Yield the features of a GeoJSON file as rows; InputError with file and feature for a malformed one."""
+    expected = "a FeatureCollection of Points"
+    document = read_json(path, expected)
+    if not isinstance(document, dict) or not isinstance(document.get("features"), list):
+        raise InputError(path, f"expected {expected}, got {reprlib.repr(document)[:120]}")
+    coordinates = geojson_coordinates(document["features"])
+    reading = world.read_coordinates(coordinates, str(path), declared_crs(document, str(path)))
+    for number, feature in enumerate(document["features"]):
+        where = f"{path}: feature {number}"
+        yield SiteRow(where, _feature_columns(where, feature, reading))
+
+
+def _feature_columns(where: str, feature: Any, reading: CoordinateReading) -> dict[str, Any]:
+    """Columns from a feature's coordinates, converted to the world frame, and from its properties."""
+    match feature:
+        case {"geometry": {"type": "Point", "coordinates": [_, _, *more] as point}, "properties": dict(properties)} if (
+            len(more) < 2
+        ):
+            values = (properties.get("name"), *_point_to_world(point, reading))
+        case _:
+            expected = "expected a Feature with properties whose geometry is a Point of two or three coordinates"
+            raise InputError(where, f"{expected}, got {reprlib.repr(feature)[:120]}")
+    row = {key: value for key, value in properties.items() if key != "name"}
+    for key, value in zip(REQUIRED_COLUMNS, values, strict=False):
+        if value is None:
+            continue
+        if isinstance(value, str) and key != "site":
+            raise InputError(f"{where}: {key}", f"expected a number as coordinate, got the text {value!r}")
+        if reading.convert is not None and _coordinates_match(row.get(key), value):
+            continue  # a GIS carried the unrounded value along as a property: keep it
+        if row.get(key, value) not in (None, value):
+            raise InputError(f"{where}: {key}", f"there are two values, {row[key]!r} and {value!r}", "Use one of them.")
+        row[key] = value
+    return row
+
+
+def _point_to_world(point: list[Any], reading: CoordinateReading) -> list[Any]:
+    """A point's coordinates with x, y in the world frame; values that are no numbers are rejected later."""
+    if reading.convert is None or any(isinstance(value, str | bool) for value in point[:2]):
+        return point
+    x = _number_or_nan(point[0])
+    y = _number_or_nan(point[1])
+    if not math.isfinite(x + y):
+        return point
+    return [*reading.to_world(np.array([[x, y]]))[0].tolist(), *point[2:]]
+
+
+def _coordinates_match(property_value: Any, geometry_value: Any) -> bool:
+    return abs(_number_or_nan(property_value) - _number_or_nan(geometry_value)) <= _TOLERANCE_M
+
+
+class _LonLatColumns(NamedTuple):
+    """Names of the columns of longitude and latitude in a row."""
+
+    lon: str
+    lat: str
+
+
+class _LonLat(NamedTuple):
+    """Longitude and latitude, degrees."""
+
+    lon_deg: float
+    lat_deg: float
+
+
+def locate_rows(rows: Iterable[SiteRow], path: object, world: Georeference) -> list[dict[str, Any]]:
+    """Return the columns of CSV rows with ``x_m, y_m`` in the world frame, and without longitude and latitude.
+
+    Missing values and values that are no numbers are left as they are; they are rejected when the row is parsed.
+
+    Raises
+    ------
+    InputError
+        When columns named in metres hold degrees, when both kinds of coordinates disagree, or when no row lies near the
+        region of interest.
+    """
+    rows = list(rows)
+    names = [_lon_lat_columns(row.columns) for row in rows]
+    metres = [(_number_or_nan(row.columns.get("x_m")), _number_or_nan(row.columns.get("y_m"))) for row in rows]
+    plausible = [(x, y) for x, y in metres if abs(x) <= _MAX_M and abs(y) <= _MAX_M]
+    world.metres(_as_points(plausible), str(path), _EXPECTED_COLUMNS)
+    if not any(names):
+        return [row.columns for row in rows]
+    degrees = [_row_degrees(row, columns) for row, columns in zip(rows, names, strict=True)]
+    needs_degrees = False
+    for lon_lat, xy_m in zip(degrees, metres, strict=True):
+        if lon_lat is not None and not math.isfinite(sum(xy_m)):
+            needs_degrees = True
+    without_degrees = [_without_columns(row.columns, columns) for row, columns in zip(rows, names, strict=True)]
+    if world.frame is None and not needs_degrees:
+        return without_degrees
+    known = _as_points([lon_lat for lon_lat in degrees if lon_lat is not None])
+    reading = world.read_coordinates(known, str(path), WGS84, _EXPECTED_COLUMNS)
+    located = []
+    for row, columns, lon_lat in zip(rows, without_degrees, degrees, strict=True):
+        located.append(columns | _row_to_world(row, lon_lat, reading))
+    return located
+
+
+def _as_points(pairs: list[tuple[float, float]] | list[_LonLat]) -> FloatArray:
+    return np.array(pairs).reshape(-1, 2)
+
+
+def _lon_lat_columns(row: Mapping[str, Any]) -> _LonLatColumns | None:
+    """The names of the row's columns of longitude and latitude; None unless it has both."""
+    by_lower_name = {name.strip().lower(): name for name in row if isinstance(name, str)}
+    lon = next((by_lower_name[name] for name in LONGITUDE if name in by_lower_name), None)
+    lat = next((by_lower_name[name] for name in LATITUDE if name in by_lower_name), None)
+    if lon is None or lat is None:
+        return None
+    return _LonLatColumns(lon, lat)
+
+
+def _row_degrees(row: SiteRow, columns: _LonLatColumns | None) -> _LonLat | None:
+    """Longitude and latitude of a row, checked; None where both are empty."""
+    if columns is None or all(row.columns[name] in (None, "") for name in columns):
+        return None
+    for name, limit_deg in ((columns.lon, 180.0), (columns.lat, 90.0)):
+        value = row.columns[name]
+        if not abs(_number_or_nan(value)) <= limit_deg:
+            problem = f"expected degrees from {-limit_deg:g} to {limit_deg:g}, got {repr(value)[:80]}"
+            raise InputError(f"{row.where}: {name}", problem)
+    return _LonLat(_number_or_nan(row.columns[columns.lon]), _number_or_nan(row.columns[columns.lat]))
+
+
+def _row_to_world(row: SiteRow, lon_lat: _LonLat | None, reading: CoordinateReading) -> dict[str, float]:
+    """x_m and y_m of a row from its longitude and latitude; nothing where it has x_m and y_m, which must agree."""
+    if lon_lat is None:
+        return {}
+    x_m, y_m = reading.to_world(np.array([lon_lat]))[0].tolist()
+    stated = (_number_or_nan(row.columns.get("x_m")), _number_or_nan(row.columns.get("y_m")))
+    if not math.isfinite(sum(stated)):
+        return {"x_m": x_m, "y_m": y_m}
+    distance_m = math.dist(stated, (x_m, y_m))
+    if distance_m > _TOLERANCE_M:
+        problem = (
+            f"x_m, y_m = ({stated[0]:g}, {stated[1]:g}), but longitude and latitude give ({x_m:.2f}, {y_m:.2f}),"
+            f" {distance_m:.1f} m away"
+        )
+        raise InputError(row.where, problem, "Use one of them.")
+    return {}
+
+
+def _without_columns(row: dict[str, Any], columns: _LonLatColumns | None) -> dict[str, Any]:
+    return {name: value for name, value in row.items() if name not in (columns or ())}
+
+
+def _number_or_nan(value: Any) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
+
+
+def user_columns(where: str, row: Mapping[str, Any], known: Collection[str]) -> dict[str, ColumnValue]:
+    """Return the columns of a row beyond the ``known`` ones; lists and tables as JSON text.
+
+    InputError when a column looks like a known one that the row lacks, or has an invalid name.
+    """
+    misspelling = find_misspelling(row, known)
+    if misspelling is not None:
+        name, meant = misspelling
+        hint = f"Did you mean {meant}? A column of your own may have any name that is less similar."
+        raise InputError(where, f"unknown column {name!r}", hint)
+    columns: dict[str, ColumnValue] = {}
+    for name, value in row.items():
+        if name in known:
+            continue
+        if not _COLUMN_NAME.fullmatch(name):
+            raise InputError(where, f"expected a column name of 1 to 80 characters, got {name[:80]!r}")
+        columns[name] = _to_column_value(value)
+    return columns
+
+
+def parse_numeric_columns(rows: Iterable[dict[str, Any]], known: Collection[str]) -> list[dict[str, Any]]:
+    """Return rows of a CSV with numbers instead of texts in the user columns that hold only numbers.
+
+    An empty cell becomes None.
+    """
+    rows = list(rows)
+    names = {name for row in rows for name in row}
+    for name in names - set(known):
+        texts = [row[name].strip() for row in rows if row.get(name)]
+        kind = _column_type(texts)
+        for row in rows:
+            text = row.get(name)
+            row[name] = kind(text) if text else None
+    return rows
+
+
+def _column_type(texts: Iterable[str]) -> type[str] | type[int] | type[float]:
+    kind: type[int] | type[float] = int
+    for text in texts:
+        match = _PLAIN_NUMBER.fullmatch(text)
+        if match is None:
+            return str
+        if match[2]:
+            kind = float
+    return kind
+
+
+def _to_column_value(value: Any) -> ColumnValue:
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, int) and not -(2**63) <= value < 2**63:
+        return str(value)
+    if isinstance(value, list | dict):
+        return json.dumps(value, ensure_ascii=True)
+    return value if isinstance(value, str | int | float | bool) else None

@@ -1,0 +1,1 @@
+"""Studies of one scenario: what accuracy costs, what effects change, how runs compare."""

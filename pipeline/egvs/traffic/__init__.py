@@ -1,0 +1,1 @@
+"""Traffic: SUMO networks and simulations, floating car data, vehicle boxes, trajectories."""

@@ -1,0 +1,833 @@
+r"""Make the demand of a simulation: trips drawn at random, or routes that meet traffic counts.
+
+**Random trips.** Steps: for each kind of vehicle, find the pairs of edges that a trip may connect; draw, for each
+departure, a kind by its share and one of its pairs by the weights of both ends (their lanes, unless the scenario sets
+weights); write trips and vTypes as SUMO reads them. SUMO finds the routes.
+
+A trip starts at the fringe, on an edge that cannot be entered from elsewhere in the network, and ends on an edge that
+cannot be left; turnarounds do not count. A network without such edges (a loop, or streets that all turn back) gets
+trips between any two edges at least a quarter of the network's diagonal apart, with a note. More trips are drawn than
+fit, so that ``--max-num-vehicles`` maintains N vehicles, as SUMO's randomTrips.py does.
+
+**Traffic counts.** Steps, for the counts of the complete fleet and then for those of each kind: find plausible routes
+over each counted location; SUMO's routeSampler (https://sumo.dlr.de/docs/Tools/Turns.html#routesamplerpy) selects
+routes that meet the counts, with departures uniformly distributed over the simulation; each vehicle of the fleet gets a
+kind, by share, among those that may drive its route. Counts of a kind are added to those of the fleet.
+
+A route over a location is the fastest way from the fringe to the location and on to the fringe. It is plausible if it
+takes at most :data:`MAX_DETOUR` times as long as the fastest way between its ends and visits no edge twice; without
+plausible routes, the shortest detours are used. Travel times are seconds at the speed limit.
+
+After the run, :func:`count_fits` compares simulated flows m with counts c by the GEH statistic of traffic engineering
+(sumolib.statistics.geh; below 5 is a good match, also in routeSampler's --geh-ok):
+
+.. math:: \mathrm{GEH} = \sqrt{2 (m - c)^2 / (m + c)}
+
+All randomness comes from the generator or seed passed in.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.etree.ElementTree import Element
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from egvs.core import files
+from egvs.core.errors import Diagnostic, InputError
+from egvs.core.grid import FloatArray, IntArray
+from egvs.formats import xml
+from egvs.scenario.traffic_config import CountConfig, TrafficConfig, VehicleKind
+from egvs.traffic import sumo
+from egvs.traffic.network import Network
+from egvs.traffic.vehicle_boxes import VehicleSize
+
+STRAIGHT_STOP_ATTRIBUTES = {"maxSpeedLat": "1.0", "lcMaxSpeedLatStanding": "0", "lcMaxSpeedLatFactor": "0.2"}
+"""Without these, cars of the sublane model stop at an angle of 35 to 47 degrees at the stop line (measured)."""
+
+MAX_DETOUR = 1.25
+
+CANDIDATE_ROUTES_FILE, COUNTS_FILE, SAMPLED_ROUTES_FILE = "candidates.rou.xml", "counts.xml", "sampled.rou.xml"
+
+FLEET = "fleet"
+"""Prefix of the ids of vehicles that were counted without their kind."""
+
+GOOD_GEH = 5.0
+
+_MAX_ORIGINS = 256
+_FAR_SHARE = 0.25
+_KIND_KEYS = {"id", "vClass", "length", "width", "height"}
+
+_MAX_DRAWS = 60
+_MAX_ROUTES = 24
+_MIN_ROUTES = 4
+
+_MAX_ROUTE_CHANGE = 50
+"""How far routeSampler's optimisation may change the number of vehicles on a route."""
+
+_NOISE_SIGMAS = 3.0
+"""A Poisson process exceeds this difference once in 370 times."""
+
+_MIN_SECONDS = 1e-3
+
+
+@dataclass(frozen=True)
+class OriginDestinations:
+    """Trips that a kind may make.
+
+    Attributes
+    ----------
+    origin, target
+        Positions in ``Network.edges``, shape (n,), int64.
+    weight
+        Relative frequency of each trip, shape (n,), float64.
+    fringe
+        Whether trips start and end at the fringe of the network.
+    """
+
+    origin: IntArray
+    target: IntArray
+    weight: FloatArray
+    fringe: bool
+
+
+class Trip(NamedTuple):
+    """Name of the kind, and ids of the first and the last edge."""
+
+    kind: str
+    origin: str
+    target: str
+
+
+@dataclass(frozen=True)
+class CountLocation:
+    """Where vehicles are counted: an edge, or the edges from one to another; ids, and positions in the network."""
+
+    edges: tuple[str, ...]
+    indices: tuple[int, ...]
+
+    def xml(self, vehicles: int) -> str:
+        """Return the count as routeSampler reads it."""
+        first, last = quoteattr(self.edges[0]), quoteattr(self.edges[-1])
+        if len(self.edges) == 1:
+            return f'    <edge id={first} entered="{vehicles}"/>'
+        return f'    <edgeRelation from={first} to={last} count="{vehicles}"/>'
+
+
+@dataclass(frozen=True)
+class CountFit:
+    """Vehicles per hour at a location: counted, and simulated in the recorded frames."""
+
+    place: str
+    kind: str
+    counted_per_h: float
+    simulated_per_h: float
+    geh: float
+
+
+def check_kinds(kinds: Sequence[VehicleKind], vehicle_classes: frozenset[str], where: str) -> None:
+    """Raise an InputError for an unknown vClass, or attributes that contradict the keys of the kind.
+
+    Parameters
+    ----------
+    kinds
+        The fleet.
+    vehicle_classes
+        SUMO's vClasses.
+    where
+        The traffic table, for messages.
+    """
+    for kind in kinds:
+        if kind.vclass not in vehicle_classes:
+            problem = f"kind {kind.name!r} has the unknown vClass {kind.vclass!r}"
+            raise InputError(f"{where}.kinds", problem, f"Use one of {', '.join(sorted(vehicle_classes))}.")
+        reserved = sorted(_KIND_KEYS & kind.attributes.keys())
+        if reserved:
+            problem = f"kind {kind.name!r} has {', '.join(reserved)} among its attributes"
+            hint = "Set name, vclass, length_m, width_m and height_m of the kind instead."
+            raise InputError(f"{where}.kinds", problem, hint)
+
+
+def target_vehicle_count(traffic: TrafficConfig, network: Network) -> int:
+    """Return how many vehicles random trips keep in the network.
+
+    That is ``traffic.vehicles`` or, where it is not set, a number proportional to the length of lanes for the fleet.
+    """
+    if traffic.vehicles is not None:
+        return traffic.vehicles
+    vclasses = {kind.vclass for kind in traffic.kinds}
+    lanes = (lane for edge in network.edges for lane in edge.lanes)
+    length_m = math.fsum(lane.length_m for lane in lanes if any(map(lane.permission.admits, vclasses)))
+    return max(1, round(traffic.vehicles_per_lane_km * length_m / 1000.0))
+
+
+def origin_destination_pairs(
+    network: Network, kind: VehicleKind, traffic: TrafficConfig, rng: np.random.Generator, where: str
+) -> OriginDestinations:
+    """Find the trips that a kind of vehicle may make.
+
+    Parameters
+    ----------
+    network
+        The streets.
+    kind
+        The kind of vehicle.
+    traffic
+        Sets ``min_trip_m`` and ``edge_weights``.
+    rng
+        Draws origins in a network without fringe.
+    where
+        The traffic table, for messages.
+
+    Returns
+    -------
+    OriginDestinations
+        All pairs of edges, with weights.
+
+    Raises
+    ------
+    InputError
+        When the kind may use no lane, or no trip is as long as ``min_trip_m``.
+    """
+    title = f"kind {kind.name!r} (vClass {kind.vclass})"
+    lanes = _lanes_per_edge(network, kind.vclass)
+    if not lanes.any():
+        problem = f"{title} may use no lane of the network"
+        raise InputError(f"{where}.kinds", problem, "Use a vClass that the network admits.")
+
+    weights = edge_weights(network, lanes, traffic, where)
+    links = network.links(kind.vclass)
+    sources, sinks = fringe_edges(lanes, links)
+    pairs = _reachable_pairs(network, links, sources, sinks, traffic.min_trip_m)
+    at_fringe = bool(pairs.size)
+    if not at_fringe:
+        min_trip_m = max(traffic.min_trip_m, _FAR_SHARE * network.diagonal_m)
+        usable = np.flatnonzero(lanes)
+        sources = np.sort(rng.choice(usable, min(_MAX_ORIGINS, usable.size), replace=False))
+        pairs = _reachable_pairs(network, links, sources, usable, min_trip_m)
+
+    origin, target = pairs[:, 0], pairs[:, 1]
+    weight = weights[origin] * weights[target]
+    if not weight.any():
+        problem = f"{title} can make no trip of at least {traffic.min_trip_m:g} m"
+        raise InputError(f"{where}.kinds", problem, "Use a connected network, or a smaller min_trip_m.")
+    return OriginDestinations(origin, target, weight, at_fringe)
+
+
+def _lanes_per_edge(network: Network, vclass: str) -> FloatArray:
+    return np.array([edge.lanes_for(vclass) for edge in network.edges], dtype=np.float64)
+
+
+def edge_weights(network: Network, lanes: FloatArray, traffic: TrafficConfig, where: str) -> FloatArray:
+    """Return how likely trips start or end at each edge.
+
+    Parameters
+    ----------
+    network
+        The streets.
+    lanes
+        Usable lanes of each edge, which are the default weights, shape (n_edges,).
+    traffic
+        Sets ``edge_weights``.
+    where
+        The traffic table, for messages.
+
+    Returns
+    -------
+    numpy.ndarray
+        Shape (n_edges,), float64; 0 for edges without usable lane.
+
+    Raises
+    ------
+    InputError
+        When the network has no such edge.
+    """
+    index = {edge.id: i for i, edge in enumerate(network.edges)}
+    weights = lanes.copy()
+    for edge_id, weight in traffic.edge_weights.items():
+        if edge_id not in index:
+            raise unknown_edge_error(f"{where}.edge_weights", edge_id)
+        if lanes[index[edge_id]]:
+            weights[index[edge_id]] = weight
+    return weights
+
+
+def unknown_edge_error(where: str, edge_id: str) -> InputError:
+    """Return the error for an edge that the network does not have; the checks list it once by its text."""
+    return InputError(where, f"the network has no edge {edge_id!r}", "Use the id of an edge.")
+
+
+def fringe_edges(lanes: FloatArray, links: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the edges that cannot be entered from elsewhere, and those that cannot be left.
+
+    Parameters
+    ----------
+    lanes
+        Usable lanes of each edge, shape (n_edges,).
+    links
+        Source, target and turnaround flag of each link, shape (n, 3), from :meth:`Network.links`.
+    """
+    onward = links[links[:, 2] == 0]
+    usable = lanes > 0
+    indices = np.arange(lanes.size)
+    is_entered = np.isin(indices, onward[:, 1])
+    is_left = np.isin(indices, onward[:, 0])
+    return np.flatnonzero(usable & ~is_entered), np.flatnonzero(usable & ~is_left)
+
+
+def _reachable_pairs(
+    network: Network, links: IntArray, sources: IntArray, sinks: IntArray, min_trip_m: float
+) -> IntArray:
+    """Return pairs of a source and a reachable sink, (n, 2), that are far apart and not a way back."""
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import breadth_first_order
+
+    edges, n = network.edges, len(network.edges)
+    graph = csr_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(n, n))
+    start_m = np.array([edge.start_m for edge in edges])
+    end_m = np.array([edge.end_m for edge in edges])
+    is_sink = np.zeros(n, dtype=bool)
+    is_sink[sinks] = True
+
+    pairs = [np.empty((0, 2), np.int64)]
+    for source in sources:
+        reached = np.sort(breadth_first_order(graph, source, return_predecessors=False)).astype(np.int64)
+        goes_back = np.array([edges[target].to_node == edges[source].from_node for target in reached])
+        is_far = np.hypot(*(end_m[reached] - start_m[source]).T) >= min_trip_m
+        targets = reached[is_sink[reached] & (reached != source) & ~goes_back & is_far]
+        pairs.append(np.column_stack([np.full(targets.size, source), targets]))
+    return np.concatenate(pairs)
+
+
+def draw_trips(
+    network: Network,
+    kinds: Sequence[VehicleKind],
+    all_pairs: Sequence[OriginDestinations],
+    departs_s: FloatArray,
+    rng: np.random.Generator,
+) -> list[Trip]:
+    """Draw a trip for each departure.
+
+    Parameters
+    ----------
+    network
+        The streets.
+    kinds, all_pairs
+        The fleet, and the trips of each kind.
+    departs_s
+        Departure times, shape (n,).
+    rng
+        Draws kinds, then trips.
+    """
+    shares = np.array([kind.share for kind in kinds])
+    kind_of_trip = rng.choice(len(kinds), size=departs_s.size, p=shares / shares.sum())
+    pair_of_trip = np.empty(departs_s.size, dtype=np.int64)
+    for index, pairs in enumerate(all_pairs):
+        is_kind = kind_of_trip == index
+        probability = pairs.weight / pairs.weight.sum()
+        pair_of_trip[is_kind] = rng.choice(pairs.origin.size, size=int(is_kind.sum()), p=probability)
+
+    trips = []
+    for kind, pair in zip(kind_of_trip, pair_of_trip, strict=True):
+        origin, target = all_pairs[kind].origin[pair], all_pairs[kind].target[pair]
+        trips.append(Trip(kinds[kind].name, network.edges[origin].id, network.edges[target].id))
+    return trips
+
+
+def trips_xml(trips: Sequence[Trip], departs_s: FloatArray) -> str:
+    """Return a SUMO route file with one ``<trip>`` per departure."""
+    lines = [
+        f'    <trip id="{index}" depart="{depart_s:.3f}" from={quoteattr(trip.origin)} to={quoteattr(trip.target)}'
+        f' type={quoteattr(trip.kind)} departLane="best" departSpeed="max"/>'
+        for index, (trip, depart_s) in enumerate(zip(trips, departs_s, strict=True))
+    ]
+    return _xml_document("routes", lines)
+
+
+def vtypes_xml(kinds: Sequence[VehicleKind]) -> str:
+    """Return a SUMO additional file with one ``<vType>`` per kind, with its real size."""
+    lines = []
+    for kind in kinds:
+        size = VehicleSize(kind.length_m, kind.width_m, kind.height_m, kind.vclass)
+        lines.append(vtype_xml(kind.name, size, STRAIGHT_STOP_ATTRIBUTES | kind.attributes))
+    return _xml_document("additional", lines)
+
+
+def vtype_xml(name: str, size: VehicleSize, attributes: Mapping[str, Any]) -> str:
+    """Return one ``<vType>`` as a line.
+
+    Parameters
+    ----------
+    name
+        Its id.
+    size
+        Its vClass, and lengths in metres.
+    attributes
+        Further attributes, under SUMO's names.
+    """
+    lengths = {"length": size.length_m, "width": size.width_m, "height": size.height_m}
+    values = {"id": name, "vClass": size.vclass, **lengths, **attributes}
+    return f"    <vType {' '.join(f'{key}={quoteattr(str(value))}' for key, value in values.items())}/>"
+
+
+def _xml_document(root: str, lines: Sequence[str]) -> str:
+    return "\n".join([f"<{root}>", *lines, f"</{root}>", ""])
+
+
+class _Route(NamedTuple):
+    """A route over a location; routes sort by how plausible they are."""
+
+    repeats_edge: bool
+    goes_back: bool
+    detour: float
+    indices: tuple[int, ...]
+
+    @property
+    def is_plausible(self) -> bool:
+        return not self.repeats_edge and not self.goes_back and self.detour <= MAX_DETOUR
+
+
+class _FastestWays(NamedTuple):
+    """Seconds (n_starts, n_edges), and the next edge towards each start, (n_starts, n_edges)."""
+
+    seconds: FloatArray
+    towards: IntArray
+
+
+class RouteFinder:
+    """Plausible routes of one vClass through a network.
+
+    Parameters
+    ----------
+    network
+        The streets.
+    vclass
+        SUMO's vClass.
+    """
+
+    def __init__(self, network: Network, vclass: str) -> None:
+        self._edges, self._network, self._vclass = network.edges, network, vclass
+        self._index = {edge.id: i for i, edge in enumerate(network.edges)}
+        self._lanes = _lanes_per_edge(network, vclass)
+        links = network.links(vclass)
+        self._links = links[links[:, 2] == 0]
+        self._sources, self._sinks = fringe_edges(self._lanes, self._links)
+
+    @cached_property
+    def _pairs(self) -> set[tuple[int, int]]:
+        return {(int(a), int(b)) for a, b in self._links[:, :2]}
+
+    @cached_property
+    def _graph(self) -> Any:
+        """Seconds from the end of an edge to the end of the next."""
+        from scipy.sparse import csr_array
+
+        pairs = np.array(sorted(self._pairs), dtype=np.int64).reshape(-1, 2)
+        seconds = np.array([max(edge.seconds, _MIN_SECONDS) for edge in self._edges])
+        size = self._lanes.size
+        return csr_array((seconds[pairs[:, 1]], (pairs[:, 0], pairs[:, 1])), shape=(size, size))
+
+    def may_drive(self, edges: Sequence[str]) -> bool:
+        """Return whether the vClass may use all these edges, one after another."""
+        indices = [self._index[edge] for edge in edges]
+        return all(self._lanes[i] for i in indices) and self._pairs.issuperset(pairwise(indices))
+
+    def locate(self, first: str, last: str | None, where: str) -> CountLocation:
+        """Return the location of a count: an edge, or the fastest way from one edge to another.
+
+        Parameters
+        ----------
+        first, last
+            Ids of edges; ``last`` is None for a count on one edge.
+        where
+            The count, for messages.
+
+        Raises
+        ------
+        InputError
+            When an edge is unknown or closed to the vClass, or there is no way.
+        """
+        for edge_id in (first, last):
+            if not edge_id:
+                continue
+            if edge_id not in self._index:
+                raise unknown_edge_error(where, edge_id)
+            if not self._lanes[self._index[edge_id]]:
+                problem = f"{self._vclass} may not use the edge {edge_id!r}"
+                raise InputError(where, problem, "Use an edge with a lane for it.")
+
+        indices = [self._index[first]]
+        if last is not None:
+            end = self._index[last]
+            ways = self._fastest(indices)
+            indices = _follow(ways.towards[0], end, indices[0])[::-1]
+        if not indices:
+            problem = f"there is no way from {first!r} to {last!r}"
+            raise InputError(where, problem, "Use an edge that can be reached from the first.")
+        return CountLocation(tuple(self._edges[i].id for i in indices), tuple(indices))
+
+    def _fastest(self, starts: Sequence[int], backward: bool = False) -> _FastestWays:
+        """Return the fastest ways from the end of each start to the end of each edge, or backward."""
+        from scipy.sparse.csgraph import dijkstra
+
+        graph = self._graph.T.tocsr() if backward else self._graph
+        seconds, predecessors = dijkstra(graph, indices=list(starts), return_predecessors=True)
+        return _FastestWays(seconds, predecessors.astype(np.int64))
+
+    def candidates(
+        self, locations: Sequence[CountLocation], traffic: TrafficConfig, rng: np.random.Generator, where: str
+    ) -> list[tuple[str, ...]]:
+        """Return plausible routes over each location, without duplicates.
+
+        Parameters
+        ----------
+        locations
+            Where vehicles are counted.
+        traffic
+            Sets ``edge_weights``: routes start and end where random trips do.
+        rng
+            Draws starts and ends.
+        where
+            The traffic table, for messages.
+
+        Returns
+        -------
+        list of tuple of str
+            Ids of the edges of each route.
+        """
+        weights = edge_weights(self._network, self._lanes, traffic, where)
+        routes: dict[tuple[int, ...], None] = {}
+        for location in locations:
+            routes.update(dict.fromkeys(self._routes_over(location, weights, rng)))
+        return [tuple(self._edges[i].id for i in indices) for indices in routes]
+
+    def _routes_over(
+        self, location: CountLocation, weights: FloatArray, rng: np.random.Generator
+    ) -> list[tuple[int, ...]]:
+        first, last = location.indices[0], location.indices[-1]
+        to_first = self._fastest([first], backward=True)
+        from_last = self._fastest([last])
+        sources = _likely_ends(self._sources, to_first.seconds[0], weights, first)
+        sinks = _likely_ends(self._sinks, from_last.seconds[0], weights, last)
+        starts = _draw_ends(sources, weights, rng)
+        ends = _draw_ends(sinks, weights, rng)
+        ends_of_routes = list(dict.fromkeys(zip(starts.tolist(), ends.tolist(), strict=True)))
+
+        inner_s = sum(self._edges[i].seconds for i in location.indices[1:])
+        routes = []
+        for (start, end), fastest_s in zip(ends_of_routes, self._direct_s(ends_of_routes), strict=True):
+            before = _follow(to_first.towards[0], start, first)
+            after = _follow(from_last.towards[0], end, last)[::-1][1:]
+            indices = (*before, *location.indices[1:], *after)
+            seconds = to_first.seconds[0][start] + inner_s + from_last.seconds[0][end]
+            detour = 1.0
+            if seconds > fastest_s:
+                detour = seconds / max(fastest_s, _MIN_SECONDS)
+            goes_back = self._edges[start].from_node == self._edges[end].to_node
+            routes.append(_Route(len(set(indices)) < len(indices), goes_back, detour, indices))
+
+        plausible = [route.indices for route in routes if route.is_plausible]
+        if plausible:
+            return plausible[:_MAX_ROUTES]
+        return [route.indices for route in sorted(routes)[:_MIN_ROUTES]]
+
+    def _direct_s(self, pairs: Sequence[tuple[int, int]]) -> list[float]:
+        """Return the seconds of the fastest way between each pair of ends."""
+        starts = sorted({start for start, _ in pairs})
+        seconds = self._fastest(starts).seconds
+        row = {start: i for i, start in enumerate(starts)}
+        return [float(seconds[row[start], end]) for start, end in pairs]
+
+
+def _likely_ends(ends: IntArray, seconds: FloatArray, weights: FloatArray, location: int) -> list[int]:
+    """Return the fringe edges that are connected to a location and have a weight; without any, the location."""
+    return [int(i) for i in ends if np.isfinite(seconds[i]) and weights[i] > 0] or [location]
+
+
+def _draw_ends(ends: Sequence[int], weights: FloatArray, rng: np.random.Generator) -> IntArray:
+    """Draw ends by their weights; the counted location is drawn even if its weight is 0."""
+    share = weights[ends]
+    if not share.any():
+        share = np.ones(len(ends))
+    drawn: IntArray = np.asarray(ends)[np.searchsorted(np.cumsum(share) / share.sum(), rng.random(_MAX_DRAWS))]
+    return drawn
+
+
+def _follow(towards: IntArray, start: int, end: int) -> list[int]:
+    """Return the way from ``start`` to ``end``; empty where there is none."""
+    way = [start]
+    while way[-1] != end:
+        following = int(towards[way[-1]])
+        if following < 0:
+            return []
+        way.append(following)
+    return way
+
+
+class _SampledRoute(NamedTuple):
+    """A departure in seconds, and ids of edges."""
+
+    depart_s: float
+    edges: list[str]
+
+
+@dataclass(frozen=True)
+class _SampledVehicle:
+    """A vehicle of the counted traffic."""
+
+    depart_s: float
+    name: str
+    kind: str
+    edges: str
+
+    def xml(self) -> str:
+        values = {"id": self.name, "type": self.kind, "depart": f"{self.depart_s:.2f}", "departLane": "best"}
+        attributes = " ".join(f"{key}={quoteattr(value)}" for key, value in values.items())
+        return f'    <vehicle {attributes} departSpeed="max"><route edges={quoteattr(self.edges)}/></vehicle>'
+
+
+def write_routes(
+    traffic: TrafficConfig, network: Network, times_s: tuple[float, float], seed: np.random.SeedSequence, path: Path,
+    where: str,
+) -> None:  # fmt: skip
+    """Write a route file with vehicles that meet the counts of a scenario.
+
+    Parameters
+    ----------
+    traffic
+        The fleet and the counts.
+    network
+        The streets.
+    times_s
+        Begin and end of the departures.
+    seed
+        Each group of counts gets a child of it.
+    path
+        The file to write; its folder is also used for temporary files.
+    where
+        The traffic table, for messages.
+
+    Raises
+    ------
+    InputError
+        When a count names an unknown edge or kind, or a way that nobody can drive.
+    """
+    finders = candidate_routes(traffic, network)
+    locations = [count_location(count, traffic, finders, where) for count in traffic.counts]
+    counted_kinds = {count.kind for count in traffic.counts}
+    groups = [group for group in ("", *(kind.name for kind in traffic.kinds)) if group in counted_kinds]
+
+    vehicles: list[_SampledVehicle] = []
+    for group, child in zip(groups, seed.spawn(len(groups)), strict=True):
+        kinds = _counted_kinds(traffic, group)
+        counts = [
+            (location, count.per_hour)
+            for location, count in zip(locations, traffic.counts, strict=True)
+            if count.kind == group
+        ]
+        rng = np.random.default_rng(child)
+        sampler_seed = int(child.generate_state(1)[0]) & 0x7FFFFFFF
+        finder = finders[_main_kind(kinds).vclass]
+        candidates = finder.candidates([location for location, _ in counts], traffic, rng, where)
+        routes = _sample_routes(counts, candidates, times_s, sampler_seed, path.parent)
+        for index, route in enumerate(routes):
+            able = [kind for kind in kinds if finders[kind.vclass].may_drive(route.edges)]  # the main kind always is
+            shares = np.array([kind.share for kind in able])
+            kind = able[int(np.searchsorted(np.cumsum(shares) / shares.sum(), rng.random(), side="right"))]
+            name = f"{group or FLEET}.{index}"
+            vehicles.append(_SampledVehicle(route.depart_s, name, kind.name, " ".join(route.edges)))
+
+    vehicles.sort(key=lambda vehicle: (vehicle.depart_s, vehicle.name))
+    files.write_text(path, _xml_document("routes", [vehicle.xml() for vehicle in vehicles]))
+
+
+def candidate_routes(traffic: TrafficConfig, network: Network) -> dict[str, RouteFinder]:
+    """Return a route finder for each vClass of the fleet."""
+    return {kind.vclass: RouteFinder(network, kind.vclass) for kind in traffic.kinds}
+
+
+def count_location(
+    count: CountConfig, traffic: TrafficConfig, routes: Mapping[str, RouteFinder], where: str
+) -> CountLocation:
+    """Return where a count was taken.
+
+    Parameters
+    ----------
+    count
+        The count.
+    traffic
+        The fleet.
+    routes
+        Route finders by vClass.
+    where
+        The traffic table, for messages.
+
+    Raises
+    ------
+    InputError
+        When the count names an unknown edge or kind, or a way that nobody can drive.
+    """
+    where = count_key(count, where)
+    kinds = _counted_kinds(traffic, count.kind)
+    if not kinds:
+        names = ", ".join(kind.name for kind in traffic.kinds)
+        raise InputError(where, f"the fleet has no kind {count.kind!r}", f"Use one of {names}.")
+    if count.kind == FLEET:
+        problem = f"a kind is called {FLEET!r}, which is reserved for vehicles counted without their kind"
+        raise InputError(where, problem, "Give this kind another name.")
+    finder = routes[_main_kind(kinds).vclass]
+    return finder.locate(count.edge or count.from_edge or "", count.to_edge, where)
+
+
+def count_key(count: CountConfig, traffic: str) -> str:
+    """Return what messages about a count of ``[traffic]`` refer to."""
+    return f"{traffic}.counts ({count.title})"
+
+
+def _counted_kinds(traffic: TrafficConfig, group: str) -> list[VehicleKind]:
+    """Return the kinds that a count includes: the named one, or the fleet."""
+    return [kind for kind in traffic.kinds if group in ("", kind.name)]
+
+
+def _main_kind(kinds: Sequence[VehicleKind]) -> VehicleKind:
+    """Return the kind whose routes all kinds follow where they may."""
+    return max(kinds, key=lambda kind: kind.share)
+
+
+def _sample_routes(
+    counts: Sequence[tuple[CountLocation, float]], candidates: Sequence[tuple[str, ...]],
+    times_s: tuple[float, float], seed: int, folder: Path,
+) -> Iterator[_SampledRoute]:  # fmt: skip
+    """Run routeSampler on counts (location, vehicles per hour); yield a route for each vehicle."""
+    begin, end = (f"{time_s:.3f}" for time_s in times_s)
+    duration_s = times_s[1] - times_s[0]
+    routes = [f'    <route id="{index}" edges={quoteattr(" ".join(edges))}/>' for index, edges in enumerate(candidates)]
+    files.write_text(folder / CANDIDATE_ROUTES_FILE, _xml_document("routes", routes))
+    relations = [location.xml(round(per_hour * (duration_s / 3600.0))) for location, per_hour in counts]
+    interval = [f'  <interval id="counts" begin="{begin}" end="{end}">', *relations, "  </interval>"]
+    files.write_text(folder / COUNTS_FILE, _xml_document("data", interval))
+
+    lengths = [len(location.edges) for location, _ in counts]
+    arguments = ["--route-files", CANDIDATE_ROUTES_FILE]
+    if max(lengths) > 1:
+        arguments += ["--turn-files", COUNTS_FILE]
+    if min(lengths) == 1:
+        arguments += ["--edgedata-files", COUNTS_FILE]
+    arguments += [
+        "--turn-max-gap", str(max(0, max(lengths) - 2)), "--begin", begin, "--end", end,
+        "--interval", f"{duration_s:.3f}", "--seed", str(seed), "--output-file", SAMPLED_ROUTES_FILE,
+        "--optimize", str(_MAX_ROUTE_CHANGE),
+    ]  # fmt: skip
+    sumo.run_tool("routeSampler.py", arguments, folder)
+
+    for vehicle in xml.iter_elements(folder / SAMPLED_ROUTES_FILE, "routes"):
+        for route in vehicle.iter("route"):
+            yield _SampledRoute(float(vehicle.get("depart", "0")), route.get("edges", "").split())
+    for name in (CANDIDATE_ROUTES_FILE, COUNTS_FILE, SAMPLED_ROUTES_FILE):
+        (folder / name).unlink()
+
+
+class _EdgeExit(NamedTuple):
+    """Number of an edge on a route, and when the vehicle left it; -1 for never."""
+
+    number: int
+    time_s: float
+
+
+_NEVER = _EdgeExit(-1, -1.0)
+
+
+def count_fits(traffic: TrafficConfig, routes: Path, first_s: float, end_s: float) -> list[CountFit]:
+    """Compare the counts with the simulated flows.
+
+    Parameters
+    ----------
+    traffic
+        The counts.
+    routes
+        SUMO's ``--vehroute-output`` with exit times.
+    first_s, end_s
+        The recorded time.
+    """
+    passages = [0] * len(traffic.counts)
+    for vehicle in xml.iter_elements(routes, "routes"):
+        if vehicle.tag != "vehicle":
+            continue  # a person
+        group = vehicle.get("id", "").rpartition(".")[0]
+        exits = _edge_exits(vehicle)
+        for number, count in enumerate(traffic.counts):
+            if (count.kind or FLEET) == group and first_s <= _passing_time_s(count, exits) < end_s:
+                passages[number] += 1
+
+    hours = (end_s - first_s) / 3600.0
+    fits = []
+    for count, vehicles in zip(traffic.counts, passages, strict=True):
+        per_hour = vehicles / hours
+        deviation = round(geh(count.per_hour, per_hour), 2)
+        fits.append(CountFit(count.title, count.kind, count.per_hour, round(per_hour, 1), deviation))
+    return fits
+
+
+def _edge_exits(vehicle: Element) -> dict[str, _EdgeExit]:
+    route = next(vehicle.iter("route"))
+    edges = route.get("edges", "").split()
+    times = route.get("exitTimes", "").split()
+    return {
+        edge: _EdgeExit(number, float(time_s)) for number, (edge, time_s) in enumerate(zip(edges, times, strict=True))
+    }
+
+
+def _passing_time_s(count: CountConfig, exits: Mapping[str, _EdgeExit]) -> float:
+    """Return when a vehicle leaves the counted edge, or the first one; -1 if it does not pass the location."""
+    if count.edge:
+        return exits.get(count.edge, _NEVER).time_s
+    first = exits.get(count.from_edge or "", _NEVER)
+    last = exits.get(count.to_edge or "", _NEVER)
+    return first.time_s if 0 <= first.number < last.number else -1.0
+
+
+def geh(counted_per_h: float, simulated_per_h: float) -> float:
+    """Return the GEH statistic of two hourly flows; 0 if both are 0."""
+    total = counted_per_h + simulated_per_h
+    if not total:
+        return 0.0
+    return math.sqrt(2.0 * (simulated_per_h - counted_per_h) ** 2 / total)
+
+
+def count_warnings(counts: Sequence[CountFit], hours: float, where: str) -> list[Diagnostic]:
+    """Warn about counts that the simulation misses by more than chance explains.
+
+    Parameters
+    ----------
+    counts
+        From :func:`count_fits`.
+    hours
+        Duration of the recording.
+    where
+        The traffic table, for messages.
+    """
+    missed = [fit for fit in counts if fit.geh > GOOD_GEH and _exceeds_noise(fit, hours)]
+    if not missed:
+        return []
+    descriptions = []
+    for fit in missed:
+        kind = f" ({fit.kind})" if fit.kind else ""
+        descriptions.append(f"{fit.place}{kind}: {fit.simulated_per_h:g} instead of {fit.counted_per_h:g}")
+    problem = (
+        f"the simulation misses {len(missed)} of {len(counts)} counts (vehicles per hour, simulated instead of counted:"
+        f" {'; '.join(descriptions)})"
+    )
+    hint = "Check that the counts are consistent with each other and with the network's lanes and signals."
+    return [Diagnostic("counts", f"{where}.counts", problem, hint)]
+
+
+def _exceeds_noise(fit: CountFit, hours: float) -> bool:
+    difference = abs(fit.simulated_per_h - fit.counted_per_h) * hours
+    return difference > _NOISE_SIGMAS * math.sqrt(max(fit.counted_per_h * hours, 1.0))

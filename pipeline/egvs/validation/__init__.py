@@ -1,0 +1,1 @@
+"""Test whether a score predicts detection: simulated point clouds, detectors, average precision, correlation."""

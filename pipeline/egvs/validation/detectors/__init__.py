@@ -1,0 +1,1 @@
+"""Detectors that validation runs on point clouds."""

@@ -1,0 +1,172 @@
+"""Held-out traffic: recorded traffic that the TPOG was not computed from.
+
+It is the scenario's own demand under another seed, in frames that lie further apart than those of the TPOG. All sites
+are evaluated with the same frames. A finished traffic file has no seed: its frames are also those of the TPOG, and
+validation warns about that.
+
+The static world and the record are stages of a run and come from its store, so what another command has computed is
+not computed again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pydantic import ValidationError
+
+from egvs.artefacts import parquet
+from egvs.artefacts.traffic_frames import TrafficFrame, read_frames
+from egvs.core.errors import InputError
+from egvs.core.grid import IntArray
+from egvs.core.runtime import ProgressCallback, no_progress
+from egvs.runs.run import ensure_stages
+from egvs.scenario.model import Scenario
+from egvs.sensors.scene import Scene
+from egvs.stages.inputs import get_scene, open_folder
+
+FRAME_SPACING_S = 2.0
+"""Minimum time between two frames: half a second later, the same queue is no new observation."""
+
+_SEED_STREAM = 0x7E57
+"""Separates the seed of held-out traffic from all other seeds that are derived from the scenario's."""
+
+_STAGES = ("statics", "traffic")
+
+
+@dataclass(frozen=True)
+class HeldOutTraffic:
+    """A junction and a record of its held-out traffic.
+
+    Attributes
+    ----------
+    scenario
+        The scenario with the seed and the frames of the record.
+    scene
+        Static world, sites, sensors and effects, as in a run of the original scenario.
+    trajectories
+        Path of the record, ``trajectories.parquet``.
+    numbers
+        Numbers of the frames that are used, (frames,) int64, ascending.
+    keys
+        Hash of everything that the static world and the record depend on, by stage.
+    """
+
+    scenario: Scenario
+    scene: Scene
+    trajectories: Path
+    numbers: IntArray
+    keys: dict[str, str]
+
+    @property
+    def frames(self) -> int:
+        """Number of frames that are used."""
+        return len(self.numbers)
+
+    def read(self) -> Iterator[TrafficFrame]:
+        """Yield the frames that are used, in order."""
+        return read_frames(self.trajectories, self.numbers)
+
+
+def prepare_held_out_traffic(
+    scenario: Scenario,
+    folder: Path,
+    frames: int,
+    *,
+    apart_s: float = FRAME_SPACING_S,
+    jobs: int | None = None,
+    progress: ProgressCallback = no_progress,
+) -> HeldOutTraffic:
+    """Compute the static world and record the held-out traffic of a scenario, or restore them from the store.
+
+    Parameters
+    ----------
+    folder
+        Folder for both. It has to exist as long as the record is used.
+    frames
+        Number of frames to use; the record may have more.
+    apart_s
+        Minimum time between two frames.
+    jobs
+        Number of threads; one per core when None.
+
+    Raises
+    ------
+    InputError
+        If the traffic has too few frames that far apart, or a stage refuses the scenario.
+    """
+    held_out = held_out_scenario(scenario, frames, apart_s)
+    folder.mkdir(parents=True, exist_ok=True)
+    context = open_folder(held_out, folder, jobs=jobs, progress=progress)
+    keys = ensure_stages(context, *_STAGES)
+
+    trajectories = context.path("trajectories.parquet")
+    with parquet.open_artefact(trajectories, "trajectories") as (_, metadata):
+        recorded = int(metadata["frames"])
+    numbers = select_frame_numbers(held_out, recorded, frames, apart_s)
+    return HeldOutTraffic(held_out, get_scene(context), trajectories, numbers, keys)
+
+
+def held_out_scenario(scenario: Scenario, frames: int, apart_s: float = FRAME_SPACING_S) -> Scenario:
+    """Return the scenario whose traffic is recorded for validation.
+
+    Parameters
+    ----------
+    frames
+        Number of frames.
+    apart_s
+        Minimum time between two frames.
+
+    Raises
+    ------
+    InputError
+        If the simulated time would exceed the limit of a scenario.
+    """
+    traffic = scenario.traffic
+    if traffic.fcd is not None:
+        return scenario
+
+    state = np.random.SeedSequence((scenario.seed, _SEED_STREAM)).generate_state(1, np.uint64)
+    seed = int(state[0]) >> 33  # SUMO takes seeds of 31 bits
+    values = {key: getattr(traffic, key) for key in traffic.model_fields_set}
+    if not traffic.periods:
+        stride = math.ceil(apart_s / traffic.frame_period_s - 1e-9)
+        values |= {"frames": frames, "frame_period_s": stride * traffic.frame_period_s}
+    try:
+        held_out = type(traffic)(**values)
+    except ValidationError as error:
+        reason = error.errors()[0]["msg"].removeprefix("Value error, ")
+        raise InputError(
+            "--frames", f"{frames} frames at least {apart_s:g} s apart are too many: {reason}", "Use fewer frames."
+        ) from None
+    return scenario.model_copy(update={"traffic": held_out, "seed": seed})
+
+
+def select_frame_numbers(scenario: Scenario, recorded: int, frames: int, apart_s: float = FRAME_SPACING_S) -> IntArray:
+    """Return the numbers of the frames to use, (frames,) int64, spread over the whole record.
+
+    Parameters
+    ----------
+    scenario
+        From :func:`held_out_scenario`.
+    recorded
+        Number of frames in its record.
+
+    Raises
+    ------
+    InputError
+        If the record has too few frames that far apart.
+    """
+    period_s = scenario.traffic.frame_period_s
+    stride = max(1, math.ceil(apart_s / period_s - 1e-9))
+    available = (recorded - 1) // stride + 1
+    if frames > available:
+        problem = (
+            f"expected at most {available} frames at least {apart_s:g} s apart, got {frames}: "
+            f"the traffic has {recorded} frames every {period_s:g} s"
+        )
+        raise InputError("--frames", problem, "Use fewer frames.")
+    return (np.arange(frames, dtype=np.int64) * available // frames) * stride

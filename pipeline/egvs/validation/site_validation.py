@@ -1,0 +1,254 @@
+"""Validates the scores of a run: ``egvs validate``.
+
+Steps: check the scenario; record traffic that the TPOG was not computed from; run each detector at each site; measure
+detection; compute every score; correlate scores with detection.
+
+Writes ``detection.parquet``, ``surrogates.parquet``, ``correlation.parquet`` and ``validation.png`` into the folder of
+the run. Their bytes depend on the scenario and the program only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from egvs.artefacts import parquet, run_folder
+from egvs.artefacts.run_folder import RunFolder
+from egvs.core import files
+from egvs.core.errors import InputError
+from egvs.core.grid import FloatArray
+from egvs.core.runtime import ProgressCallback, no_progress
+from egvs.runs import run as runs
+from egvs.runs import stages
+from egvs.scenario.model import Scenario
+from egvs.sensors.sites import Site
+from egvs.stages.inputs import open_folder
+from egvs.validation import detection_metrics, kitti_results, results, surrogates
+from egvs.validation.correlation import COEFFICIENT_KINDS, CorrelationStudy, JunctionScores, MeasureValues
+from egvs.validation.detection_metrics import ALL_OBJECTS, SiteDetection
+from egvs.validation.detector_runs import DetectionListener, SiteDetectionTask, run_detectors
+from egvs.validation.detectors import base
+from egvs.validation.held_out_traffic import HeldOutTraffic
+from egvs.validation.results import ScoreAgreement, ScoreName, Validation
+from egvs.validation.surrogates import Surrogates
+from egvs.validation.sweeps import POINT_COUNTS_NAME, DetectedBoxes, detections_in_roi
+from egvs.validation.validation_run import ValidationRun, validation_metadata, validation_run
+
+CORRELATION_TABLE = RunFolder.correlation.name
+
+BoxesBySite = Mapping[str, Mapping[str, DetectedBoxes]]
+"""Boxes of other detectors, by site and detector."""
+
+
+def validate_sites(
+    scenario: Scenario,
+    out: Path,
+    *,
+    frames: int,
+    detectors: Sequence[str] = (POINT_COUNTS_NAME,),
+    detections: Path | None = None,
+    keep: bool = False,
+    jobs: int | None = None,
+    progress: ProgressCallback = no_progress,
+    listener: DetectionListener | None = None,
+) -> Validation:
+    """Validate the scores of a scenario's sites.
+
+    Parameters
+    ----------
+    out
+        The run's folder.
+    frames
+        Number of frames of held-out traffic.
+    detectors
+        Names of detectors; points on vehicles are always counted.
+    detections
+        Folder with KITTI results of further detectors, see :mod:`egvs.validation.kitti_results`.
+    keep
+        Whether to write ground truth and detections as KITTI files too.
+    jobs
+        Number of processes; one per core when None.
+    listener
+        Receives the progress of the detectors.
+
+    Raises
+    ------
+    InputError
+        If the check finds an error, a detector is unknown, the traffic has too few frames or no vehicle in the region
+        of interest, or ``detections`` do not belong to these sites and frames.
+    """
+    chosen = {name: base.make_detector(name) for name in dict.fromkeys(detectors) if name != POINT_COUNTS_NAME}
+    _check_no_input_overwritten(scenario, out, detections, keep=keep)
+
+    with validation_run(scenario, out, frames, jobs=jobs, progress=progress) as run:
+        record = run.record
+        external = _read_external_boxes(detections, record, chosen)
+        task = SiteDetectionTask(record, chosen)
+        detected = run_detectors(record.scene.sites, task, jobs=jobs, progress=progress, listener=listener)
+        by_site = {site: {**by_detector, **external.get(site, {})} for site, by_detector in detected.items()}
+
+        rows, undefined = detection_metrics.measure_detection(run.frames, record.scene.roi, by_site)
+        scores = surrogates.compute_surrogates(scenario, run.folder / "scores", jobs=jobs, progress=progress)
+        agreements = correlate_scores(record.scene.sites, scenario, rows, scores)
+        warnings = (*run.warnings, *undefined, *scores.skipped)
+        validation = Validation(tuple(rows), scores, tuple(agreements), warnings)
+
+        _write_artefacts(out, run, scenario, validation, external)
+        if keep:
+            kitti_results.write_kitti_results(out / kitti_results.KITTI_FOLDER, record, run.frames, by_site)
+        return replace(validation, report=runs.refresh_report(out))
+
+
+def _check_no_input_overwritten(scenario: Scenario, out: Path, detections: Path | None, *, keep: bool) -> None:
+    """Raise an InputError if an output would overwrite an input."""
+    if not keep:
+        runs.check_no_overwrite(scenario, out)
+        return
+    runs.check_no_overwrite(scenario, out, (kitti_results.KITTI_FOLDER, kitti_results.PARTIAL_FOLDER))
+    kitti_folder = (out / kitti_results.KITTI_FOLDER).resolve()
+    if detections is not None and detections.resolve().is_relative_to(kitti_folder):
+        raise InputError(
+            f"--detections {detections}",
+            "the folder would be overwritten by --keep",
+            "Copy the folder elsewhere, or omit --keep.",
+        )
+
+
+def _read_external_boxes(folder: Path | None, record: HeldOutTraffic, chosen: Iterable[str]) -> BoxesBySite:
+    """Return the boxes of other detectors whose centre lies in the region of interest."""
+    if folder is None:
+        return {}
+    sites = record.scene.sites
+    by_detector = kitti_results.read_kitti_results(folder, {site.name: site.pose for site in sites}, record.numbers)
+    for name in by_detector:
+        if name in (POINT_COUNTS_NAME, *chosen):
+            raise InputError(
+                "--detections",
+                f"the folder has results of {name!r}, which also runs here",
+                "Rename the folder of results, or omit the detector.",
+            )
+
+    boxes: dict[str, dict[str, DetectedBoxes]] = {site.name: {} for site in sites}
+    for name, by_site in by_detector.items():
+        for site_name, frames in by_site.items():
+            in_roi = tuple(detections_in_roi(detections, record.scene.roi) for detections in frames)
+            boxes[site_name][name] = DetectedBoxes(in_roi)
+    return boxes
+
+
+def correlate_scores(
+    sites: Sequence[Site], scenario: Scenario, rows: Sequence[SiteDetection], scores: Surrogates
+) -> list[ScoreAgreement]:
+    """Correlate every score with every measure of every detector, over all vehicles.
+
+    Parameters
+    ----------
+    sites
+        The sites; those on one pole are resampled together.
+    rows
+        Detection at each site.
+    scores
+        Scores of each site.
+
+    Returns
+    -------
+    list of ScoreAgreement
+        By detector, measure and score.
+    """
+    site_names = tuple(site.name for site in sites)
+    poles = tuple(site.pole for site in sites)
+    values = _values_by_score(site_names, scores)
+    values_by_text = {str(name): site_values for name, site_values in values.items()}
+
+    agreements = []
+    for detector in dict.fromkeys(row.detector for row in rows):
+        detector_rows = [row for row in rows if row.detector == detector and row.objects_of == ALL_OBJECTS]
+        measure_names = results.correlated_measures(detector)
+        measures = {name: MeasureValues.of([row.measures[name] for row in detector_rows]) for name in measure_names}
+        junction = JunctionScores(scenario.name, site_names, values_by_text, measures, poles)
+        study = CorrelationStudy([junction], scenario.seed)
+        by_kind = {}
+        for kind in COEFFICIENT_KINDS:  # the study is quickest in this order
+            for measure in measure_names:
+                for name in values:
+                    by_kind[kind, measure, name] = study.correlation(str(name), measure, kind)
+        for measure in measure_names:
+            for name in values:
+                coefficients = {kind: by_kind[kind, measure, name] for kind in COEFFICIENT_KINDS}
+                agreements.append(ScoreAgreement(name, detector, measure, coefficients))
+    return agreements
+
+
+def _values_by_score(sites: Sequence[str], scores: Surrogates) -> dict[ScoreName, FloatArray]:
+    """Return each score's values at the sites, with the sign changed where less is better; NaN where missing."""
+    row_of_site = {site: number for number, site in enumerate(sites)}
+    values: dict[ScoreName, FloatArray] = {}
+    for row in scores.rows:
+        name = ScoreName(row.score, row.parameters_json)
+        if name not in values:
+            values[name] = np.full(len(sites), np.nan)
+        values[name][row_of_site[row.site]] = row.sign * row.value
+    return values
+
+
+def _write_artefacts(
+    out: Path, run: ValidationRun, scenario: Scenario, validation: Validation, external: BoxesBySite
+) -> None:
+    """Write all artefacts or none: they are written to a temporary folder, then renamed."""
+    metadata = _site_metadata(run, scenario, validation, external)
+    folder = run.folder / "done"
+    folder.mkdir()
+    detection_metrics.write_detection(folder / detection_metrics.DETECTION_TABLE, validation.detections, metadata)
+    validation.surrogates.write(folder / surrogates.SURROGATES_TABLE, scenario)
+    _write_correlation(folder / CORRELATION_TABLE, validation, metadata)
+    results.write_figure(folder / results.FIGURE_FILE, scenario, validation)
+    run_folder.write_checksums(RunFolder(folder).validation_checksums, sorted(folder.iterdir()))
+    for path in sorted(folder.iterdir()):
+        path.replace(out / path.name)
+
+
+def _site_metadata(
+    run: ValidationRun, scenario: Scenario, validation: Validation, external: BoxesBySite
+) -> dict[str, Any]:
+    """Return the metadata of all artefacts; the report uses it to find the run that they belong to."""
+    record = run.record
+    detectors = list(dict.fromkeys(row.detector for row in validation.detections))
+    egvs = validation.egvs_score(scenario)
+    inputs = [record.keys, record.numbers.tolist(), detectors, validation.surrogates.inputs]
+    metadata = validation_metadata(scenario, record, detectors, validation.warnings)
+    metadata["inputs"] = files.hash_json(inputs)
+    metadata["stages"] = _stage_keys(scenario, run.folder / "scores")
+    metadata["own_score"] = {"score": egvs.score, "parameters": egvs.parameters}
+    if external:
+        metadata["given"] = {
+            site: {name: boxes.digest for name, boxes in by_detector.items()} for site, by_detector in external.items()
+        }
+    return metadata
+
+
+def _stage_keys(scenario: Scenario, folder: Path) -> dict[str, str]:
+    """Return the keys of the stages of a run whose artefacts the scores were computed from."""
+    context = open_folder(scenario, folder)
+    runs.ensure_stages(context, "tpog")  # the last TPOG in the folder may have voxels of another size
+    return {name: stages.stage_key(name, context).key for name in stages.RANKING_STAGES}
+
+
+def _write_correlation(path: Path, validation: Validation, metadata: dict[str, Any]) -> None:
+    agreements = validation.agreements
+    columns: dict[str, list[Any]] = {
+        "score": [agreement.score.score for agreement in agreements],
+        "parameters": [agreement.score.parameters for agreement in agreements],
+        "detector": [agreement.detector for agreement in agreements],
+        "measure": [agreement.measure for agreement in agreements],
+        "n": [agreement.by_kind[COEFFICIENT_KINDS[0]].sites for agreement in agreements],
+    }
+    for kind in COEFFICIENT_KINDS:
+        correlations = [agreement.by_kind[kind] for agreement in agreements]
+        columns[kind] = [correlation.value for correlation in correlations]
+        columns[f"{kind}_low"] = [correlation.interval.low for correlation in correlations]
+        columns[f"{kind}_high"] = [correlation.interval.high for correlation in correlations]
+    parquet.write_artefact(path, "correlation", columns, metadata)

@@ -1,0 +1,1 @@
+"""Training of the PointPillars detector (needs PyTorch)."""

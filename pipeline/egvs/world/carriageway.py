@@ -1,0 +1,176 @@
+"""The carriageway: the lanes that vehicles drive on, as areas.
+
+The middle line of each lane, including those inside junctions, is widened to its width less a margin on either side
+(:data:`egvs.world.clearances.LANE_INSET_M`). Sidewalks, bicycle lanes and separate rails are not carriageway. World
+frame, metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egvs.core.grid import FloatArray, IntArray
+from egvs.traffic.network import LANE_WIDTH_M, Lane, Network, Permission, Shape
+from egvs.world import clearances
+
+if TYPE_CHECKING:
+    from shapely import STRtree
+    from shapely.geometry.base import BaseGeometry
+
+
+Corner = Sequence[float] | FloatArray
+"""x and y, or more, of a corner of a rectangle."""
+
+ROAD_VCLASSES = (
+    "passenger", "private", "taxi", "bus", "coach", "delivery", "truck", "trailer", "motorcycle", "moped", "evehicle",
+    "hov", "emergency", "authority", "army", "vip", "tram",
+)  # fmt: skip
+"""A lane that admits one of these vClasses is carriageway."""
+
+_PEDESTRIAN_FUNCTIONS = ("crossing", "walkingarea")
+
+
+@dataclass(frozen=True)
+class Carriageway:
+    """The lanes that vehicles drive on.
+
+    Attributes
+    ----------
+    names
+        SUMO's id of each lane.
+    lanes
+        Their middle lines and widths.
+    junctions, corners
+        Outlines of junctions, and of the walking areas in them.
+    """
+
+    names: tuple[str, ...]
+    lanes: tuple[Lane, ...]
+    junctions: tuple[Shape, ...] = ()
+    corners: tuple[Shape, ...] = ()
+
+    @classmethod
+    def of(cls, network: Network) -> Carriageway:
+        """Return the carriageway of a network; lanes without length are left out."""
+        lanes: dict[str, Lane] = {}
+        corners: list[Shape] = []
+        for edge in network.all_edges:
+            if edge.function == "walkingarea":
+                corners += [lane for lane in edge.lanes if len(lane.shape_m) > 2]
+            if edge.function in _PEDESTRIAN_FUNCTIONS:
+                continue
+            for index, lane in enumerate(edge.lanes):
+                if is_carriageway(lane.permission) and len(lane.shape_m) > 1:
+                    lanes[f"{edge.id}_{index}"] = lane
+        junctions = [shape for shape in network.junctions if shape.type != "internal" and len(shape.shape_m) > 2]
+        return cls(tuple(lanes), tuple(lanes.values()), tuple(junctions), tuple(corners))
+
+    @cached_property
+    def areas(self) -> NDArray[Any]:
+        """Area of each lane as a shapely polygon, inset on both sides."""
+        import shapely
+
+        widths_m = np.array([LANE_WIDTH_M if lane.width_m is None else lane.width_m for lane in self.lanes])
+        half_widths_m = np.maximum(widths_m / 2.0 - clearances.LANE_INSET_M, 0.0)
+        points = [lane.shape_m[:, :2] for lane in self.lanes]
+        lane_of_point = np.repeat(np.arange(len(points)), [len(p) for p in points])
+        lines = shapely.linestrings(np.concatenate([np.empty((0, 2)), *points]), indices=lane_of_point)
+        areas: NDArray[Any] = shapely.buffer(lines, half_widths_m, cap_style="flat")
+        return areas
+
+    @cached_property
+    def _tree(self) -> STRtree:
+        from shapely import STRtree
+
+        return STRtree(self.areas)
+
+    def lanes_at(self, at_m: FloatArray) -> list[int | None]:
+        """Return the index in :attr:`lanes` of the first lane that contains each point (n, 2); None for no lane."""
+        import shapely
+
+        lanes: list[int | None] = [None] * len(at_m)
+        points, lanes_there = self._tree.query(shapely.points(at_m), "intersects").tolist()
+        for point, lane in sorted(zip(points, lanes_there, strict=True)):
+            if lanes[point] is None:
+                lanes[point] = lane
+        return lanes
+
+    def in_junctions(self, at_m: FloatArray) -> NDArray[np.bool_]:
+        """Return whether each point (n, 2) is well inside a junction, and not in a walking area; (n,) bool."""
+        import shapely
+
+        inside: NDArray[np.bool_] = shapely.intersects(self._junction_interiors, shapely.points(at_m))
+        return inside
+
+    @cached_property
+    def _junction_interiors(self) -> BaseGeometry:
+        """Junctions without their kerbs and walking areas."""
+        import shapely
+
+        inset = shapely.buffer(_outlines(self.junctions), -clearances.LANE_INSET_M)
+        return shapely.union_all(shapely.difference(inset, shapely.union_all(_outlines(self.corners))))
+
+    def touching(self, shapes: Sequence[BaseGeometry] | NDArray[Any]) -> IntArray:
+        """Return each pair of a shape and a lane that intersect, as indices (2, k)."""
+        pairs: IntArray = self._tree.query(shapes, "intersects")
+        return pairs
+
+    def nearest(self, at_m: FloatArray) -> int:
+        """Return the lane that is nearest to a point (2,)."""
+        import shapely
+
+        return int(self._tree.nearest(shapely.points(at_m)))
+
+    def within(self, low_m: Corner, high_m: Corner) -> BaseGeometry:
+        """Return all lanes in a rectangle as one shape, empty where there is none."""
+        import shapely
+
+        box = shapely.box(*low_m[:2], *high_m[:2])
+        return shapely.union_all(shapely.intersection(self.areas[self._tree.query(box, "intersects")], box))
+
+    def distance_m(self, low_m: Corner, high_m: Corner) -> float:
+        """Return the distance from a rectangle to the nearest lane; 0 where a lane crosses it."""
+        import shapely
+
+        box = shapely.box(*low_m[:2], *high_m[:2])
+        nearest = self._tree.nearest(box)
+        return float(shapely.distance(self.areas[nearest], box))
+
+    @property
+    def bounds_m(self) -> FloatArray:
+        """South-west and north-east corner of all lanes, (2, 2)."""
+        import shapely
+
+        return np.reshape(shapely.total_bounds(self.areas), (2, 2))
+
+    def height_m(self, lane: int, at_m: FloatArray) -> float:
+        """Return the road's z beside a point (2,), on the middle line of a lane."""
+        line = self.lanes[lane].shape_m
+        starts = line[:-1, :2]
+        along = np.diff(line[:, :2], axis=0)
+        length2 = np.maximum((along**2).sum(axis=1), np.finfo(np.float64).tiny)
+        share = np.clip(((at_m - starts) * along).sum(axis=1) / length2, 0.0, 1.0)
+        distance2 = ((starts + share[:, None] * along - at_m) ** 2).sum(axis=1)
+        i = int(np.argmin(distance2))
+        return float(line[i, 2] + share[i] * (line[i + 1, 2] - line[i, 2]))
+
+
+def _outlines(shapes: Sequence[Shape]) -> NDArray[Any]:
+    import shapely
+
+    rings = [shape.shape_m[:, :2] for shape in shapes]
+    polygons = np.array([shapely.Polygon(ring) for ring in rings], dtype=object)
+    # areas only: GEOS cannot subtract a collection that contains lines
+    outlines: NDArray[Any] = shapely.make_valid(polygons, method="structure", keep_collapsed=False)
+    return outlines
+
+
+def is_carriageway(permission: Permission) -> bool:
+    """Return whether a lane is for road vehicles."""
+    return any(permission.admits(vclass) for vclass in ROAD_VCLASSES)

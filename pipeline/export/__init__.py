@@ -1,1 +1,0 @@
-"""What a finished run found, in the files of other programs: any map, a spreadsheet, paper."""

@@ -1,1 +1,0 @@
-"""Writers of the formats that maps, spreadsheets and rasters are exchanged in."""

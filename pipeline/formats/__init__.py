@@ -1,1 +1,0 @@
-"""Files of other programs: point clouds, OpenStreetMap, XML that is not trusted."""

@@ -1,1 +1,0 @@
-"""Triangle meshes: how their files are held against bounds, and loaded."""

@@ -1,1 +1,0 @@
-"""Scenarios made from other people's maps."""

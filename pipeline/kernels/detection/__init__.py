@@ -1,1 +1,0 @@
-"""Kernels of detectors, which find vehicles in point clouds."""

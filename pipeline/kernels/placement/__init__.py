@@ -1,1 +1,0 @@
-"""Kernels of placement: what several sensors see together."""

@@ -1,1 +1,0 @@
-"""Where on the road a site misses vehicles: by square metre, and by lane, approach and crossing in words."""

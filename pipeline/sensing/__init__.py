@@ -1,1 +1,0 @@
-"""What a sensor in some pose sees: sensors, sites, the scene, the scanner."""

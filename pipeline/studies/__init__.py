@@ -1,1 +1,0 @@
-"""What settings cost and change: accuracy against time, effects one by one."""

@@ -1,1 +1,0 @@
-"""Who moves where: SUMO, its networks and demand, recorded traffic, boxes, trajectories."""

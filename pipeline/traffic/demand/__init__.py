@@ -1,1 +1,0 @@
-"""What moves through a network when nobody says who drives where: drawn trips, and routes that meet counts."""

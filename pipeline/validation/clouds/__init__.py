@@ -1,1 +1,0 @@
-"""Point clouds with traffic: vehicle bodies before the empty scan, returns with noise, labels; and their files."""

@@ -1,1 +1,0 @@
-"""Detectors of vehicles: those that are shipped, and files with the boxes of any other one."""

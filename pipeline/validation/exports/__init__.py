@@ -1,1 +1,0 @@
-"""Labelled point clouds as folders for anyone's detector: KITTI, OpenPCDet's custom format, PLY, PCD."""

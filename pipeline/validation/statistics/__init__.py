@@ -1,1 +1,0 @@
-"""How well a score and detection agree over sites, and how sure that is."""

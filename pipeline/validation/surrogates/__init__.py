@@ -1,1 +1,0 @@
-"""Scores of a site that are compared with detection: the EGVS itself, and those that others have published."""

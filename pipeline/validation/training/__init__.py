@@ -1,1 +1,0 @@
-"""Trains the detector on simulated sweeps of junctions; the only part that needs PyTorch."""

@@ -1,1 +1,0 @@
-"""What stands there: footprints, meshes, terrain, one triangle mesh, and casting rays at it."""
