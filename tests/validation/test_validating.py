@@ -15,6 +15,7 @@ from egvs.sensors.sites import Pose, Site
 from egvs.validation.correlation import CorrelationStudy, JunctionScores, MeasureValues
 from egvs.validation.detection_metrics import ALL_OBJECTS, BLOCKS, MEASURES, JackknifeEstimate, SiteDetection
 from egvs.validation.detectors import base
+from egvs.validation.kitti_results import KittiFiles
 from egvs.validation.results import CORRELATED_BOX_MEASURES, CORRELATED_POINT_MEASURES, ScoreName
 from egvs.validation.site_validation import correlate_scores, validate_sites
 from egvs.validation.surrogates import SurrogateRow, Surrogates
@@ -95,16 +96,18 @@ def test_twice_the_same_bytes(whole, middle, tmp_path):
 @pytest.mark.slow
 def test_what_is_kept_comes_back_as_the_results_of_another_detector(mini, middle, tmp_path):
     scenario = load(mini)
-    first = validate_sites(scenario, tmp_path / "a", frames=10, detectors=["middle"], keep=True, jobs=1)
+    first = validate_sites(
+        scenario, tmp_path / "a", frames=10, detectors=["middle"], kitti=KittiFiles(keep=True), jobs=1
+    )
     kept = tmp_path / "a" / "validation_kitti"
     with pytest.raises(InputError, match="--detections: the folder has results of 'middle', which also runs here"):
-        validate_sites(scenario, tmp_path / "b", frames=10, detectors=["middle"], detections=kept, jobs=1)
+        validate_sites(scenario, tmp_path / "b", frames=10, detectors=["middle"], kitti=KittiFiles(kept), jobs=1)
     for site in ("pole_a", "pole_b"):
         frames = sorted(path.name for path in (kept / site / "middle").iterdir())
         assert frames == sorted(path.name for path in (kept / site / "label_2").iterdir())
         assert len(frames) == 10
         (kept / site / "middle").rename(kept / site / "theirs")
-    again = validate_sites(scenario, tmp_path / "b", frames=10, detections=kept, keep=True, jobs=1)
+    again = validate_sites(scenario, tmp_path / "b", frames=10, kitti=KittiFiles(kept, keep=True), jobs=1)
     told = {(row.site, row.detector, row.objects_of): row.measures for row in [*first.detections, *again.detections]}
     for (site, detector, objects_of), measures in told.items():
         if detector == "middle":
@@ -115,7 +118,7 @@ def test_what_is_kept_comes_back_as_the_results_of_another_detector(mini, middle
     assert len(labels) == objects and all(line.startswith("Car ") for line in labels)
     (kept / "pole_b" / "theirs" / "000000.txt").unlink()
     with pytest.raises(InputError, match=r"pole_b/theirs/000000\.txt: no such file"):
-        validate_sites(scenario, tmp_path / "b", frames=10, detections=kept, jobs=1)
+        validate_sites(scenario, tmp_path / "b", frames=10, kitti=KittiFiles(kept), jobs=1)
 
 
 @pytest.mark.slow

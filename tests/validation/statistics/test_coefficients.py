@@ -17,8 +17,8 @@ OTHER = {
 
 
 def coefficient(a, b, kind):
-    return StandardisedValues.of(np.atleast_2d(np.asarray(a, float)), kind).correlate(
-        StandardisedValues.of(np.atleast_2d(np.asarray(b, float)), kind)
+    return StandardisedValues.from_values(np.atleast_2d(np.asarray(a, float)), kind).correlate(
+        StandardisedValues.from_values(np.atleast_2d(np.asarray(b, float)), kind)
     )
 
 

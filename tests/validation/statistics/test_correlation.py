@@ -40,27 +40,29 @@ def thirteen():
 
 def test_an_interval_without_bias_is_that_of_the_quantiles():
     draws = np.linspace(-1, 1, 2001)
-    interval = ConfidenceInterval.of(0.0, draws)
+    interval = ConfidenceInterval.from_resamples(0.0, draws)
     np.testing.assert_allclose([interval.low, interval.high], [-0.95, 0.95], atol=1e-9)
 
 
 def test_bias_is_corrected_by_the_normal_scale():
     """A tenth of the resamples lie below the value: z0 = -1.2816, so the ends are at Phi(2 z0 -+ 1.96)."""
     draws = np.linspace(0, 1, 10_001)
-    interval, z0 = ConfidenceInterval.of(0.1, draws), ndtri(0.1)
+    interval, z0 = ConfidenceInterval.from_resamples(0.1, draws), ndtri(0.1)
     np.testing.assert_allclose([interval.low, interval.high], ndtr(2 * z0 + np.array([-1.96, 1.96])), atol=5e-4)
 
 
 def test_values_that_equal_count_half():
-    assert ConfidenceInterval.of(0.5, np.array([0.0] * 50 + [0.5] * 50 + [1.0] * 50)) == ConfidenceInterval(0.0, 1.0)
+    assert ConfidenceInterval.from_resamples(0.5, np.array([0.0] * 50 + [0.5] * 50 + [1.0] * 50)) == ConfidenceInterval(
+        0.0, 1.0
+    )
 
 
 def test_what_an_interval_cannot_tell():
-    assert "all resamples agree" in ConfidenceInterval.of(1.0, np.ones(100)).why
+    assert "all resamples have the same value" in ConfidenceInterval.from_resamples(1.0, np.ones(100)).why
     draws = np.concatenate([np.full(10, math.nan), np.linspace(0, 1, 90)])
-    assert ConfidenceInterval.of(0.5, draws).why == "10% of the resamples have equal values only"
-    assert math.isnan(ConfidenceInterval.of(0.5, draws).low)
-    assert math.isfinite(ConfidenceInterval.of(0.5, draws[8:]).low)
+    assert ConfidenceInterval.from_resamples(0.5, draws).why == "10% of the resamples have equal values only"
+    assert math.isnan(ConfidenceInterval.from_resamples(0.5, draws).low)
+    assert math.isfinite(ConfidenceInterval.from_resamples(0.5, draws[8:]).low)
 
 
 def test_share_above():
@@ -91,8 +93,8 @@ def test_blocks_drawn_are_as_good_as_average_precision_computed_anew():
     block, rng = frame_blocks(60), np.random.default_rng(5)
     weights = rng.multinomial(10, np.full(10, 0.1), 30)
     for name, least in (("ap_bev_r40_iou50", 0.85), ("recall_3d_iou50_cars", 0.98)):
-        measured = MeasureValues.of([measures[name]])
-        linear = Resamples(np.zeros((30, 1), np.int64), weights).of_measure(measured, np.array([True]))[:, 0]
+        measured = MeasureValues.from_estimates([measures[name]])
+        linear = Resamples(np.zeros((30, 1), np.int64), weights).resample_measure(measured, np.array([True]))[:, 0]
         anew = []
         for drawn in weights:
             rows = [k for k in range(60) for _ in range(drawn[block[k]])]
@@ -105,8 +107,8 @@ def test_blocks_drawn_are_as_good_as_average_precision_computed_anew():
 
 def test_blocks_drawn_scatter_by_the_standard_error():
     made = made_up.junction(np.random.default_rng(6), 3, (0.5,)).measures["ap"]
-    draws = Resamples.of("a", 3, 10, 20_000, 0)
-    fixed = Resamples(np.tile(np.arange(3), (20_000, 1)), draws.blocks).of_measure(made, made.known)
+    draws = Resamples.draw("a", 3, 10, 20_000, 0)
+    fixed = Resamples(np.tile(np.arange(3), (20_000, 1)), draws.blocks).resample_measure(made, made.defined)
     se = np.sqrt(9 / 10 * ((made.left_out - made.left_out.mean(axis=1, keepdims=True)) ** 2).sum(axis=1))
     np.testing.assert_allclose(fixed.std(axis=0), se, rtol=0.02)
     np.testing.assert_allclose(fixed.mean(axis=0), made.values, atol=0.005)
@@ -114,8 +116,11 @@ def test_blocks_drawn_scatter_by_the_standard_error():
 
 def test_a_resample_has_whole_sites(thirteen):
     """A site's score and measure stay together, and a site that is drawn twice has the same of both."""
-    draws = Resamples.of("a", 13, 10, 50, 0)
-    score, measure = draws.of_score(thirteen.scores["s0"]), draws.of_measure(thirteen.measures["ap"], np.ones(13, bool))
+    draws = Resamples.draw("a", 13, 10, 50, 0)
+    score, measure = (
+        draws.resample_score(thirteen.scores["s0"]),
+        draws.resample_measure(thirteen.measures["ap"], np.ones(13, bool)),
+    )
     for row in range(50):
         assert len(np.unique(score[row])) == len(np.unique(measure[row])) == len(np.unique(draws.sites[row]))
     assert (draws.blocks.sum(axis=1) == 10).all()
@@ -147,15 +152,15 @@ def test_a_constant_score_has_no_correlation_and_it_is_told(thirteen):
     assert math.isnan(found.value) and math.isnan(found.interval.low)
     (doubt,) = found.warnings("flat, ap")
     assert str(doubt) == (
-        "flat, ap: no correlation: flat is the same at all sites of made up; more sites, or sites that differ more"
+        "flat, ap: no correlation: flat is the same at all sites of made up. Use more sites, or sites that differ more"
     )
 
 
 @pytest.mark.parametrize(
     ("sites", "defined", "why"),
     [
-        (2, False, "made up has 2 sites with values; 3 are needed"),
-        (4, True, "made up has sites at 4 places; an interval needs 5"),
+        (2, False, "made up has 2 sites with values, and a correlation needs 3"),
+        (4, True, "made up has sites on 4 poles, and an interval needs 5"),
         (5, True, ""),
     ],
 )
@@ -169,7 +174,7 @@ def test_a_perfect_order_of_ranks_has_an_interval_only_if_resamples_differ():
     made = made_up.junction(np.random.default_rng(0), 8, (1.0,))
     sure = MeasureValues(made.scores["s0"], np.tile(made.scores["s0"][:, None], (1, 10)))  # no block changes anything
     found = study(JunctionScores("j", made.sites, made.scores, {"ap": sure})).correlation("s0", "ap", "spearman")
-    assert found.value == 1 and math.isnan(found.interval.low) and "all resamples agree" in found.why
+    assert found.value == 1 and math.isnan(found.interval.low) and "all resamples have the same value" in found.why
 
 
 def test_sites_without_a_value_are_left_out_and_named(thirteen):
@@ -183,7 +188,7 @@ def test_sites_without_a_value_are_left_out_and_named(thirteen):
     rest = [k for k in range(13) if k not in (4, 7)]
     assert found.value == pytest.approx(scipy.stats.spearmanr(values[rest], measured.values[rest]).statistic)
     assert found.sites == 11 and found.dropped == ("j c04", "j c07")
-    assert "left out, for a value is not defined there: j c04, j c07" in str(found.warnings("s0")[0])
+    assert "without j c04, j c07, where a value is undefined" in str(found.warnings("s0")[0])
 
 
 # ---- two scores
@@ -202,7 +207,7 @@ def test_a_score_is_no_better_than_its_copy_and_pairing_tells_more_than_two_inte
     rng = np.random.default_rng(1)
     near = with_scores(thirteen, copy=thirteen.scores["s0"], near=thirteen.scores["s0"] + 0.1 * rng.normal(size=13))
     same = study(near).difference("s0", "copy", "ap", "pearson")
-    assert same.value == 0 and same.better == 0.5 and "all resamples agree" in same.why
+    assert same.value == 0 and same.better == 0.5 and "all resamples have the same value" in same.why
     width = [its.interval.high - its.interval.low for its in (
         study(near).difference("s0", "near", "ap", "pearson"), study(near).correlation("s0", "ap", "pearson"),
     )]  # fmt: skip
@@ -253,15 +258,15 @@ def test_one_junction_with_a_constant_score_is_named():
 
 def test_sites_of_one_place_are_drawn_together() -> None:
     places = ("a", "b", "a", "c", "d", "d")  # two of two sites, two of one
-    draws = Resamples.of("x", 6, 10, 4000, 0, places)
+    draws = Resamples.draw("x", 6, 10, 4000, 0, places)
     assert draws.sites.shape == (4000, 6)
     often = np.stack([np.bincount(row, minlength=6) for row in draws.sites])
     np.testing.assert_array_equal(often[:, 0], often[:, 2])
     np.testing.assert_array_equal(often[:, 4], often[:, 5])
     assert (often[:, [0, 4]].sum(axis=1) == 2).all() and (often[:, [1, 3]].sum(axis=1) == 2).all()
     assert 0.45 < (often[:, 0] == 1).mean() < 0.55  # each of two, twice
-    alone = Resamples.of("x", 6, 10, 50, 0, tuple("abcdef"))
-    np.testing.assert_array_equal(alone.sites, Resamples.of("x", 6, 10, 50, 0).sites)
+    alone = Resamples.draw("x", 6, 10, 50, 0, tuple("abcdef"))
+    np.testing.assert_array_equal(alone.sites, Resamples.draw("x", 6, 10, 50, 0).sites)
 
 
 def test_places_widen_an_interval_where_their_sites_are_alike() -> None:
