@@ -223,7 +223,7 @@ def test_a_second_run_says_that_all_was_kept(run_egvs, mini, tmp_path):
             ["--set", "roi.center_m=[20, 28, 2.5]"],
             r"no vehicle's centre is in the region in any of 10 frames of held-out",
         ),
-        (["--set", "sites.file='measured.csv'"], r"site pole_a: an empty scan that was measured"),
+        (["--set", "sites.file='measured.csv'"], r"site pole_a: its empty scan was measured"),
     ],
 )
 def test_what_cannot_be_done_is_told(run_egvs, mini, tmp_path, arguments, message):

@@ -440,7 +440,7 @@ class Playback:
         self._session, self._path = session, session.work.folder.trajectories
         self.frames = int(parquet.read_metadata(self._path, "trajectories")["frames"])
         self.parts = cloud_simulation.body_parts(session.scenario)
-        self._shapes = VehicleMeshes.of(self.parts)
+        self._shapes = VehicleMeshes.from_parts(self.parts)
         self._stretch: tuple[int, list[TrafficFrame]] = (-1, [])
         self._scanner: tuple[Scene, Scanner] | None = None
         self._maker: tuple[Site, CloudSimulator] | None = None

@@ -71,6 +71,9 @@ class KittiFiles:
     keep: bool = False
 
 
+NO_KITTI_FILES = KittiFiles()
+
+
 def read_kitti_results(folder: Path, poses: Mapping[str, Pose], numbers: IntArray) -> DetectorResults:
     """Read all results of a folder.
 

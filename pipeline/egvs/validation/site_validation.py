@@ -33,7 +33,7 @@ from egvs.validation.detection_metrics import ALL_OBJECTS, SiteDetection
 from egvs.validation.detector_runs import DetectionListener, SiteDetectionTask, run_detectors
 from egvs.validation.detectors import base
 from egvs.validation.held_out_traffic import HeldOutTraffic
-from egvs.validation.kitti_results import KittiFiles
+from egvs.validation.kitti_results import NO_KITTI_FILES, KittiFiles
 from egvs.validation.results import ScoreAgreement, ScoreName, Validation
 from egvs.validation.surrogates import Surrogates
 from egvs.validation.sweeps import POINT_COUNTS_NAME, DetectedBoxes, detections_in_roi
@@ -51,7 +51,7 @@ def validate_sites(
     *,
     frames: int,
     detectors: Sequence[str] = (POINT_COUNTS_NAME,),
-    kitti: KittiFiles = KittiFiles(),
+    kitti: KittiFiles = NO_KITTI_FILES,
     jobs: int | None = None,
     progress: ProgressCallback = no_progress,
     listener: DetectionListener | None = None,

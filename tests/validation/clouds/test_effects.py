@@ -61,7 +61,7 @@ def test_each_beam_draws_one_of_its_rows_by_weight(mini, settings):
     drawn = np.zeros(len(weight))
     random = sweep_rng(1, "here", 0)
     for _ in range(60):
-        rows = maker._drawn(maker._cumulated, random)
+        rows = maker._draw_rows(maker._cumulated_weight, random)
         np.testing.assert_array_equal(maker._beam[rows], np.arange(sensor.beams))
         drawn[rows] += 1
     of_rank = np.arange(len(weight)) % (len(weight) // sensor.beams)

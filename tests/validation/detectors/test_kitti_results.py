@@ -104,7 +104,10 @@ def _calibrated(folder, text):
         (lambda f: (f / "b" / "mine").rename(f / "b" / "label_2"), ["b: the folder contains no results"]),
         (lambda f: (f / "b" / "mine").rename(f / "b" / "yours"), ["a: no results of yours"]),
         (lambda f: (f / "a" / "mine" / "000008.txt").unlink(), ["000008.txt: no such file", "each of the 2 frames"]),
-        (lambda f: (f / "a" / "mine" / "000004.txt").touch(), ["000004.txt: expected results of 2 frames", "000000.txt to 000008.txt"]),
+        (
+            lambda f: (f / "a" / "mine" / "000004.txt").touch(),
+            ["000004.txt: expected results of 2 frames", "000000.txt to 000008.txt"],
+        ),
         (lambda f: (f / "a" / "mine" / "000008.txt").write_bytes(b"\xff\xfe"), ["000008.txt: is no text"]),
         (lambda f: _calibrated(f, "P2: 1 0 0 0"), ["000000.txt: has no R0_rect"]),
         (lambda f: _calibrated(f, kitti.CALIBRATION.replace("0 -1 0 0 0 0 -1", "1 -1 0 0 0 0 -1")), ["Tr_velo_to_cam"]),

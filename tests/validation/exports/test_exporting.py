@@ -260,7 +260,7 @@ def test_sites_that_cannot_be_exported_are_refused(four, tmp_path):
     (four / "sites.csv").write_text("site,x_m,y_m,z_m,points\n..,10,8,3,\nmeasured,12,8,3,scan.ply\n")
     with pytest.raises(InputError, match=r"site \.\.: its name cannot be that of a folder here"):
         write_dataset(load(four), tmp_path / "out", sites=[".."], frames=2)
-    with pytest.raises(InputError, match="site measured: an empty scan that was measured"):
+    with pytest.raises(InputError, match="site measured: its empty scan was measured"):
         write_dataset(load(four), tmp_path / "out", sites=["measured"], frames=2)
 
 

@@ -17,7 +17,7 @@ def _estimate(by_block):
     """The mean of a value that each of ten blocks of one frame has, as a detector's measures are jackknifed."""
     by_block = np.asarray(by_block, dtype=np.float64)
     left_out = (by_block.sum() - by_block) / (BLOCKS - 1)
-    return JackknifeEstimate.of(np.append(by_block.mean(), left_out), np.ones(BLOCKS))
+    return JackknifeEstimate.from_values(np.append(by_block.mean(), left_out), np.ones(BLOCKS))
 
 
 def test_a_difference_is_as_sure_as_the_blocks_agree():

@@ -166,4 +166,4 @@ def test_a_site_with_a_measured_scan_cannot_look_at_traffic(run_egvs, planned, t
     (mini / "cloud.csv").write_text("x_m,y_m,z_m\n12,3,0\n20,1,0\n")
     (mini / "measured.csv").write_text("site,x_m,y_m,z_m,points\npole_a,10,12,3,cloud.csv\npole_b,30.5,-12,3,\n")
     error = _refused(run_egvs, mini, tmp_path / "x", "--plan-from", out, "--set", "sites.file='measured.csv'")
-    assert "site pole_a: an empty scan that was measured" in error
+    assert "site pole_a: its empty scan was measured" in error

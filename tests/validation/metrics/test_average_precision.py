@@ -35,7 +35,7 @@ def found(*scored):
 def one_frame(truth, *scored):
     """The measures of one frame, beside nine that are empty."""
     empty = [(objects([]), Detections.empty())] * 9
-    return evaluate(EvaluationFrames.of(*zip((truth, found(*scored)), *empty, strict=True)))
+    return evaluate(EvaluationFrames.from_frames(*zip((truth, found(*scored)), *empty, strict=True)))
 
 
 def values(evaluation, view="bev", iou=70, end=""):
@@ -97,10 +97,12 @@ def test_no_objects_is_no_number_and_is_told():
     evaluation = one_frame(objects([]), (A, 0.9))
     assert all(math.isnan(its.value) and math.isnan(its.se) for its in evaluation.measures.values())
     doubts = [str(doubt) for doubt in evaluation.warnings("site c03, cluster")]
-    assert doubts[0] == ("site c03, cluster: no vehicles in 10 frames: there is no average precision; more frames")
+    assert doubts[0] == (
+        "site c03, cluster: no vehicles in 10 frames, so average precision is undefined. Use more frames"
+    )
     assert len(doubts) == 5  # of each subset
     evaluation = one_frame(objects([A]), (A, 0.9))
-    assert "the only vehicles are in one of 10 blocks of frames" in str(evaluation.warnings("site c03")[0])
+    assert "all vehicles are in one of 10 blocks of frames" in str(evaluation.warnings("site c03")[0])
     assert evaluation.measures["ap_bev_r40_iou70"].value == 1 and math.isnan(evaluation.measures["ap_bev_r40_iou70"].se)
 
 
@@ -144,7 +146,7 @@ def test_standard_error_by_hand():
     """One object a frame, found in five of ten. Recall .5; without a found one 4/9, without a missed one 5/9. Pseudo-
     values 10 * .5 - 9 * that: 1 and 0. se^2 = mean of (1/2)^2 / 9, so se = 1/6: that of a mean of five 1 and five 0."""
     truth, hit = objects([A]), found((A, 0.9))
-    record = EvaluationFrames.of([truth] * 10, [hit] * 5 + [Detections.empty()] * 5)
+    record = EvaluationFrames.from_frames([truth] * 10, [hit] * 5 + [Detections.empty()] * 5)
     recall = evaluate(record).measures["recall_bev_iou70"]
     np.testing.assert_allclose(recall.left_out, [4 / 9] * 5 + [5 / 9] * 5)
     assert recall.value == 0.5 and recall.se == pytest.approx(1 / 6)
@@ -155,14 +157,14 @@ def test_standard_error_of_unequal_blocks():
     frames, rng = np.bincount(frame_blocks(47, 10)), np.random.default_rng(0)
     sums = rng.normal(size=10) * frames
     left_out = (sums.sum() - sums) / (frames.sum() - frames)
-    estimate = JackknifeEstimate.of(np.concatenate([[sums.sum() / 47], left_out]), frames)
+    estimate = JackknifeEstimate.from_values(np.concatenate([[sums.sum() / 47], left_out]), frames)
     expected = ((sums / frames - sums.sum() / 47) ** 2 / (47 / frames - 1)).mean() ** 0.5
     assert estimate.se == pytest.approx(expected)
 
 
 def test_blocks_are_neighbours_of_equal_length():
     assert list(frame_blocks(7, 3)) == [0, 0, 0, 1, 1, 2, 2]
-    with pytest.raises(InputError, match="--frames: 9; at least 10: standard errors come from 10 blocks"):
+    with pytest.raises(InputError, match="--frames: expected at least 10 frames, got 9"):
         frame_blocks(9)
 
 
@@ -208,7 +210,7 @@ def twin(truth, detections, subset, view, iou):
 @pytest.mark.parametrize("seed", range(3))
 def test_it_is_the_twins(seed):
     truth, detections = random_scenes(seed, 20)
-    evaluation = evaluate(EvaluationFrames.of(truth, detections))
+    evaluation = evaluate(EvaluationFrames.from_frames(truth, detections))
     for subset in ("", "cars", "points_20"):
         for view, iou in (("bev", 0.7), ("3d", 0.5)):
             end = f"_{subset}" if subset else ""
@@ -219,7 +221,7 @@ def test_it_is_the_twins(seed):
 
 def test_left_out_values_are_those_of_fewer_frames():
     truth, detections = random_scenes(7, 20)
-    estimate = evaluate(EvaluationFrames.of(truth, detections), 5).measures
+    estimate = evaluate(EvaluationFrames.from_frames(truth, detections), 5).measures
     for block in (0, 3):
         rest = [k for k in range(20) if k // 4 != block]
         right = twin([truth[k] for k in rest], [detections[k] for k in rest], "cars", "3d", 0.5)
@@ -230,7 +232,7 @@ def test_left_out_values_are_those_of_fewer_frames():
 def test_few_objects_are_frames_counted_often():
     truth, detections = random_scenes(3, 12, 1.0)
     assert 5 < sum(len(its.boxes) for its in truth) < 30
-    got = values(evaluate(EvaluationFrames.of(truth, detections)), "bev", 50)
+    got = values(evaluate(EvaluationFrames.from_frames(truth, detections)), "bev", 50)
     np.testing.assert_allclose(got, twin(truth, detections, "", "bev", 0.5), atol=1e-12)
 
 
@@ -244,8 +246,10 @@ def test_the_order_in_which_things_are_given_has_no_say():
             return GroundTruth(its.boxes[row], its.is_car[row], its.points[row])
         return Detections(its.boxes[row], its.scores[row])
 
-    plain = evaluate(EvaluationFrames.of(truth, detections))
-    other = evaluate(EvaluationFrames.of([shuffled(its) for its in truth], [shuffled(its) for its in detections]))
+    plain = evaluate(EvaluationFrames.from_frames(truth, detections))
+    other = evaluate(
+        EvaluationFrames.from_frames([shuffled(its) for its in truth], [shuffled(its) for its in detections])
+    )
     for name, its in plain.measures.items():
         assert (its.value, its.se) == (other.measures[name].value, other.measures[name].se), name
 
@@ -265,7 +269,7 @@ def test_who_comes_first_among_equals(turned, swapped):
 def test_scores_matter_by_their_order_alone():
     truth, detections = random_scenes(12, 30)
     bent = [Detections(its.boxes, np.exp(7 * its.scores) - 100) for its in detections]
-    plain, other = (evaluate(EvaluationFrames.of(truth, its)).measures for its in (detections, bent))
+    plain, other = (evaluate(EvaluationFrames.from_frames(truth, its)).measures for its in (detections, bent))
     assert all(plain[name].value == other[name].value for name in plain)
 
 
@@ -275,7 +279,8 @@ def test_scores_matter_by_their_order_alone():
 def test_vehicles_of_a_frame():
     boxes = np.array([box(1.0), box(2.0), box(3.0), box(30.0)])
     frame = TrafficFrame(0, tuple("abcd"), ("taxi", "bus", "bicycle", "taxi"), boxes, np.zeros(4))
-    its = GroundTruth.of(frame, np.array([7, 8, 9, 10]), Roi((0.0, -5.0, 0.0), (10.0, 10.0, 5.0)))
+    roi = Roi((0.0, -5.0, 0.0), (10.0, 10.0, 5.0))
+    its = GroundTruth.from_frame(frame, np.array([7, 8, 9, 10])[frame.target_rows(roi)], roi)
     assert list(its.is_car) == [True, False] and list(its.points) == [7, 8] and list(its.boxes[:, 0]) == [1, 2]
 
 
@@ -288,12 +293,12 @@ def test_detections_beyond_the_region_are_dropped():
 @pytest.mark.parametrize(
     ("wrong", "score", "message"),
     [
-        (box(math.nan), 1.0, "detection 1 of frame 1: x_m is nan; a finite number"),
-        (box(0.0), math.inf, "detection 1 of frame 1: score is inf; a finite number"),
-        (box(0.0, length=-1.0), 1.0, "detection 1 of frame 1: length_m is -1; a length of at least 0"),
+        (box(math.nan), 1.0, "detection 1 of frame 1: x_m: expected a finite number, got nan"),
+        (box(0.0), math.inf, "detection 1 of frame 1: score: expected a finite number, got inf"),
+        (box(0.0, length=-1.0), 1.0, "detection 1 of frame 1: length_m: expected a length of at least 0, got -1"),
     ],
 )
 def test_what_is_no_box_is_refused(wrong, score, message):
     with pytest.raises(InputError) as caught:
-        EvaluationFrames.of([objects([])] * 2, [Detections.empty(), found((A, 0.5), (wrong, score))])
-    assert str(caught.value) == message
+        EvaluationFrames.from_frames([objects([])] * 2, [Detections.empty(), found((A, 0.5), (wrong, score))])
+    assert str(caught.value).startswith(message)

@@ -89,7 +89,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(kind):
 def test_blocks_drawn_are_as_good_as_average_precision_computed_anew():
     """A draw of blocks is a sum of frames: AP of these frames against its linear form from the left-out values."""
     truth, found = random_scenes(21, 60)
-    measures = evaluate(EvaluationFrames.of(truth, found)).measures
+    measures = evaluate(EvaluationFrames.from_frames(truth, found)).measures
     block, rng = frame_blocks(60), np.random.default_rng(5)
     weights = rng.multinomial(10, np.full(10, 0.1), 30)
     for name, least in (("ap_bev_r40_iou50", 0.85), ("recall_3d_iou50_cars", 0.98)):
@@ -98,7 +98,7 @@ def test_blocks_drawn_are_as_good_as_average_precision_computed_anew():
         anew = []
         for drawn in weights:
             rows = [k for k in range(60) for _ in range(drawn[block[k]])]
-            again = evaluate(EvaluationFrames.of([truth[k] for k in rows], [found[k] for k in rows])).measures
+            again = evaluate(EvaluationFrames.from_frames([truth[k] for k in rows], [found[k] for k in rows])).measures
             anew.append(again[name].value)
         assert np.corrcoef(linear, anew)[0, 1] > least
         assert np.std(linear) == pytest.approx(np.std(anew), rel=0.25)

@@ -61,7 +61,7 @@ class HeldOutSet:
             for number, junction in enumerate(self._junctions):
                 for pose in range(self.POSES):
                     self._run_detector(PointPillars(path), junction, (number, pose), truth, found)
-        measures = evaluate(EvaluationFrames.of(truth, found)).measures
+        measures = evaluate(EvaluationFrames.from_frames(truth, found)).measures
         return {name: round(measures[name].value, 4) for name in _MEASURES}
 
     def _run_detector(
@@ -81,7 +81,11 @@ class HeldOutSet:
         at_site = detector.at(maker.view, scene.roi)
         for frame in junction.frames[which[1] :: self.POSES]:
             swept = maker.sweep(frame, random)
-            truth.append(GroundTruth.of(frame, swept.points_on(len(frame.boxes)), scene.roi))
+            truth.append(
+                GroundTruth.from_frame(
+                    frame, swept.points_on(len(frame.boxes))[frame.target_rows(scene.roi)], scene.roi
+                )
+            )
             detections.append(detections_in_roi(at_site.detect(swept.sweep), scene.roi))
 
 
