@@ -24,7 +24,7 @@ class Middle:
     def settings(self):
         return {"size_m": self.size_m}
 
-    def at(self, view, roi):
+    def at_site(self, view, roi):
         del roi
         return _MiddleAt(view, self.size_m)
 
@@ -51,7 +51,7 @@ class Odd(Middle):
     NAME = "odd"
     folder: Path = Path()
 
-    def at(self, view, roi):
+    def at_site(self, view, roi):
         if (self.folder / view.site).exists():
             what = (self.folder / view.site).read_text()
             if what == "refuse":
@@ -67,4 +67,4 @@ class Odd(Middle):
                     alive.flush()
                     os.kill(os.getppid(), signal.SIGKILL)
                     threading.Event().wait()
-        return super().at(view, roi)
+        return super().at_site(view, roi)

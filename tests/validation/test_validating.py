@@ -218,7 +218,7 @@ def test_a_second_run_says_that_all_was_kept(run_egvs, mini, tmp_path):
     [
         (["--frames", "11"], r"--frames: expected at most 10 frames at least 2 s apart, got 11"),
         (["--frames", "9"], r"greater than or equal to 10"),
-        (["--detector", "nosuch"], r"--detector: unknown detector 'nosuch'; one of points, "),
+        (["--detector", "nosuch"], r"--detector: unknown detector 'nosuch'. Use one of points, "),
         (
             ["--set", "roi.center_m=[20, 28, 2.5]"],
             r"no vehicle's centre is in the region in any of 10 frames of held-out",

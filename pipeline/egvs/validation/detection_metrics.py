@@ -1,7 +1,7 @@
 r"""Detection metrics: matching, recall and average precision with standard errors; ``detection.parquet``.
 
-**Overlap** of two boxes: intersection over union, from above (BEV, rotated rectangles: area over area) and in 3D (volume
-over volume: the common area times the common height). Boxes are upright; pitch is ignored, as in KITTI.
+**Overlap** of two boxes: intersection over union, from above (BEV, rotated rectangles: area over area) and in 3D
+(volume over volume: the common area times the common height). Boxes are upright; pitch is ignored, as in KITTI.
 
 .. math:: IoU_{BEV} = \frac{A_{ab}}{A_a + A_b - A_{ab}}, \qquad
           IoU_{3D} = \frac{A_{ab} h_{ab}}{V_a + V_b - A_{ab} h_{ab}}

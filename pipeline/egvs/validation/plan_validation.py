@@ -149,7 +149,7 @@ class FusedDetectionTask(DetectionTaskBase[JointDetector]):
         detectors = {}
         for name in names:
             if name != POINT_COUNTS_NAME:
-                detectors[name] = self.detectors[name].together(views, self.record.scene.roi).detect
+                detectors[name] = self.detectors[name].at_sites(views, self.record.scene.roi).detect
         return self.detect(simulators, detectors, with_points=POINT_COUNTS_NAME in names)
 
     def key(self, group: SensorGroup, name: str) -> str:

@@ -192,7 +192,7 @@ def test_the_empty_scan_holds_every_beam_and_those_at_the_region_as_ever(mini):
 def test_a_measured_scan_is_refused(mini):
     scene = built(mini)
     with pytest.raises(
-        InputError, match=r"site pole_a: an empty scan that was measured \(scan\.pcd\).*; a site without"
+        InputError, match=r"site pole_a: its empty scan was measured \(scan\.pcd\).* Use a site without"
     ):
         CloudSimulator.of_site(scene, replace(scene.sites[0], points="scan.pcd"))
 

@@ -43,7 +43,7 @@ def look(boxes, pose=POSE, slope=0.0, still=(), noise_m=0.0):
     beam = np.flatnonzero(np.isfinite(ranges)).astype(np.uint32)
     measured = ranges[beam] + noise_m * np.random.default_rng(1).standard_normal(len(beam))
     points = np.column_stack([SENSOR.directions()[beam] * measured[:, None], np.ones(len(beam))])
-    return Cluster().at(view, ROI), Sweep(points.astype(np.float32), beam)
+    return Cluster().at_site(view, ROI), Sweep(points.astype(np.float32), beam)
 
 
 def overlaps(boxes, found, slope=0.0):
@@ -103,7 +103,7 @@ def test_what_a_pole_hides_of_a_car_is_completed():
     assert len(found.boxes) == 1
     assert overlaps([car], found)[0].min() > 0.7
     # did it not know of the column, it would take it for something short
-    blind = replace(detector, joint=replace(detector.joint, still=whole.joint.still))
+    blind = replace(detector, joint=replace(detector.joint, static_images=whole.joint.static_images))
     assert overlaps([car], blind.detect(sweep))[0].min() < 0.7 if len(blind.detect(sweep).boxes) else True
 
 

@@ -35,20 +35,20 @@ def _to_plane(slope, wall_x_m=np.inf):
 
 @pytest.mark.parametrize("slope", [0.0, 0.06, -0.1])
 def test_the_ground_of_a_slope_is_the_slope(slope):
-    ground = GroundMap.of(_view(_to_plane(slope)), ROI)
+    ground = GroundMap.from_empty_scans([_view(_to_plane(slope))], ROI)
     at = np.random.default_rng(0).uniform(5.0, 35.0, (200, 2))
     np.testing.assert_allclose(ground.height_m(at), slope * at[:, 0], atol=2 * abs(slope) * 2 + 1e-9)
 
 
 def test_a_wall_is_no_ground():
-    ground = GroundMap.of(_view(_to_plane(0.0, wall_x_m=30.0)), ROI)
+    ground = GroundMap.from_empty_scans([_view(_to_plane(0.0, wall_x_m=30.0))], ROI)
     at = np.array([[10.0, 20.0], [29.0, 20.0], [31.0, 20.0], [39.0, 10.0]])
     np.testing.assert_allclose(ground.height_m(at), 0.0, atol=MAX_SLOPE * SQUARE_M)  # its foot is taken for a climb
 
 
 def test_where_nothing_was_met_the_ground_is_below_the_sensor():
     view = _view(lambda _, ways: np.full(len(ways), np.inf))
-    np.testing.assert_array_equal(GroundMap.of(view, ROI).height_m(np.array([[1.0, 2.0]])), [4.0])
+    np.testing.assert_array_equal(GroundMap.from_empty_scans([view], ROI).height_m(np.array([[1.0, 2.0]])), [4.0])
 
 
 def test_what_is_new_lies_before_the_empty_scan_and_in_the_world_where_it_was_met():

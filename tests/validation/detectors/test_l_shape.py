@@ -37,7 +37,7 @@ def test_a_box_seen_from_one_corner_gives_its_corner(degrees):
     xy = corner_of(4.5, 1.8, yaw, (20.0, -7.0))
     found = cluster.bounding_rectangles(xy, np.array([0, len(xy)]))
     np.testing.assert_allclose(found.yaw_rad, [yaw], atol=1e-12)
-    corner = found.along_axes(0, np.array([[20.0, -7.0]]))[0]
+    corner = found.to_axes(0, np.array([[20.0, -7.0]]))[0]
     np.testing.assert_allclose(found.ends_m[0, :, 0], corner, atol=1e-9)
     np.testing.assert_allclose(found.ends_m[0, :, 1], corner + np.array([4.5, 1.8]), atol=1e-9)
     np.testing.assert_allclose(found.closeness, [1.0])

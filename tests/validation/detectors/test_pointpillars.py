@@ -106,14 +106,14 @@ def test_windows_cover_the_region_and_share_a_seam(size_m):
 def test_a_model_that_is_none_is_named(tmp_path):
     path = tmp_path / "m.onnx"
     path.write_bytes(b"no model")
-    with pytest.raises(InputError, match=r"m\.onnx: no ONNX model .*; a model that egvs train wrote"):
-        pointpillars.OnnxModel.of(path)
+    with pytest.raises(InputError, match=r"m\.onnx: not an ONNX model .*\. Use a model that egvs train wrote"):
+        pointpillars.OnnxModel.load(path)
     with pytest.raises(InputError, match="No such file"):
-        pointpillars.OnnxModel.of(tmp_path / "absent.onnx")
+        pointpillars.OnnxModel.load(tmp_path / "absent.onnx")
 
 
 def test_the_shipped_model_says_how_it_was_made():
-    about = pointpillars.OnnxModel.of(pointpillars.SHIPPED_MODEL).metadata
+    about = pointpillars.OnnxModel.load(pointpillars.SHIPPED_MODEL).metadata
     assert about["convention"] == "ground" and about["parameters"] == 985785
     assert "nishishinjuku" not in about["junctions"] and len(about["junctions"]) >= 4
     assert about["curve"][-1]["step"] == about["recipe"]["steps"]

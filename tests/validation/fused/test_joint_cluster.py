@@ -19,7 +19,7 @@ NEAR, FAR = Pose(0.0, 0.0, 4.0), Pose(0.0, 30.0, 4.0, yaw_deg=40.0)
 def fused(boxes, poses, still=(), noise_m=0.0):
     """What sensors find together, and what each finds alone."""
     seen = [look(boxes, pose, still=still, noise_m=noise_m) for pose in poses]
-    joint = Cluster().together([detector.joint.views[0] for detector, _ in seen], ROI)
+    joint = Cluster().at_sites([detector.joint.views[0] for detector, _ in seen], ROI)
     return joint.detect([sweep for _, sweep in seen]), [detector.detect(sweep) for detector, sweep in seen]
 
 
@@ -59,7 +59,7 @@ def test_sensors_that_see_nothing_new_change_nothing():
 
 def test_sweeps_without_points_are_nothing():
     detector, _ = look([], NEAR)
-    joint = Cluster().together([detector.joint.views[0]] * 2, ROI)
+    joint = Cluster().at_sites([detector.joint.views[0]] * 2, ROI)
     empty = Sweep(np.empty((0, 4), np.float32), np.empty(0, np.uint32))
     assert joint.detect([empty, empty]).boxes.shape == Detections.empty().boxes.shape
 

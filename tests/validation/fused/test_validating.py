@@ -13,7 +13,7 @@ from egvs.validation.detection_metrics import ALL_OBJECTS
 from egvs.validation.detector_runs import SiteDetectionTask
 from egvs.validation.detectors import base
 from egvs.validation.detectors.cluster import Cluster
-from egvs.validation.detectors.pointpillars import HeightZero, PillarPoints
+from egvs.validation.detectors.pointpillars import HeightOrigin, PillarPoints
 from egvs.validation.plan_validation import FusedDetectionTask, SensorGroup
 from egvs.validation.sweeps import POINT_COUNTS_NAME, SiteView, Sweep
 from tests.validation.detecting import Middle
@@ -82,11 +82,11 @@ def test_pillars_have_what_each_sensor_says_of_its_own_points(mini):
     ranges = np.full(record_sensor.beams, 20.0)
     views = [SiteView(name, pose, record_sensor, ranges) for name, pose in _poses()]
     sweep = Sweep(np.array([[5.0, 0.0, 0.0, 0.5], [20.0, 0.0, 0.0, 0.25]], np.float32), np.array([0, 1], np.uint32))
-    zero = HeightZero("sensor", views[0], scenario.roi.box, views[1:])
-    found = PillarPoints.together([sweep, sweep], views, zero)
+    zero = HeightOrigin("sensor", views, scenario.roi.box)
+    found = PillarPoints.from_sweeps([sweep, sweep], views, zero)
     np.testing.assert_allclose(found.xy_m, [[5, 0], [20, 0], [25, 0], [10, 0]], atol=1e-9)  # the second looks back
     np.testing.assert_allclose(found.height_m, [0, 0, 1, 1])  # from the first one's sensor
-    np.testing.assert_array_equal(found.new, [True, False, True, False])
+    np.testing.assert_array_equal(found.is_foreground, [True, False, True, False])
     np.testing.assert_allclose(found.range_m, [5, 20, 5, 20])
     np.testing.assert_allclose(found.intensity, [0.5, 0.25, 0.5, 0.25])
 

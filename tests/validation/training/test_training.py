@@ -21,7 +21,7 @@ from egvs.validation.detectors.pointpillars import (
     METADATA_KEY,
     N_FEATURES,
     POINTS_PER_PILLAR,
-    HeightZero,
+    HeightOrigin,
     OnnxModel,
     Pillars,
     PillarWindow,
@@ -40,7 +40,7 @@ VIEW = SiteView("s", Pose(0.0, 0.0, 5.0), SENSOR, np.full(SENSOR.beams, np.inf))
 
 def _target(boxes, points, kinds=None):
     frame = TrafficFrame(0, ("v",) * len(boxes), kinds or ("passenger",) * len(boxes), np.array(boxes), np.zeros(2))
-    zero = HeightZero("sensor", VIEW, None)  # heights from 5 m
+    zero = HeightOrigin("sensor", [VIEW], None)  # heights from 5 m
     motor = np.array([kind != "pedestrian" for kind in frame.kinds])
     return samples.make_target(frame, motor, np.array(points), PillarWindow((0.0, 0.0), 0.0, CROP_CELLS), zero)
 
@@ -103,7 +103,7 @@ def test_an_exported_model_says_what_the_network_says(tmp_path):
     net = PillarNet()
     path = tmp_path / "m.onnx"
     path.write_bytes(pillar_net.export_onnx(net, {"convention": "ground", "note": "é"}))
-    model = OnnxModel.of(path)
+    model = OnnxModel.load(path)
     assert model.metadata == {"convention": "ground", "note": "é"}
     net.eval()
     for pillars in (1, 37):
@@ -129,13 +129,13 @@ def test_models_of_other_shapes_are_named(tmp_path):
     graph = onnx.helper.make_graph([onnx.helper.make_node("Relu", ["x"], ["y"])], "g", [value], [out])
     opset = [onnx.helper.make_opsetid("", 18)]
     path.write_bytes(onnx.helper.make_model(graph, opset_imports=opset, ir_version=9).SerializeToString())
-    with pytest.raises(InputError, match=r"m\.onnx: a model with inputs .*'x': \[3\].*; inputs"):
-        OnnxModel.of(path)
+    with pytest.raises(InputError, match=r"m\.onnx: expected a model with inputs .*'x': \[3\]"):
+        OnnxModel.load(path)
     good = onnx.load_from_string(pillar_net.export_onnx(PillarNet(), {"convention": "ground"}))
     del good.metadata_props[:]
     path.write_bytes(good.SerializeToString())
-    with pytest.raises(InputError, match="its metadata does not say how heights count"):
-        OnnxModel.of(path)
+    with pytest.raises(InputError, match="its metadata has no valid height convention"):
+        OnnxModel.load(path)
 
 
 def test_a_sample_is_a_function_of_its_number(mini, tmp_path):

@@ -78,7 +78,7 @@ class HeldOutSet:
         )
         sensor = scene.sensor(self._recipe.sensors[sum(which) % len(self._recipe.sensors)])
         maker = CloudSimulator(scene, junction.rule.draw(sensor, random), sensor, f"held out {which}", junction.scanner)
-        at_site = detector.at(maker.view, scene.roi)
+        at_site = detector.at_site(maker.view, scene.roi)
         for frame in junction.frames[which[1] :: self.POSES]:
             swept = maker.sweep(frame, random)
             truth.append(
