@@ -468,7 +468,7 @@ class Playback:
 
     def kinds(self, frame: TrafficFrame) -> list[str]:
         """The body of each box of a frame."""
-        return [self._shapes.kinds[kind] for kind in self._shapes.of_frame(frame).tolist()]
+        return [self._shapes.kinds[kind] for kind in self._shapes.kinds_of_boxes(frame).tolist()]
 
     def _maker_of(self, site: Site) -> CloudSimulator:
         scene = self._session.scene_before(site)

@@ -167,8 +167,8 @@ def correlate_scores(
         detector_rows = [row for row in rows if row.detector == detector and row.objects_of == ALL_OBJECTS]
         measure_names = results.correlated_measures(detector)
         measures = {}
-        for name in measure_names:
-            measures[name] = MeasureValues.from_estimates([row.measures[name] for row in detector_rows])
+        for measure in measure_names:
+            measures[measure] = MeasureValues.from_estimates([row.measures[measure] for row in detector_rows])
         junction = JunctionScores(scenario.name, site_names, values_by_text, measures, poles)
         study = CorrelationStudy([junction], scenario.seed)
         by_kind = {}

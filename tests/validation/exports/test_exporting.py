@@ -192,7 +192,7 @@ def test_the_readme_says_what_the_files_hold(four, tmp_path):
     assert classes == {"Car": str(lines)}
     assert f"4 sites, 10 frames each, {points} points; format kitti." in text
     assert "Effects on beams and returns: dropout; on traffic: none." in text
-    assert "these are the frames that the TPOG is counted from" in text
+    assert "these are the frames that the TPOG was computed from" in text
     assert "at least 2 s apart" in text and "small 0." in text
 
 
@@ -220,11 +220,11 @@ def test_openpcdet_gets_a_grid_that_holds_the_labels(four, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--site", "levl"], "--site: no site 'levl'; did you mean level?"),
-        (["--site", "x9"], "--site: no site 'x9'; one of level, tilted, rolled, behind"),
+        (["--site", "levl"], "--site: no site 'levl'. Did you mean level?"),
+        (["--site", "x9"], "--site: no site 'x9'. Use one of level, tilted, rolled, behind"),
         (["--frames", "11"], "--frames: expected at most 10 frames at least 2 s apart, got 11"),
         (["--frames", "0"], "--frames"),
-        (["--format", "waymo"], "--format: 'waymo'; one of kitti, openpcdet, ply, pcd"),
+        (["--format", "waymo"], "--format: unknown format 'waymo'. Use one of kitti, openpcdet, ply, pcd"),
     ],
 )
 def test_wrong_words_are_refused_and_nothing_is_written(four, tmp_path, run_egvs, words, message):
@@ -237,8 +237,8 @@ def test_nothing_is_overwritten(four, tmp_path, run_egvs):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").write_text("mine")
     for out, message in (
-        ("full", "holds files already"),
-        ("full/mine.txt", "is a file"),
+        ("full", "the folder is not empty"),
+        ("full/mine.txt", "expected a folder, got a file"),
         ("full/mine.txt/a", "cannot be written"),
     ):
         code, _, err = run_egvs("clouds", four, "--frames", 2, "--out", tmp_path / out)
@@ -251,14 +251,14 @@ def test_a_disk_without_room_is_told_before_anything_is_written(four, tmp_path, 
         free = 1000
 
     monkeypatch.setattr(dataset.shutil, "disk_usage", lambda _: Full)
-    with pytest.raises(InputError, match=r"GB of points, but 0\.0 GB are free there; fewer --frames"):
+    with pytest.raises(InputError, match=r"GB, but 0\.0 GB are free\. Use fewer --frames"):
         write_dataset(load(four), tmp_path / "out", frames=FRAMES)
     assert not (tmp_path / "out").exists() and not list(tmp_path.glob(".out*"))
 
 
 def test_sites_that_cannot_be_exported_are_refused(four, tmp_path):
     (four / "sites.csv").write_text("site,x_m,y_m,z_m,points\n..,10,8,3,\nmeasured,12,8,3,scan.ply\n")
-    with pytest.raises(InputError, match=r"site \.\.: its name cannot be that of a folder here"):
+    with pytest.raises(InputError, match=r"site \.\.: its name cannot be the name of a folder here"):
         write_dataset(load(four), tmp_path / "out", sites=[".."], frames=2)
     with pytest.raises(InputError, match="site measured: its empty scan was measured"):
         write_dataset(load(four), tmp_path / "out", sites=["measured"], frames=2)

@@ -54,8 +54,8 @@ def test_a_target_has_its_vehicles_and_lets_the_hardly_seen_pass():
     np.testing.assert_array_equal(its.cell, [cell])
     np.testing.assert_allclose(its.values[0, 2:], [-0.75, *np.log(seen[3:6]), math.sin(0.6), math.cos(0.6)], rtol=1e-6)
     other = tuple(np.floor((np.array(hardly[:2]) + half) / 0.8).astype(int))
-    assert its.counts[other] == 0.0 and its.counts[cell] == 1.0
-    assert _target([seen, hardly], [3, 0]).counts.all()  # nobody can see it: an empty place
+    assert its.loss_weight[other] == 0.0 and its.loss_weight[cell] == 1.0
+    assert _target([seen, hardly], [3, 0]).loss_weight.all()  # nobody can see it: an empty place
 
 
 def test_a_mirrored_sample_is_the_sample_of_the_mirrored_street():
@@ -86,7 +86,7 @@ def test_the_loss_is_as_on_paper():
         np.ones((1, POINTS_PER_PILLAR), np.float32),
         np.array([0]),
     )
-    batch = Batch.of([Sample(pillars, its)])
+    batch = Batch.collate([Sample(pillars, its)])
     odds = torch.full((1, 1, 64, 64), -20.0)  # surely nothing anywhere
     values = torch.zeros((1, pointpillars.N_VALUES, 64, 64))
     middles, boxes = compute_loss(odds, values, batch)
@@ -158,7 +158,7 @@ def test_training_learns_goes_on_after_a_stop_and_says_how_it_was_made(mini, tmp
     from egvs.validation.training.train import HeldOutSet
 
     monkeypatch.setattr(HeldOutSet, "FRAMES", 10)
-    monkeypatch.setattr(train, "_KEEP_EVERY", 2)
+    monkeypatch.setattr(train, "_CHECKPOINT_STEPS", 2)
     whole = train([scenario], tmp_path / "whole.onnx", recipe)
     assert [entry["step"] for entry in whole["curve"]] == [4]
     assert whole["junctions"] == [scenario.name] and whole["recipe"]["steps"] == 4
@@ -173,7 +173,7 @@ def test_training_learns_goes_on_after_a_stop_and_says_how_it_was_made(mini, tmp
     with pytest.raises(Stop):
         train([scenario], tmp_path / "part.onnx", recipe, progress=stop)
     assert not (tmp_path / "part.onnx").exists() and (tmp_path / "part.onnx.partial").exists()
-    with pytest.raises(InputError, match="is of another training"):
+    with pytest.raises(InputError, match="the checkpoint belongs to another training"):
         train([scenario], tmp_path / "part.onnx", Recipe(steps=5, frames=10, sensors=("small",)))
     train([scenario], tmp_path / "part.onnx", recipe)
     assert not (tmp_path / "part.onnx.partial").exists()
