@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +34,7 @@ def draw(path: Path) -> None:
     for row, kinds in enumerate(ROWS):
         at = np.array([0.0, -ROW_M * row])
         for kind in kinds:
-            size = np.array(cloud_simulation.drawn_size_m(kind))
+            size = np.array(tomllib.loads(cloud_simulation.BODIES_FILE.read_text())[kind]["size_m"])
             edges, _ = _seen(_edges(size))
             left, right = edges[:, :, 0].min(), edges[:, :, 0].max()
             spare = max(LABEL_M - (right - left), 0.0) / 2

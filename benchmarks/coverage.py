@@ -13,7 +13,7 @@ from collections import defaultdict
 from typing import Any
 
 import numpy as np
-from tests.validation.statistics import made_up
+from tests.validation import simulated_studies
 
 from egvs.validation.correlation import COEFFICIENT_KINDS, ConfidenceInterval, Correlation, CorrelationStudy
 
@@ -41,18 +41,18 @@ def main() -> None:
         for rho in RHOS:
             single: dict[Any, list[Correlation]] = defaultdict(list)
             for seed in range(studies):
-                study = CorrelationStudy([made_up.junction(rng, sites, (rho,))], seed, RESAMPLES)
+                study = CorrelationStudy([simulated_studies.junction(rng, sites, (rho,))], seed, RESAMPLES)
                 for kind in COEFFICIENT_KINDS:
                     single[kind].append(study.correlation("s0", "ap", kind))
             for kind in COEFFICIENT_KINDS:
-                print(line(f"{sites}, {rho}, {kind}", single[kind], made_up.truth(rho, kind)), flush=True)
+                print(line(f"{sites}, {rho}, {kind}", single[kind], simulated_studies.truth(rho, kind)), flush=True)
         both: dict[Any, list[Correlation]] = defaultdict(list)
         for seed in range(studies):
-            study = CorrelationStudy([made_up.junction(rng, sites, PAIR)], seed, RESAMPLES)
+            study = CorrelationStudy([simulated_studies.junction(rng, sites, PAIR)], seed, RESAMPLES)
             for kind in COEFFICIENT_KINDS:
                 both[kind].append(study.difference("s0", "s1", "ap", kind))
         for kind in COEFFICIENT_KINDS:
-            truth = made_up.truth(PAIR[0], kind) - made_up.truth(PAIR[1], kind)
+            truth = simulated_studies.truth(PAIR[0], kind) - simulated_studies.truth(PAIR[1], kind)
             print(line(f"{sites}, {PAIR[0]} less {PAIR[1]}, {kind}", both[kind], truth), flush=True)
 
 

@@ -36,13 +36,13 @@ def made_up(rng: np.random.Generator, frames: int) -> tuple[list[GroundTruth], l
 def rows() -> list[tuple[str, str, str, bool]]:
     """Lines of the table of ``make bench``."""
     rng = np.random.default_rng(0)
-    evaluate(EvaluationFrames.of(*made_up(rng, 20)))  # compiles
+    evaluate(EvaluationFrames.from_frames(*made_up(rng, 20)))  # compiles
     took, measures = 0.0, 0
     for _ in range(DETECTORS):
         objects, found = made_up(rng, FRAMES)
         for _ in range(SITES):
             start = time.perf_counter()
-            measures = len(evaluate(EvaluationFrames.of(objects, found)).measures)
+            measures = len(evaluate(EvaluationFrames.from_frames(objects, found)).measures)
             took += time.perf_counter() - start
     what = f"AP: {SITES} sites x {FRAMES} frames x {DETECTORS} detectors, {measures} measures, 10 blocks left out"
     return [(what, f"{took:.1f} s", f"{MOST_S:.0f} s", took < MOST_S)]

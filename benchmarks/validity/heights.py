@@ -19,7 +19,7 @@ from benchmarks.validity.pools import SEED
 from benchmarks.validity.poses import HEIGHTS_M
 from benchmarks.validity.record import Record, measures_of
 from benchmarks.validity.tables import Cell, Column, Table, with_interval
-from egvs.validation.correlation import MIN_PLACES, RESAMPLES, ConfidenceInterval, MeasureValues, Resamples
+from egvs.validation.correlation import MIN_POLES, RESAMPLES, ConfidenceInterval, MeasureValues, Resamples
 from egvs.validation.detectors.pointpillars import PointPillars
 
 Floats = NDArray[np.float64]
@@ -105,7 +105,7 @@ def _places(record: Record, detector: str, measure: str) -> dict[str, dict[float
     for row, site in enumerate(record.sites[i] for i in its.sites):
         if not site.is_given:
             at.setdefault(site.place, {})[site.height_m] = row
-    known = its.measured().known
+    known = its.measured().defined
     return {
         place: rows for place, rows in at.items() if set(rows) == set(HEIGHTS_M) and known[list(rows.values())].all()
     }
@@ -122,8 +122,8 @@ def _mean(junctions: Sequence[str], each: Sequence[MeasureValues]) -> Cell:
     draws: Floats = np.zeros(RESAMPLES)
     for name, its, weight in zip(junctions, each, weights.tolist(), strict=True):
         if weight:
-            drawn = Resamples.of(name, len(its.values), its.left_out.shape[1], RESAMPLES, SEED)
-            draws += drawn.of_measure(its, np.ones(len(its.values), dtype=np.bool_)).mean(axis=1) * weight
-    if 0 < min(filter(None, weights.tolist())) < MIN_PLACES:
-        return with_interval(100.0 * value, ConfidenceInterval.unknown("too few places"))
-    return with_interval(100.0 * value, ConfidenceInterval.of(100.0 * value, 100.0 * draws / weights.sum()))
+            drawn = Resamples.draw(name, len(its.values), its.left_out.shape[1], RESAMPLES, SEED)
+            draws += drawn.resample_measure(its, np.ones(len(its.values), dtype=np.bool_)).mean(axis=1) * weight
+    if 0 < min(filter(None, weights.tolist())) < MIN_POLES:
+        return with_interval(100.0 * value, ConfidenceInterval.undefined("too few places"))
+    return with_interval(100.0 * value, ConfidenceInterval.from_resamples(100.0 * value, 100.0 * draws / weights.sum()))

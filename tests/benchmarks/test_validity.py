@@ -293,7 +293,7 @@ def test_no_shipped_model_has_seen_a_held_out_junction() -> None:
         (low_models.model(low_models.LOW), "ground", [2.0, 2.0]),
         (low_models.model(low_models.SENSOR), "sensor", [2.0, 2.0]),
     ):
-        about = OnnxModel.of(model).metadata
+        about = OnnxModel.load(model).metadata
         assert about["convention"] == convention and about["recipe"]["heights_m"] == heights_m
         assert about["junctions"] == ["ingolstadt", "hill", "roundabout", "east"]
 

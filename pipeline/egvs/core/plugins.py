@@ -26,8 +26,8 @@ _REQUIREMENTS = {
         "a subclass of Detect or another kind in egvs.effects.base, with NAME, SOURCE and Model",
     ),
     "egvs.detectors": (
-        ("NAME", "SOURCE", "settings", "at"),
-        "a class with NAME, SOURCE, settings and at, see egvs.validation.detectors.base",
+        ("NAME", "SOURCE", "settings", "at_site"),
+        "a class with NAME, SOURCE, settings and at_site, see egvs.validation.detectors.base",
     ),
     "egvs.scores": (
         ("name", "formula", "source", "sign", "function"),

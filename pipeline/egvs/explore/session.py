@@ -440,7 +440,7 @@ class Playback:
         self._session, self._path = session, session.work.folder.trajectories
         self.frames = int(parquet.read_metadata(self._path, "trajectories")["frames"])
         self.parts = cloud_simulation.body_parts(session.scenario)
-        self._shapes = VehicleMeshes.of(self.parts)
+        self._shapes = VehicleMeshes.from_parts(self.parts)
         self._stretch: tuple[int, list[TrafficFrame]] = (-1, [])
         self._scanner: tuple[Scene, Scanner] | None = None
         self._maker: tuple[Site, CloudSimulator] | None = None
@@ -468,7 +468,7 @@ class Playback:
 
     def kinds(self, frame: TrafficFrame) -> list[str]:
         """The body of each box of a frame."""
-        return [self._shapes.kinds[kind] for kind in self._shapes.of_frame(frame).tolist()]
+        return [self._shapes.kinds[kind] for kind in self._shapes.kinds_of_boxes(frame).tolist()]
 
     def _maker_of(self, site: Site) -> CloudSimulator:
         scene = self._session.scene_before(site)

@@ -1,9 +1,10 @@
-r"""Occupied voxels of a record, the autocorrelation time of its traffic, and warnings about both.
+r"""Occupied voxels of recorded traffic, its autocorrelation time, and warnings about both.
 
-A voxel is occupied at a frame when a vehicle's box, made 0.1 mm smaller on each side, shares positive volume with it.
+A voxel is occupied in a frame if a vehicle's box, made 0.1 mm smaller on each side, shares positive volume with it.
 The Traffic Probabilistic Occupancy Grid (arXiv 2504.06772, section III) is :math:`p(v) = c(v) / T`, with :math:`c(v)`
 the sum of counts over blocks and :math:`T` the number of frames. A voxel that static geometry fills has p = 1 and so no
-entropy; it is left out. Memory holds one block's counters and one batch of frames, however many frames there are.
+entropy; it is left out. The memory that is needed, for the counters of one block and one batch of frames, does not
+depend on the number of frames.
 
 With :math:`\rho(t)` the autocorrelation at lag t of the number of boxes near the region, frame by frame, the integrated
 autocorrelation time is
@@ -201,7 +202,7 @@ def warn_empty_region(boxes: float, trajectories: Path) -> Iterator[Diagnostic]:
 
 
 def _traffic_extent(trajectories: Path) -> str:
-    """Where recorded vehicles are, in words; empty where there is none."""
+    """Return the extent of recorded vehicles as text; empty without vehicles."""
     table, _ = parquet.read_artefact(trajectories, "trajectories", ["x_m", "y_m"])
     if not table.num_rows:
         return ""
@@ -226,12 +227,12 @@ def warn_empty_periods(boxes: Mapping[str, float]) -> Iterator[Diagnostic]:
 def warn_traffic_through_solids(
     hidden: IntArray, visible: int, voxels: IntArray, grid: Grid, world: World
 ) -> Iterator[Diagnostic]:
-    """Warn where vehicles occupy what static geometry fills.
+    """Warn where vehicles occupy voxels that static geometry fills.
 
     Parameters
     ----------
     hidden
-        In how many frames each voxel that static geometry fills is occupied, (k,).
+        Number of frames in which each voxel that static geometry fills is occupied, (k,).
     visible
         The same, summed over all other voxels.
     voxels
@@ -253,7 +254,7 @@ def warn_traffic_through_solids(
 
 
 def _solid_at(world: World, at_m: FloatArray, within_m: float) -> str:
-    """The first solid whose triangles come so near to a point along each axis that they may fill its voxel."""
+    """Return the first solid with a triangle within a distance of a point along each axis; empty without one."""
     corners = world.triangles_m
     near = (corners.min(axis=1) <= at_m + within_m).all(axis=1) & (corners.max(axis=1) >= at_m - within_m).all(axis=1)
     for solid in np.unique(world.solid_of_face[near]):
@@ -264,7 +265,7 @@ def _solid_at(world: World, at_m: FloatArray, within_m: float) -> str:
 
 
 def warn_sites_in_traffic(sites: Iterable[Site], tpog: Tpog) -> Iterator[Diagnostic]:
-    """Warn about each site that is, no higher than the clearance, where vehicles drive in some frame."""
+    """Warn about each site at a position where vehicles drive, unless it is higher than the clearance."""
     grid = tpog.grid
     for site in sites:
         at_m = np.array(site.pose.position_m)

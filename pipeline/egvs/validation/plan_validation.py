@@ -149,7 +149,7 @@ class FusedDetectionTask(DetectionTaskBase[JointDetector]):
         detectors = {}
         for name in names:
             if name != POINT_COUNTS_NAME:
-                detectors[name] = self.detectors[name].together(views, self.record.scene.roi).detect
+                detectors[name] = self.detectors[name].at_sites(views, self.record.scene.roi).detect
         return self.detect(simulators, detectors, with_points=POINT_COUNTS_NAME in names)
 
     def key(self, group: SensorGroup, name: str) -> str:
@@ -316,7 +316,7 @@ def with_gains(groups: Sequence[SensorGroup], rows: Sequence[SiteDetection]) -> 
 def estimate_difference(first: JackknifeEstimate, second: JackknifeEstimate, frames: int) -> JackknifeEstimate:
     """Return the first measure minus the second, both of the same frames."""
     values = np.concatenate([[first.value - second.value], first.left_out - second.left_out])
-    return JackknifeEstimate.of(values, np.bincount(detection_metrics.frame_blocks(frames)))
+    return JackknifeEstimate.from_values(values, np.bincount(detection_metrics.frame_blocks(frames)))
 
 
 def write_fused(path: Path, rows: Sequence[FusedDetection], metadata: Mapping[str, Any]) -> None:
