@@ -12,6 +12,7 @@ import pytest
 import shapely
 
 import egvs
+from egvs.artefacts.planned_sensor import PlannedSensor
 from egvs.placement import plan as placement_plan
 from egvs.placement import refinement
 from egvs.placement.plan import Placement
@@ -56,16 +57,16 @@ def with_sites(folder: Path, poses: dict[str, Pose]) -> None:
 )
 def test_a_plan_is_never_worth_less_than_it_was(mini: Path, settings: tuple[str, ...]) -> None:
     placed = plan(mini, *settings)
-    assert placed.moves is not None
+    assert placed.refinement is not None
     point = placed.solution.point
-    assert placed.moves.before == point.plan_value.joint
-    assert placed.moves.value_before == point.plan_value.value
-    assert placed.moves.value > placed.moves.value_before
+    assert placed.refinement.joint_before == point.plan_value.joint
+    assert placed.refinement.value_before == point.plan_value.value
+    assert placed.refinement.value_after > placed.refinement.value_before
     if point.plan_value.value == point.plan_value.joint:
-        assert (placed.moves.value, placed.joint > placed.moves.before) == (placed.joint, True)
+        assert (placed.refinement.value_after, placed.joint > placed.refinement.joint_before) == (placed.joint, True)
     assert placed.sensors[-1].score == placed.joint
     assert all(zone.seen >= zone.share for zone in placed.zones)
-    assert {pick.site.name for pick in placed.sensors} == set(placed.curve_sites[-1])
+    assert {pick.site for pick in placed.sensors} == set(placed.curve_sites[-1])
 
 
 @pytest.mark.slow
@@ -74,17 +75,21 @@ def test_the_score_is_that_of_candidates_that_hang_so(mini: Path) -> None:
     so has one with a sensor put back."""
     first = {site.name: site.pose for site in sites_of(egvs.load(mini))}
     placed = plan(mini, "placement.refine.radius_m=2", "placement.refine.heights_m=[2, 5]")
-    moved = {pick.site.name: pick.site.pose for pick in placed.sensors}
+    moved = {sensor.site: pose_of(sensor) for sensor in placed.sensors}
     assert moved.keys() == first.keys()
     whole = _unmoved(mini, moved)
     assert whole.joint == placed.joint
-    assert [(pick.site.name, pick.gain, pick.loss) for pick in whole.sensors] == [
-        (pick.site.name, pick.gain, pick.loss) for pick in placed.sensors
+    assert [(pick.site, pick.gain, pick.loss) for pick in whole.sensors] == [
+        (pick.site, pick.gain, pick.loss) for pick in placed.sensors
     ]
     for pick in placed.sensors:
-        name = pick.site.name
+        name = pick.site
         assert placed.joint - _unmoved(mini, moved | {name: first[name]}).joint == pick.gain_by_refining > 0
         assert pick.moved_m == pytest.approx(math.dist(moved[name].position_m, first[name].position_m))
+
+
+def pose_of(sensor: PlannedSensor) -> Pose:
+    return Pose(sensor.x_m, sensor.y_m, sensor.z_m, sensor.yaw_deg, sensor.pitch_deg, sensor.roll_deg)
 
 
 def _unmoved(folder: Path, poses: dict[str, Pose]) -> Placement:
@@ -110,7 +115,7 @@ def test_from_the_worst_corner_it_finds_what_a_fine_grid_finds(mini: Path) -> No
     with_sites(mini, {"corner": grid[worst]})
     placed = plan(mini, "placement.count=1", "placement.refine.evaluations=200", "placement.refine.heights_m=[2, 6]",
                   "placement.refine.yaw_deg=[0, 0]")  # fmt: skip
-    assert placed.moves is not None and placed.moves.before == scores[worst]
+    assert placed.refinement is not None and placed.refinement.joint_before == scores[worst]
     assert placed.joint >= max(scores.values())
 
 
@@ -119,10 +124,10 @@ def test_poses_that_cannot_be_are_counted_and_never_taken(mini: Path) -> None:
     """A polygon round the building: what is inside of it is no place."""
     polygon = "[[10, 3], [22, 3], [22, 13], [9, 13]]"
     placed = plan(mini, f"placement.refine.within_m=[{polygon}]", "placement.refine.heights_m=[0.5, 5]")
-    assert placed.moves is not None and placed.moves.impossible > 0
+    assert placed.refinement is not None and placed.refinement.poses_infeasible > 0
     house = shapely.Polygon(BUILDING[0])
     for pick in placed.sensors:
-        assert not house.contains(shapely.Point(pick.site.pose.x_m, pick.site.pose.y_m))
+        assert not house.contains(shapely.Point(pick.x_m, pick.y_m))
 
 
 def test_no_pole_moves_into_a_lane(mini: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -133,9 +138,9 @@ def test_no_pole_moves_into_a_lane(mini: Path, monkeypatch: pytest.MonkeyPatch) 
     anywhere = plan(mini, *settings)
     monkeypatch.setattr(sumo_folder, "read_network", lambda _: network.read_net_xml(mini / "net.net.xml"))
     beside = plan(mini, *settings)
-    assert anywhere.moves is not None and anywhere.moves.impossible == 0
-    assert beside.moves is not None and beside.moves.impossible > 0.1 * beside.moves.tried
-    assert beside.sensors[0].site.pose.y_m > 3.0
+    assert anywhere.refinement is not None and anywhere.refinement.poses_infeasible == 0
+    assert beside.refinement is not None and beside.refinement.poses_infeasible > 0.1 * beside.refinement.poses_tried
+    assert beside.sensors[0].y_m > 3.0
 
 
 def test_a_budget_holds_while_sensors_move(mini: Path) -> None:
@@ -144,9 +149,9 @@ def test_a_budget_holds_while_sensors_move(mini: Path) -> None:
     settings = "placement.count=1", "placement.refine.heights_m=[6, 9]", "costs.metre=100"
     scarce, ample = (plan(mini, *settings, f"placement.budget={budget}") for budget in (750, 9000))
     assert 700 < scarce.cost <= 750 < ample.cost
-    assert scarce.cost == pytest.approx(100 * scarce.sensors[0].site.pose.z_m)
-    assert scarce.moves is not None and ample.moves is not None
-    assert scarce.moves.before == ample.moves.before < scarce.joint < ample.joint
+    assert scarce.cost == pytest.approx(100 * scarce.sensors[0].z_m)
+    assert scarce.refinement is not None and ample.refinement is not None
+    assert scarce.refinement.joint_before == ample.refinement.joint_before < scarce.joint < ample.joint
 
 
 def test_a_candidate_that_sees_nothing_is_refused_before_it_moves(mini: Path) -> None:
@@ -166,14 +171,14 @@ def test_sensors_do_not_meet(mini: Path, setting: str, least_m: float) -> None:
     with_sites(mini, {"a": Pose(19, 11, 3.0), "b": Pose(21.5, 11, 3.0)})
     polygon = "[[18, 8], [23, 8], [23, 12], [18, 12]]"
     placed = plan(mini, f"placement.refine.within_m=[{polygon}]", setting)
-    assert math.dist(*(pick.site.pose.position_m for pick in placed.sensors)) >= least_m
-    assert placed.moves is not None and placed.moves.impossible > 0
+    assert math.dist(*(pose_of(sensor).position_m for sensor in placed.sensors)) >= least_m
+    assert placed.refinement is not None and placed.refinement.poses_infeasible > 0
 
 
 def test_the_forced_one_stays_and_costs_nothing(mini: Path) -> None:
     placed = plan(mini, "placement.forced=['pole_a']", "placement.refine.radius_m=2", "costs.pole=5")
     forced, other = placed.sensors
-    assert forced.is_forced and forced.site.pose == Pose(10, 12, 3) and (forced.moved_m, forced.cost) == (0.0, 0.0)
+    assert forced.forced and pose_of(forced) == Pose(10, 12, 3) and (forced.moved_m, forced.cost) == (0.0, 0.0)
     assert other.moved_m > 0.0 and other.cost == 5.0
 
 
@@ -221,6 +226,6 @@ def test_nothing_that_may_move_is_refused_and_leaves_no_plan(mini: Path, run_egv
 
 def test_a_turn_asks_for_no_more_poses_than_it_may(mini: Path) -> None:
     placed = plan(mini)
-    assert placed.moves is not None
-    assert placed.moves.tried <= 60 * placed.moves.turns
+    assert placed.refinement is not None
+    assert placed.refinement.poses_tried <= 60 * placed.refinement.turns
     assert refinement.MIN_IMPROVEMENT > 0.0
