@@ -54,7 +54,7 @@ RIM_WIDTH_M = 100.0
 """Junctions nearer to the rim of the circle are left out, because their approaches are cut."""
 
 NEAR_RIM, NO_SIGNALS, TOO_FEW_ARMS = "too near to the rim", "without signals", "fewer than three streets meet"
-NO_FREE_KERB = "no free pole location along the kerbs"
+NO_FREE_KERB = "no place for a pole is free along the kerbs"
 """Reasons to leave a junction out."""
 
 PEDESTRIANS_NOTE = (
