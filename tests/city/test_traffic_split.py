@@ -102,7 +102,7 @@ def test_keeps_every_box_that_may_be_in_region(city: City) -> None:
     x, y, angle = rng.uniform(-400, 400, n), rng.uniform(-400, 400, n), np.radians(rng.uniform(0, 360, n))
     length, width = rng.uniform(0.5, 30, n), rng.uniform(0.5, 4, n)
     region = traffic_split.find_traffic_regions(city)["west"]
-    is_kept = region.may_contain(x, y, np.hypot(length, width))
+    is_selected = region.may_contain(x, y, np.hypot(length, width))
     low_x, low_y, high_x, high_y = region.to_json()
     assert (low_x, low_y, high_x, high_y) == (-60.0, -80.0, 100.0, 80.0)
     is_inside = np.zeros(n, dtype=bool)
@@ -111,8 +111,8 @@ def test_keeps_every_box_that_may_be_in_region(city: City) -> None:
             px = x - along * length * np.sin(angle) + across * width * np.cos(angle)
             py = y - along * length * np.cos(angle) - across * width * np.sin(angle)
             is_inside |= (px >= low_x) & (px <= high_x) & (py >= low_y) & (py <= high_y)
-    assert is_inside.sum() > 100 and (~is_kept).sum() > 1000
-    assert not (is_inside & ~is_kept).any()
+    assert is_inside.sum() > 100 and (~is_selected).sum() > 1000
+    assert not (is_inside & ~is_selected).any()
 
 
 def test_repeats_only_what_changed(city: City) -> None:

@@ -33,7 +33,6 @@ from egvs.placement.problem import PlanRules, Problem
 from egvs.placement.problem_builder import PlacementProblem
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import PlacementConfig
-from egvs.sensors.sites import Site
 from egvs.stages.inputs import open_folder
 
 _UNLIMITED_BUDGET = 1e15
@@ -211,34 +210,21 @@ def plan_junction(
     orders += [solver.greedy_order(problem, point.plan) for point in curve]
     if with_single_sensors and len(rules.forced) < count:
         orders += [(*rules.forced, candidate) for candidate in _efficient_candidates(problem)]
-    plans = tuple(make_junction_plan(problem, placement_problem.sites, order) for order in orders)
+    plans = []
+    for order in orders:
+        sensors = placement_plan.planned_sensors(problem, [placement_problem.sites[i] for i in order], order)
+        value = problem.coverage_state(order).value(problem.joint)
+        plans.append(JunctionPlan(tuple(sensors), value, problem.rules.cost_of(order)))
 
     bounds_below_curve = [plans[0].value] * curve[0].count
     return JunctionPlans(
         junction,
-        plans,
+        tuple(plans),
         (*bounds_below_curve, *(point.bound for point in curve)),
         min_costs_by_count(rules),
         placement_problem.joint_of_all * (1.0 + BOUND_ROUNDING),
         is_complete=count == n_candidates or curve[-1].count < count,
     )
-
-
-def make_junction_plan(problem: Problem, sites: Sequence[Site], order: Sequence[int]) -> JunctionPlan:
-    """Return the plan of some candidates.
-
-    Parameters
-    ----------
-    problem
-        The problem of the junction.
-    sites
-        All its candidates.
-    order
-        The chosen candidates, in the order of installation.
-    """
-    sensors = tuple(placement_plan.planned_sensors(problem, [sites[i] for i in order], order))
-    value = problem.coverage_state(order).value(problem.joint)
-    return JunctionPlan(sensors, value, problem.rules.cost_of(order))
 
 
 def _efficient_candidates(problem: Problem) -> list[int]:

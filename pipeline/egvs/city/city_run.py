@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 from egvs.artefacts.planned_sensor import PlannedSensor
 from egvs.city import allocation, page, results, scheduler, traffic_split
 from egvs.city.allocation import Allocation, JunctionPlans
-from egvs.city.model import City, CityJunction
+from egvs.city.model import City
 from egvs.city.results import CityPlan, JunctionResult, read_junction_results, write_results
 from egvs.city.tasks import Job, JobFailure, JobResult
 from egvs.core.errors import Diagnostic, InputError, collect_warnings
@@ -105,13 +105,13 @@ def run_city(city: City, out: str | Path | None = None, options: CityRunOptions 
         When the traffic or a run fails, or the cluster is lost; finished results are kept.
     """
     options = options or CityRunOptions()
-    folder, junctions = city_run_folder(city, out), select_junctions(city, options.junctions)
-    jobs = make_jobs(city, folder, junctions, options.overrides)
+    folder = _run_folder(city, out)
+    jobs = make_jobs(city, folder, options)
     with lock_run_folder(folder):
         scheduler.check_cluster(options.cluster)
         with scheduler.connect(options.cluster) as client:
             ran = _run_jobs(client, city, folder, jobs, options)
-        plan = results.read_plan(folder, [junction.id for junction in junctions])
+        plan = results.read_plan(folder, [job.junction for job in jobs])
         page_file = page.write_page(folder, city, ran.results, ran.warnings, plan)
         return replace(ran, files=(*ran.files, page_file))
 
@@ -126,30 +126,35 @@ def _run_jobs(client: Client, city: City, folder: Path, jobs: Sequence[Job], opt
     return CityRun(folder, junction_results, written, tuple(collect_warnings([traffic.summary])))
 
 
-def select_junctions(city: City, names: Sequence[str]) -> tuple[CityJunction, ...]:
-    """Return the junctions with these names, in the city's order; all if there are no names."""
-    if not names:
-        return city.junctions
-    selected = {city.junction(name).id for name in names}
-    return tuple(junction for junction in city.junctions if junction.id in selected)
+def make_jobs(city: City, out: Path, options: CityRunOptions) -> list[Job]:
+    """Return the jobs of the selected junctions, in the city's order.
 
+    Parameters
+    ----------
+    city, out, options
+        The city, the folder of the city run, and its options.
 
-def make_jobs(city: City, out: Path, junctions: Sequence[CityJunction], overrides: Sequence[str]) -> list[Job]:
-    """Return the jobs of junctions; raise an InputError if the overrides have keys of the traffic."""
-    for override in overrides:
+    Raises
+    ------
+    InputError
+        When a junction is unknown, or an override changes the traffic.
+    """
+    for override in options.overrides:
         key = override.partition("=")[0].strip()
         if key.split(".")[0] == "traffic":
             problem = "the traffic of a city is simulated once for all junctions"
             raise InputError(f"--set {override}", problem, f"Set {key} in {city.file} instead.")
+    selected = {city.junction(name).id for name in options.junctions}
     jobs = []
-    for junction in junctions:
-        run_folder = results.junction_run_folder(out, junction.id).absolute()
-        jobs.append(Job(junction.id, junction.scenario_folder(city).absolute(), run_folder, tuple(overrides)))
+    for junction in city.junctions:
+        if not selected or junction.id in selected:
+            run_folder = results.junction_run_folder(out, junction.id).absolute()
+            scenario_folder = junction.scenario_folder(city).absolute()
+            jobs.append(Job(junction.id, scenario_folder, run_folder, tuple(options.overrides)))
     return jobs
 
 
-def city_run_folder(city: City, out: str | Path | None) -> Path:
-    """Return the folder of a city run: ``out``, or ``runs/<name of the city>``."""
+def _run_folder(city: City, out: str | Path | None) -> Path:
     return Path(out) if out is not None else Path("runs") / city.name
 
 
@@ -177,8 +182,8 @@ def place_city(
     """
     options = options or CityRunOptions()
     requested = _check_request(count, budget)
-    folder, junctions = city_run_folder(city, out), select_junctions(city, options.junctions)
-    jobs = make_jobs(city, folder, junctions, options.overrides)
+    folder = _run_folder(city, out)
+    jobs = make_jobs(city, folder, options)
     for job in jobs:
         allocation.check_additive_config(job.scenario())
 
@@ -195,8 +200,7 @@ def place_city(
         plan = _make_city_plan(plans, shares, ran.results[0].best.rank_by, requested)
         without_gain = [job.junction for job in jobs if job.junction not in with_gain]
         warnings = (*ran.warnings, *overlap_warnings(jobs), *_no_gain_warnings(city, without_gain))
-        names = [junction.id for junction in junctions]
-        plan_file = results.write_plan(folder, city, plan, names)
+        plan_file = results.write_plan(folder, city, plan, [job.junction for job in jobs])
         page_file = page.write_page(folder, city, ran.results, warnings, plan)
     return CityPlacement(replace(ran, warnings=warnings), plan, (plan_file, page_file))
 

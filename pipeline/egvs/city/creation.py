@@ -202,7 +202,11 @@ def create_city(
             hint = "Try --junctions all."
         raise InputError(osm, f"no junction is left ({reasons})", hint)
 
-    notes = import_notes(sum(not junction.roi.area.covers(junction.junction.area) for junction in made), counts)
+    notes = openstreetmap.scenario_notes(True, counts)
+    n_larger = sum(not junction.roi.area.covers(junction.junction.area) for junction in made)
+    if n_larger:
+        limit = f"at most {junctions.ROI_MAX_M:g} m"
+        notes.append(f"{n_larger} junctions are larger than their regions of interest ({limit})")
     if walk:
         notes.append(PEDESTRIANS_NOTE)
     city = NewCity(folder, tuple(made), left_out, streets, counts, tuple(notes))
@@ -325,23 +329,6 @@ def _count_solids(solids: Sequence[MappedSolid]) -> ImportCounts:
     for solid in solids:
         counts.keep(solid)
     return counts
-
-
-def import_notes(larger: int, counts: ImportCounts) -> list[str]:
-    """Return what to know before trusting a city.
-
-    Parameters
-    ----------
-    larger
-        Number of junctions that are larger than their regions of interest.
-    counts
-        What happened to the objects of the map.
-    """
-    notes = openstreetmap.scenario_notes(True, counts)
-    if larger:
-        limit = f"at most {junctions.ROI_MAX_M:g} m"
-        notes.append(f"{larger} junctions are larger than their regions of interest ({limit})")
-    return notes
 
 
 def traffic_amount(streets: Streets) -> dict[str, Any]:

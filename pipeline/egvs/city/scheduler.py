@@ -315,7 +315,8 @@ def run_jobs(
     n_done = 0
     progress("junctions", n_done, len(jobs))
     with _watch_scheduler(client):
-        graph = build_graph([job for job in jobs if job.junction in beams], beams, settings, _worker_count(client))
+        n_workers = max(1, sum(client.nthreads().values()))
+        graph = build_graph([job for job in jobs if job.junction in beams], beams, settings, n_workers)
         futures = client.compute(list(graph))
         group_of_key = {future.key: group for future, group in zip(futures, graph.values(), strict=True)}
         for future in _as_finished(client, futures):
@@ -378,11 +379,6 @@ def raise_failures(failures: Sequence[JobFailure], n_junctions: int) -> None:
     error = EgvsError("\n".join(lines))
     error.exit_code = max(failure.exit_code for failure in failures)  # wrong input wins
     raise error
-
-
-def _worker_count(client: Client) -> int:
-    threads: dict[str, int] = client.nthreads()
-    return max(1, sum(threads.values()))
 
 
 def _as_finished(client: Client, futures: list[Future]) -> Iterator[Future]:

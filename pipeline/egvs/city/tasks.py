@@ -9,7 +9,7 @@ of its sites, and :func:`finish_junction` completes its run. Results pass from o
 what is missing there is computed again. Each task first releases the memory of the previous one, so that a worker
 needs hardly more memory for many sites than for a few.
 
-``part.npz`` has one array for each type of number, and a JSON text that says where each array of a site is in them.
+``part.npz`` has one array for each dtype, and a JSON text with the objects of all sites, which refer to these arrays.
 So a part is read back to the last bit, and no code in it is run.
 """
 
@@ -21,7 +21,7 @@ import zipfile
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property, wraps
 from itertools import pairwise
 from pathlib import Path
@@ -44,9 +44,9 @@ from egvs.scoring.blindspots import SpotVisibility
 from egvs.scoring.scorer import SiteScore
 from egvs.scoring.target_scores import SiteTargetScores
 from egvs.sensors import sensor, sites
-from egvs.sensors.sites import ScannedSite
+from egvs.sensors.sites import Pose, ScannedSite
 from egvs.stages.inputs import open_folder
-from egvs.stages.site_scoring import ScoredSite, SiteScoring
+from egvs.stages.site_scoring import BeamAudit, ScoredSite, SiteScoring
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -64,6 +64,9 @@ SITE_BEAMS = 2**14
 """Work per site that does not depend on its beams, in beams: mainly the sum over all voxels."""
 
 _STAGE_MODULES = tuple(f"egvs.stages.{name}" for name in ("check", "statics", "scan", "traffic", "tpog", "score"))
+
+_PART_CLASSES = (ScoredSite, ScannedSite, Pose, SiteScore, SiteTargetScores, SpotVisibility, BeamAudit)
+"""Classes that occur in a part."""
 
 _DTYPES = ("float64", "int64", "int32")
 _METADATA = "metadata"
@@ -251,12 +254,12 @@ SCENE_CACHE = SceneCache()
 
 
 def write_part(path: Path, scored_sites: Iterable[ScoredSite]) -> None:
-    """Write the scores of some sites, without their audits; only one site at a time is in memory as an object."""
-    pool = _ArrayPool()
-    metadata = [pool.site_to_json(site) for site in scored_sites]
+    """Write the scores of some sites; only one site at a time is in memory as an object."""
+    encoder = _PartEncoder()
+    metadata = [encoder.encode(site) for site in scored_sites]
     with files.atomic_write(path) as partial, partial.open("wb") as file:
         text = np.frombuffer(json.dumps(metadata).encode("utf-8"), dtype=np.uint8)
-        np.savez(file, allow_pickle=False, **{_METADATA: text}, **pool.arrays())
+        np.savez(file, allow_pickle=False, **{_METADATA: text}, **encoder.arrays())
 
 
 def read_part(path: Path) -> Iterator[ScoredSite]:
@@ -264,15 +267,19 @@ def read_part(path: Path) -> Iterator[ScoredSite]:
     try:
         with np.load(path, allow_pickle=False) as stored:
             metadata = json.loads(stored[_METADATA].tobytes())
-            arrays = _StoredArrays({dtype: stored[dtype] for dtype in _DTYPES})
+            arrays = {dtype: stored[dtype] for dtype in _DTYPES}
         for value in metadata:
-            yield arrays.site_from_json(value, path)
+            yield _decode(value, arrays)
     except (OSError, EOFError, ValueError, LookupError, TypeError, zipfile.BadZipFile) as error:
         raise InputError(path, f"cannot be read as a part of scores ({error})", "Remove it, and run again.") from None
 
 
-class _ArrayPool:
-    """Turns sites into JSON, in which an array is [dtype, start, length] in the pool of its dtype, or null."""
+class _PartEncoder:
+    """Turns sites into JSON, and collects their arrays in one array for each dtype.
+
+    JSON lists are tuples. JSON objects are ``{"class": name, "fields": {...}}``, ``{"mapping": {...}}``, or
+    ``{"array": [dtype, start, length]}``.
+    """
 
     def __init__(self) -> None:
         self._bytes = {dtype: bytearray() for dtype in _DTYPES}
@@ -280,87 +287,38 @@ class _ArrayPool:
     def arrays(self) -> dict[str, NDArray[Any]]:
         return {dtype: np.frombuffer(data, dtype=dtype) for dtype, data in self._bytes.items()}
 
-    def site_to_json(self, site: ScoredSite) -> dict[str, Any]:
-        return {
-            "site": site.site.to_json(),
-            "score": self._score_to_json(site.score),
-            "targets": None if site.targets is None else self._targets_to_json(site.targets),
-            "visible": None if site.visible is None else self._add_all(site.visible),
-        }
-
-    def _score_to_json(self, score: SiteScore) -> dict[str, Any]:
-        return {
-            "egvs": score.egvs,
-            "entropy_seen": score.entropy_seen,
-            "left_out": self._add(score.left_out),
-            "shares": self._add_all(score.shares),
-            "by_period": [self._score_to_json(period) for period in score.by_period],
-        }
-
-    def _targets_to_json(self, targets: SiteTargetScores) -> dict[str, Any]:
-        missed = targets.missed
-        return {
-            "scores": self._add_all(targets.scores),
-            "by_period": [dict(period) for period in targets.by_period],
-            "missed": None
-            if missed is None
-            else [self._add(array) for array in (missed.seen, missed.share, missed.se)],
-        }
-
-    def _add(self, array: NDArray[Any] | None) -> list[Any] | None:
-        if array is None:
-            return None
-        dtype = str(array.dtype)
-        start = len(self._bytes[dtype]) // array.itemsize
-        self._bytes[dtype] += array.tobytes()
-        return [dtype, start, len(array)]
-
-    def _add_all(self, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-        return {name: self._add(array) for name, array in arrays.items()}
+    def encode(self, value: Any) -> Any:
+        if isinstance(value, np.ndarray):
+            dtype = str(value.dtype)
+            start = len(self._bytes[dtype]) // value.itemsize
+            self._bytes[dtype] += value.tobytes()
+            return {"array": [dtype, start, len(value)]}
+        if isinstance(value, _PART_CLASSES):
+            encoded = {field.name: self.encode(getattr(value, field.name)) for field in fields(value)}
+            return {"class": type(value).__name__, "fields": encoded}
+        if isinstance(value, Mapping):
+            return {"mapping": {key: self.encode(item) for key, item in value.items()}}
+        if isinstance(value, tuple):
+            return [self.encode(item) for item in value]
+        return value
 
 
-class _StoredArrays:
-    """Turns the JSON of :class:`_ArrayPool` back into sites."""
-
-    def __init__(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        self._arrays = arrays
-
-    def site_from_json(self, value: dict[str, Any], path: Path) -> ScoredSite:
-        return ScoredSite(
-            ScannedSite.from_json(value["site"], path),
-            self._score_from_json(value["score"]),
-            None if value["targets"] is None else self._targets_from_json(value["targets"]),
-            None,
-            None if value["visible"] is None else self._get_all(value["visible"]),
-        )
-
-    def _score_from_json(self, value: dict[str, Any]) -> SiteScore:
-        return SiteScore(
-            float(value["egvs"]),
-            float(value["entropy_seen"]),
-            self._get(value["left_out"]),
-            self._get_all(value["shares"]),
-            tuple(self._score_from_json(period) for period in value["by_period"]),
-        )
-
-    def _targets_from_json(self, value: dict[str, Any]) -> SiteTargetScores:
-        missed = None
-        if value["missed"] is not None:
-            missed = SpotVisibility(*map(self._get, value["missed"]))
-        by_period = tuple({name: float(score) for name, score in period.items()} for period in value["by_period"])
-        return SiteTargetScores(self._get_all(value["scores"]), by_period, missed)
-
-    def _get(self, location: list[Any] | None) -> Any:
-        if location is None:
-            return None
-        dtype, start, length = location
-        array = self._arrays[dtype][start : start + length]
+def _decode(value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
+    """Invert :meth:`_PartEncoder.encode`."""
+    if isinstance(value, list):
+        return tuple(_decode(item, arrays) for item in value)
+    if not isinstance(value, dict):
+        return value
+    if "array" in value:
+        dtype, start, length = value["array"]
+        array = arrays[dtype][start : start + length]
         if len(array) != length:
             raise ValueError("numbers are missing")
         return array.copy()  # a view would keep the arrays of all sites in memory
-
-    def _get_all(self, locations: dict[str, Any]) -> dict[str, NDArray[Any]]:
-        return {name: self._get(location) for name, location in locations.items()}
+    if "class" in value:
+        decoded = {name: _decode(item, arrays) for name, item in value["fields"].items()}
+        return {cls.__name__: cls for cls in _PART_CLASSES}[value["class"]](**decoded)
+    return {key: _decode(item, arrays) for key, item in value["mapping"].items()}
 
 
 def split_sites(count: int, parts: int) -> list[slice]:

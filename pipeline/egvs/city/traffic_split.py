@@ -171,7 +171,7 @@ def make_city_traffic(
     """
     folder = city.folder / TRAFFIC_FOLDER
     with lock_run_folder(folder):
-        linked = link_scenarios(city)
+        linked = tuple(junction.id for junction in city.junctions if _link_scenario(city, junction))
         regions = find_traffic_regions(city, overrides)
         scenario = city_traffic_scenario(city, regions)
         key = _traffic_key(scenario, folder, regions)
@@ -274,15 +274,11 @@ def city_traffic_scenario(city: City, regions: Mapping[str, TrafficRegion]) -> S
     return scenario
 
 
-def link_scenarios(city: City) -> tuple[str, ...]:
-    """Make the scenarios of the junctions name the city's files and periods; return the changed junctions.
+def _link_scenario(city: City, junction: CityJunction) -> bool:
+    """Make the scenario of a junction name the city's files and periods; return whether it was changed.
 
     A scenario with traffic from elsewhere is not changed, and is an error in :func:`find_traffic_regions`.
     """
-    return tuple(junction.id for junction in city.junctions if _link_scenario(city, junction))
-
-
-def _link_scenario(city: City, junction: CityJunction) -> bool:
     path = junction.scenario_folder(city) / SCENARIO_FILE
     table = reading.read_toml(path).get("traffic", {})
     sources = {key: table[key] for key in _SOURCE_KEYS if key in table} if isinstance(table, dict) else {}

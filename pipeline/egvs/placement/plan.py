@@ -365,15 +365,9 @@ def _refine_placement(
     sensors = []
     for sensor, i in zip(result.sensors, order, strict=True):
         sensors.append(replace(sensor, moved_m=refined.moved_m(i), gain_by_refining=refined.gain(i)))
-    summary = RefinementSummary(
-        placed.joint,
-        before.value,
-        after.value,
-        refined.tried,
-        refined.impossible,
-        refined.turns,
-        perf_counter() - start_s,
-    )
+    seconds = perf_counter() - start_s
+    counts = (refined.tried, refined.impossible, refined.turns)
+    summary = RefinementSummary(placed.joint, before.value, after.value, *counts, seconds)
     return replace(result, sensors=tuple(sensors), refinement=summary)
 
 
