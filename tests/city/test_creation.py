@@ -100,26 +100,33 @@ def test_selects_junctions_with_signals(made: creation.NewCity, extract: Path) -
 
 @pytest.mark.slow
 def test_junction_has_region_and_poles_of_egvs_new(made: creation.NewCity, extract: Path) -> None:
-    for its in model.load_city(made.folder).junctions:
-        folder = made.folder.parent / f"alone-{its.id}"
-        openstreetmap.create_scenario(folder, extract, (its.lat_deg, its.lon_deg), surroundings_m=None)
-        ours, alone = egvs.load(made.folder / "junctions" / its.id), egvs.load(folder)
-        assert (ours.roi, ours.sites, ours.score) == (alone.roi, alone.sites, alone.score)
-        assert (made.folder / "junctions" / its.id / "sites.csv").read_bytes() == (folder / "sites.csv").read_bytes()
-        near, every = (
-            {f["properties"]["name"]: f for f in json.loads((its_folder / "statics.geojson").read_text())["features"]}
-            for its_folder in (made.folder / "junctions" / its.id, folder)
-        )
-        assert near.items() <= every.items()
-        (x, y, _), (width, depth, _) = ours.roi.box.origin_m, ours.roi.size_m
+    for junction in model.load_city(made.folder).junctions:
+        in_city, single = made.folder / "junctions" / junction.id, made.folder.parent / f"single-{junction.id}"
+        openstreetmap.create_scenario(single, extract, (junction.lat_deg, junction.lon_deg), surroundings_m=None)
+        scenario, expected = egvs.load(in_city), egvs.load(single)
+        assert (scenario.roi, scenario.sites, scenario.score) == (expected.roi, expected.sites, expected.score)
+        assert (in_city / "sites.csv").read_bytes() == (single / "sites.csv").read_bytes()
+
+        near, all_solids = read_solids(in_city), read_solids(single)
+        assert near.items() <= all_solids.items()
+        (x, y, _), (width, depth, _) = scenario.roi.box.origin_m, scenario.roi.size_m
         region = box(x, y, x + width, y + depth)
-        away_m = {name: region.distance(shape(feature["geometry"])) for name, feature in every.items()}
-        assert {name for name in every if away_m[name] < 200} <= near.keys()  # the reach of a VLP-32C
-        assert {name for name in every if away_m[name] > 300}.isdisjoint(near) and len(near) < len(every)
-        mine, networks = geolocation.scenario_georeference(ours).frame, geolocation.scenario_georeference(alone).frame
-        assert mine is not None and networks is not None
-        spot = [[its.x_m, its.y_m]]
-        assert mine.to_degrees(spot) == pytest.approx(networks.to_degrees(spot), abs=1e-9)
+        distance_m = {name: region.distance(shape(feature["geometry"])) for name, feature in all_solids.items()}
+        assert {name for name in all_solids if distance_m[name] < 200} <= near.keys()  # the range of a VLP-32C
+        assert {name for name in all_solids if distance_m[name] > 300}.isdisjoint(near)
+        assert len(near) < len(all_solids)
+
+        frame = geolocation.scenario_georeference(scenario).frame
+        expected_frame = geolocation.scenario_georeference(expected).frame
+        assert frame is not None and expected_frame is not None
+        location = [[junction.x_m, junction.y_m]]
+        assert frame.to_degrees(location) == pytest.approx(expected_frame.to_degrees(location), abs=1e-9)
+
+
+def read_solids(folder: Path) -> dict[str, dict]:
+    """Return the solids of a scenario by name."""
+    features = json.loads((folder / "statics.geojson").read_text())["features"]
+    return {feature["properties"]["name"]: feature for feature in features}
 
 
 def test_nearby_streets_give_same_poles_as_all_streets(extract: Path) -> None:
@@ -137,26 +144,30 @@ def test_network_excerpt_keeps_streets(extract: Path, tmp_path: Path) -> None:
     text, streets = osm_network.build_network(
         read, extract, osm_network.netconvert_flags(read, lefthand=False, walk=True)
     )
-    pieces, whole = osm_network.NetworkExcerpts(text), streets.network
-    (tmp_path / "whole.net.xml").write_text(text)
+    excerpts, complete = osm_network.NetworkExcerpts(text), streets.network
+    (tmp_path / "complete.net.xml").write_text(text)
     for junction in (junction for junction in streets.junctions if junction.arms >= 3):
         window = junctions.region_around(junction).area.buffer(80.0, join_style="mitre")
-        path = tmp_path / "part.net.xml"
-        path.write_text(pieces.near(streets.near(window)))
-        part = network.read_net_xml(path)
-        assert part.location == whole.location
-        ours, all_edges = {e.id: e for e in part.all_edges}, {e.id: e for e in whole.all_edges}
-        assert len(ours) < len(all_edges)
-        for its_id, edge in ours.items():
-            assert [lane.text for lane in edge.lanes] == [lane.text for lane in all_edges[its_id].lanes]
-        reached = {its for its, area in streets.areas.items() if area.intersects(window) and not its.startswith(":")}
-        assert reached <= ours.keys()
-        inside = {its for its in all_edges if its.startswith(f":{junction.id}_")}
-        assert inside and inside <= ours.keys()  # lanes, crossings and walking areas of the junction
-        assert {j.id for j in part.junctions} >= {junction.id}
-        mine = {(part.edges[c.source].id, part.edges[c.target].id, c.via) for c in part.connections}
-        every = {(whole.edges[c.source].id, whole.edges[c.target].id, c.via) for c in whole.connections}
-        assert mine == {c for c in every if c[0] in ours and c[1] in ours}
+        path = tmp_path / "excerpt.net.xml"
+        path.write_text(excerpts.near(streets.near(window)))
+        excerpt = network.read_net_xml(path)
+        assert excerpt.location == complete.location
+        edges, all_edges = {e.id: e for e in excerpt.all_edges}, {e.id: e for e in complete.all_edges}
+        assert len(edges) < len(all_edges)
+        for edge_id, edge in edges.items():
+            assert [lane.text for lane in edge.lanes] == [lane.text for lane in all_edges[edge_id].lanes]
+        in_window = {edge_id for edge_id, area in streets.areas.items() if area.intersects(window)}
+        assert {edge_id for edge_id in in_window if not edge_id.startswith(":")} <= edges.keys()
+        inside = {edge_id for edge_id in all_edges if edge_id.startswith(f":{junction.id}_")}
+        assert inside and inside <= edges.keys()  # lanes, crossings and walking areas of the junction
+        assert {j.id for j in excerpt.junctions} >= {junction.id}
+        expected = {connection for connection in connections(complete) if connection[0] in edges}
+        assert connections(excerpt) == {connection for connection in expected if connection[1] in edges}
+
+
+def connections(net: network.Network) -> set[tuple[str, str, str]]:
+    """Return source, target and internal lane of all connections."""
+    return {(net.edges[c.source].id, net.edges[c.target].id, c.via) for c in net.connections}
 
 
 def test_same_map_gives_same_bytes(made: creation.NewCity, extract: Path, tmp_path: Path) -> None:
@@ -166,7 +177,7 @@ def test_same_map_gives_same_bytes(made: creation.NewCity, extract: Path, tmp_pa
 
 def test_leaves_out_junction_without_pole_locations(extract: Path, tmp_path: Path) -> None:
     city = creation.create_city(tmp_path / "town", extract, which="all")
-    assert [its.junction.names[0] for its in city.junctions] == ["A Road", "B Road"]
+    assert [new.junction.names[0] for new in city.junctions] == ["A Road", "B Road"]
     assert len(city.left_out[creation.NO_FREE_KERB]) == 1
 
 
@@ -186,7 +197,7 @@ def test_selects_junctions_of_table(extract: Path, tmp_path: Path) -> None:
 
 def test_radius_limits_streets_and_junctions(extract: Path, tmp_path: Path) -> None:
     city = creation.create_city(tmp_path / "town", extract, around=degrees(-200, 0), radius_m=250.0)
-    assert [its.junction.names[0] for its in city.junctions] == ["A Road"]
+    assert [new.junction.names[0] for new in city.junctions] == ["A Road"]
     assert len(city.left_out["too near to the rim"]) == 1
     assert city.streets.lane_length_m < 2 * (500 + 300 + 300) + 50
 

@@ -22,7 +22,7 @@ from egvs.city import allocation, page, results, scheduler, traffic_split
 from egvs.city.allocation import Allocation, JunctionPlans
 from egvs.city.model import City
 from egvs.city.results import CityPlan, JunctionResult, read_junction_results, write_results
-from egvs.city.tasks import Job, JobFailure, JobResult
+from egvs.city.tasks import Job, JobFailure, JobResult, RunSettings
 from egvs.core.errors import Diagnostic, InputError, collect_warnings
 from egvs.core.grid import Roi
 from egvs.core.runtime import ProgressCallback, no_progress
@@ -229,18 +229,9 @@ def _allocate_sensors(
     max_counts = {job.junction: first_count for job in jobs}
     plans: dict[str, JunctionPlans] = {}
     while True:
-        failures = []
-        for number in sorted(set(max_counts.values())):
-            number_jobs = [job for job in jobs if max_counts.get(job.junction) == number]
-            for job, result in scheduler.map_junctions(
-                client, allocation.junction_plans, number_jobs, settings, number, budget is not None
-            ):
-                if isinstance(result, JobFailure):
-                    failures.append(result)
-                else:
-                    plans[job.junction] = result
-                progress("junctions planned", len(plans), len(jobs))
-        scheduler.raise_failures(failures, len(jobs))
+        for result in _compute_plans(client, jobs, max_counts, settings, with_costs=budget is not None):
+            plans[result.junction] = result
+            progress("junctions planned", len(plans), len(jobs))
 
         all_plans = [plans[job.junction] for job in jobs]
         shares = _solve_allocation(all_plans, count, budget)
@@ -251,6 +242,22 @@ def _allocate_sensors(
                 max_counts[junction.junction] = min(limit, 2 * junction.max_count)
         if not max_counts:
             return all_plans, shares
+
+
+def _compute_plans(
+    client: Client, jobs: Sequence[Job], max_counts: Mapping[str, int], settings: RunSettings, *, with_costs: bool
+) -> Iterator[JunctionPlans]:
+    """Yield the plans of the junctions in ``max_counts``; finally raise an EgvsError if any of them failed."""
+    failures = []
+    for count in sorted(set(max_counts.values())):
+        count_jobs = [job for job in jobs if max_counts.get(job.junction) == count]
+        task = allocation.junction_plans
+        for _, result in scheduler.map_junctions(client, task, count_jobs, settings, count, with_costs):
+            if isinstance(result, JobFailure):
+                failures.append(result)
+            else:
+                yield result
+    scheduler.raise_failures(failures, len(jobs))
 
 
 def _solve_allocation(plans: Sequence[JunctionPlans], count: int | None, budget: float | None) -> Allocation:

@@ -202,6 +202,14 @@ def create_city(
             hint = "Try --junctions all."
         raise InputError(osm, f"no junction is left ({reasons})", hint)
 
+    notes = _import_notes(made, counts, walk)
+    city = NewCity(folder, tuple(made), left_out, streets, counts, notes)
+    openstreetmap.publish_folder(folder, _city_files(city, name, network, solids, areas), _check_city)
+    return city
+
+
+def _import_notes(made: Sequence[NewJunction], counts: ImportCounts, walk: bool) -> tuple[str, ...]:
+    """Return what to know before trusting the city."""
     notes = openstreetmap.scenario_notes(True, counts)
     n_larger = sum(not junction.roi.area.covers(junction.junction.area) for junction in made)
     if n_larger:
@@ -209,9 +217,7 @@ def create_city(
         notes.append(f"{n_larger} junctions are larger than their regions of interest ({limit})")
     if walk:
         notes.append(PEDESTRIANS_NOTE)
-    city = NewCity(folder, tuple(made), left_out, streets, counts, tuple(notes))
-    openstreetmap.publish_folder(folder, _city_files(city, name, network, solids, areas), _check_city)
-    return city
+    return tuple(notes)
 
 
 def choose_junctions(streets: Streets, which: str, within: BaseGeometry | None) -> JunctionChoice:

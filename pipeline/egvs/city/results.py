@@ -218,29 +218,36 @@ def read_junction_results(out: Path, junctions: Sequence[CityJunction]) -> tuple
 
 def write_results(out: Path, city: City, results: Sequence[JunctionResult]) -> tuple[Path, Path]:
     """Write the table of junctions and the dataset of scores; return the file, and the folder of the dataset."""
-    _write_scores(out, [result.junction.id for result in results])
-    junctions, best = [result.junction for result in results], [result.best for result in results]
-    columns: dict[str, Any] = {
-        "rank": [result.rank for result in results],
-        "junction": [junction.id for junction in junctions],
-        "title": [junction.title for junction in junctions],
-        "x_m": [junction.x_m for junction in junctions],
-        "y_m": [junction.y_m for junction in junctions],
-        "longitude_deg": [junction.lon_deg for junction in junctions],
-        "latitude_deg": [junction.lat_deg for junction in junctions],
-        "signalised": [junction.signalised for junction in junctions],
-        "sites": [result.sites for result in results],
-        "best": [site.site for site in best],
-        "sensor": [site.sensor for site in best],
-        "gain": [result.gain for result in results],
-        "vehicles": [result.vehicles for result in results],
-    }
-    for key in ("score", "egvs", "egvs_limit", "entropy_seen"):
-        columns[key] = [getattr(site, key) for site in best]
-    inputs = hash_scores(out, columns["junction"])
-    metadata = {**_common_metadata(city, inputs), "rank_by": best[0].rank_by}
+    names = [result.junction.id for result in results]
+    _write_scores(out, names)
+    rows = [_table_row(result) for result in results]
+    columns = {column: [row[column] for row in rows] for column in rows[0]}
+    metadata = {**_common_metadata(city, hash_scores(out, names)), "rank_by": results[0].best.rank_by}
     parquet.write_artefact(out / JUNCTIONS_TABLE, "city", columns, metadata)
     return out / JUNCTIONS_TABLE, out / SCORES_DATASET
+
+
+def _table_row(result: JunctionResult) -> dict[str, Any]:
+    junction, best = result.junction, result.best
+    return {
+        "rank": result.rank,
+        "junction": junction.id,
+        "title": junction.title,
+        "x_m": junction.x_m,
+        "y_m": junction.y_m,
+        "longitude_deg": junction.lon_deg,
+        "latitude_deg": junction.lat_deg,
+        "signalised": junction.signalised,
+        "sites": result.sites,
+        "best": best.site,
+        "sensor": best.sensor,
+        "gain": result.gain,
+        "vehicles": result.vehicles,
+        "score": best.score,
+        "egvs": best.egvs,
+        "egvs_limit": best.egvs_limit,
+        "entropy_seen": best.entropy_seen,
+    }
 
 
 def _common_metadata(city: City, inputs: str) -> dict[str, Any]:
