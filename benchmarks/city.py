@@ -241,7 +241,7 @@ def main() -> None:
     parser.add_argument("--most-beams", type=int, help="of a task, so that small cities are cut too")
     asked = parser.parse_args()
     if asked.most_beams:
-        scheduler.LEAST_BEAMS = scheduler.MOST_BEAMS = asked.most_beams
+        scheduler.MIN_TASK_BEAMS = scheduler.MAX_TASK_BEAMS = asked.most_beams
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         match asked.what:

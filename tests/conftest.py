@@ -60,7 +60,6 @@ gamma = 4
 SITES = "site,x_m,y_m,z_m\npole_a,10,12,3\npole_b,30.5,-12,3\n"
 
 SYSTEM = (
-    "tests/city/running/",
     "tests/effects/test_traffic_effects",
     "tests/importers/",
     "tests/runs/",

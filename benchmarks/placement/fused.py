@@ -19,6 +19,7 @@ from egvs.cli.validation_tables import PlanRunDisplay
 from egvs.core import files
 from egvs.placement import plan
 from egvs.scenario.loading import load
+from egvs.sensors.sites import candidate_sites
 from egvs.validation import detection_metrics
 from egvs.validation.detection_metrics import ALL_OBJECTS, JackknifeEstimate, SiteDetection
 from egvs.validation.detector_runs import run_detectors
@@ -51,8 +52,9 @@ def chosen(home: Path, folder: Path, counts: Sequence[int], jobs: int | None) ->
         for count in counts:
             scenario = load(home, [f"score.rank_by={score!r}", f"placement.count={count}"])
             placed = plan.place(scenario, folder / score, exact=True, jobs=jobs)
-            group = SensorGroup(tuple(pick.site for pick in placed.sensors))
-            yield Chosen(score, group, placed.joint / placed.together, placed.solution.is_best)
+            sites = {site.name: site for site in candidate_sites(scenario)}
+            group = SensorGroup(tuple(sites[sensor.site] for sensor in placed.sensors))
+            yield Chosen(score, group, placed.joint / placed.joint_of_all, placed.solution.is_best)
 
 
 def look(

@@ -58,7 +58,7 @@ def _many(path: Path, out: Path) -> None:
     placed = plan.place(scenario, out)
     seconds = perf_counter() - started
     memory_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-    picks = ", ".join(pick.site.name for pick in placed.sensors)
+    picks = ", ".join(sensor.site for sensor in placed.sensors)
     print(f"{placed.candidates} candidates, {len(placed.sensors)} sensors: {picks}")
     print(f"proved: {placed.certificate:.2%} of the best; {seconds:.1f} s, {memory_gb:.2f} GB at most")
 

@@ -12,7 +12,7 @@ import pytest
 import egvs
 from egvs.explore.session import Session
 from egvs.explore.settings import open_session
-from egvs.sensors.sites import Site
+from egvs.sensors.sites import Pose, Site
 
 SITES = "site,x_m,y_m,z_m\na,10,12,3\nb,30.5,-12,3\nc,2,-12,4\nd,38,12,4\n"
 
@@ -73,7 +73,8 @@ def test_a_refined_plan_stands_where_it_was_moved_to(mini: Path, tmp_path: Path)
     placed = egvs.place(scenario, tmp_path / "run", refine=True)
     plan = open_session(mini, (), tmp_path / "run").plan
     assert plan is not None
-    assert [site.pose for site in plan.sites.values()] == [pick.site.pose for pick in placed.sensors]
+    for site, sensor in zip(plan.sites.values(), placed.sensors, strict=True):
+        assert site.pose == Pose(sensor.x_m, sensor.y_m, sensor.z_m, sensor.yaw_deg, sensor.pitch_deg, sensor.roll_deg)
     assert plan.joint == placed.joint
 
 

@@ -1,4 +1,4 @@
-"""Small problems of every kind, drawn at random, and their answers by trying every subset in plain Python."""
+"""Small random problems of all kinds, and their solutions by trying all subsets in plain Python."""
 
 from __future__ import annotations
 
@@ -14,58 +14,63 @@ from egvs.placement.problem import CoverageTerm, Demand, PlanRules, Problem, Vis
 
 @dataclass(frozen=True)
 class Instance:
-    """A problem, and what it was made of."""
+    """A problem, and the hits that it was made of."""
 
     problem: Problem
     hits: np.ndarray
     """(candidates, cells) int64."""
 
 
-def sight_of(hits: np.ndarray, most: int = 2**62) -> VisibilityMatrix:
-    """From hits (candidates, cells)."""
-    return VisibilityMatrix.of((VisibilityRow.of(row, most) for row in hits), hits.shape[1])
+def make_matrix(hits: np.ndarray, max_amount: int = 2**62) -> VisibilityMatrix:
+    """Return the visibility matrix of hits (candidates, cells)."""
+    return VisibilityMatrix.of((VisibilityRow.of(row, max_amount) for row in hits), hits.shape[1])
 
 
-def term_of(
+def make_term(
     name: str,
-    sight: VisibilityMatrix,
+    visibility: VisibilityMatrix,
     weight: np.ndarray,
     *,
     curve: int = CAPPED,
     scale: float = 3.0,
     each_once: bool = False,
 ) -> CoverageTerm:
-    """A sum whose exact value is :func:`math.fsum`'s."""
-    most = int(np.bincount(sight.cells, sight.amounts).max(initial=0))
-    worths = np.array([worth(curve, scale, total) for total in range(most + 1)])
+    """Return a term whose exact value is that of :func:`math.fsum`."""
+    max_total = int(np.bincount(visibility.cells, visibility.amounts).max(initial=0))
+    values = np.array([curve_value(curve, scale, total) for total in range(max_total + 1)])
 
     def exact(totals: np.ndarray) -> float:
-        return math.fsum((weight * worths[totals]).tolist())
+        return math.fsum((weight * values[totals]).tolist())
 
-    return CoverageTerm(name, sight, weight, curve, scale, each_once, exact)
+    return CoverageTerm(name, visibility, weight, curve, scale, each_once, exact)
 
 
-def worth(curve: int, scale: float, total: int) -> float:
-    """f, by the formula."""
+def curve_value(curve: int, scale: float, total: int) -> float:
+    """Return f(total) by the formula."""
     if curve == CAPPED:
         return min(float(total), scale)
     return math.log(1 + total / scale) if curve == LOGARITHM else 1 - math.exp(-total / scale)
 
 
-def drawn(seed: int) -> Instance:
-    """A problem with 4 to 7 candidates over up to 15 cells: any curve, forced and excluded candidates, costs, shared
-    poles, distances, zones, several records, a failure to survive; each of them in some."""
+def draw_problem(seed: int) -> Instance:
+    """Return a problem with 4 to 7 candidates and up to 15 cells.
+
+    Some have forced or excluded candidates, costs, shared poles, distances, zones, several records, or survive a
+    failure; all curves occur.
+    """
     rng = np.random.default_rng(seed)
     n, cells = int(rng.integers(4, 8)), int(rng.integers(3, 16))
     hits = rng.integers(0, 6, (n, cells)) * (rng.random((n, cells)) < rng.uniform(0.2, 0.9))
-    sight = sight_of(hits)
+    visibility = make_matrix(hits)
     curve = int(rng.choice([CAPPED, CAPPED, LOGARITHM, SATURATING]))
     scale, once = float(rng.choice([0.5, 1.0, 2.5, 4.0, np.inf if curve == CAPPED else 7.0])), bool(rng.random() < 0.3)
     records = [
-        term_of(f"r{i}", sight, rng.random(cells) * (rng.random(cells) < 0.8), curve=curve, scale=scale, each_once=once)
+        make_term(
+            f"r{i}", visibility, rng.random(cells) * (rng.random(cells) < 0.8), curve=curve, scale=scale, each_once=once
+        )
         for i in range(2)
     ]
-    mix = term_of("", sight, records[0].weight + records[1].weight, curve=curve, scale=scale, each_once=once)
+    mix = make_term("", visibility, records[0].weight + records[1].weight, curve=curve, scale=scale, each_once=once)
     objective = tuple(records) if rng.random() < 0.25 else (mix,)
     some = rng.permutation(n)
     forced = tuple(int(i) for i in some[: rng.choice([0, 0, 0, 1])])
@@ -87,24 +92,28 @@ def drawn(seed: int) -> Instance:
     if rng.random() < 0.3:
         zone = rng.random(cells) * (rng.random(cells) < 0.4)
         zone = zone / zone.sum() if zone.any() else zone
-        share = term_of("zone", sight, zone, scale=1.0, each_once=True)
+        share = make_term("zone", visibility, zone, scale=1.0, each_once=True)
         demands = (Demand(share, float(rng.uniform(0.2, 0.8))),) if zone.any() else ()
     return Instance(Problem(mix, objective, demands, rules, int(rng.random() < 0.15)), hits)
 
 
-def drawn_degenerate(seed: int) -> Instance:
-    """A problem with 1 to 9 candidates, many of them equal or blind: caps of nothing and of infinity, records without
-    traffic, all candidates forced, costs of nothing, budgets that are sums of decimals, zones that two must see,
-    counts above the candidates."""
+def draw_degenerate_problem(seed: int) -> Instance:
+    """Return a problem with 1 to 9 candidates, many of them equal or blind.
+
+    Some have caps of 0 or infinity, records without traffic, only forced candidates, no costs, budgets that are sums of
+    decimals, zones that two sensors must see, or counts above the number of candidates.
+    """
     rng = np.random.default_rng(10_000 + seed)
     n, cells = int(rng.integers(1, 10)), int(rng.integers(1, 25))
     kinds = rng.integers(0, 4, (max(1, n // int(rng.integers(1, 4))), cells)) * (rng.random((1, cells)) < 0.7)
     hits = kinds[rng.integers(0, len(kinds), n)] * (rng.random(n) < 0.85)[:, None]
-    sight, curve = sight_of(hits), int(rng.choice([CAPPED, CAPPED, LOGARITHM, SATURATING]))
+    visibility, curve = make_matrix(hits), int(rng.choice([CAPPED, CAPPED, LOGARITHM, SATURATING]))
     scale = float(rng.choice([0.0, 1.0, 2.5, np.inf])) if curve == CAPPED else 3.0
     weight = rng.integers(0, 3, cells) * rng.choice([1.0, 0.1, 0.0])
-    records = [term_of(f"r{i}", sight, weight * (rng.random(cells) < 0.6), curve=curve, scale=scale) for i in range(2)]
-    mix = term_of("", sight, records[0].weight + records[1].weight, curve=curve, scale=scale)
+    records = [
+        make_term(f"r{i}", visibility, weight * (rng.random(cells) < 0.6), curve=curve, scale=scale) for i in range(2)
+    ]
+    mix = make_term("", visibility, records[0].weight + records[1].weight, curve=curve, scale=scale)
     objective = tuple(records) if rng.random() < 0.25 else (mix,)
     forced = tuple(rng.permutation(n)[: int(rng.choice([0, 0, 1, n]))].tolist())
     excluded = rng.random(n) < 0.15
@@ -120,51 +129,54 @@ def drawn_degenerate(seed: int) -> Instance:
     )  # fmt: skip
     zone, demands = rng.integers(0, 2, cells).astype(float), ()
     if rng.random() < 0.3 and zone.any():
-        demands = (Demand(_seen_by(sight, zone, int(rng.choice([1, 2]))), float(rng.choice([0.25, 0.5, 1.0]))),)
+        demands = (Demand(_zone_share(visibility, zone, int(rng.choice([1, 2]))), float(rng.choice([0.25, 0.5, 1.0]))),)
     return Instance(Problem(mix, objective, demands, rules, int(rng.random() < 0.2)), hits)
 
 
-def _seen_by(sight: VisibilityMatrix, zone: np.ndarray, sensors: int) -> CoverageTerm:
-    """The share of a zone's cells that so many see; its weights are those of a sum that is never below it."""
-    term = term_of("zone", sight, zone / (zone.sum() * sensors), scale=float(sensors), each_once=True)
+def _zone_share(visibility: VisibilityMatrix, zone: np.ndarray, sensors: int) -> CoverageTerm:
+    """Return the share of a zone's cells that so many sensors see, and the weights of a sum that is an upper bound."""
+    term = make_term("zone", visibility, zone / (zone.sum() * sensors), scale=float(sensors), each_once=True)
     return replace(term, exact=lambda totals: float(zone[totals >= sensors].sum() / zone.sum()))
 
 
-def every_plan(problem: Problem):
-    """All subsets that keep the rules, by the rules as a person would read them."""
+def all_plans(problem: Problem):
+    """Yield all subsets that keep the rules, which are written out here."""
     rules, n = problem.rules, len(problem.rules.cost)
     for size in range(rules.count + 1):
         for plan in itertools.combinations(range(n), size):
-            if _keeps(rules, plan):
+            if _keeps_rules(rules, plan):
                 yield plan
 
 
-def _keeps(rules: PlanRules, plan: tuple[int, ...]) -> bool:
+def _keeps_rules(rules: PlanRules, plan: tuple[int, ...]) -> bool:
     if not set(rules.forced) <= set(plan) or any(rules.excluded[i] for i in plan):
         return False
     on_pole: dict[int, list[int]] = {}
     for i in plan:
         on_pole.setdefault(int(rules.pole[i]), []).append(i)
-    if any(len(those) > rules.most_per_pole for those in on_pole.values()):
+    if any(len(group) > rules.most_per_pole for group in on_pole.values()):
         return False
     for i, j in itertools.combinations(plan, 2):
         if math.dist(rules.position_m[i], rules.position_m[j]) < rules.least_distance_m:
             return False
     total = 0.0
-    for those in on_pole.values():
-        total += sum(float(rules.cost[i] - rules.pole_cost[i]) for i in those)
-        if not set(those) & set(rules.forced):
-            total += max(float(rules.pole_cost[i]) for i in those)
+    for group in on_pole.values():
+        total += sum(float(rules.cost[i] - rules.pole_cost[i]) for i in group)
+        if not set(group) & set(rules.forced):
+            total += max(float(rules.pole_cost[i]) for i in group)
     return total <= rules.budget + 1e-9
 
 
 def value_of(problem: Problem, plan: tuple[int, ...], hits: np.ndarray) -> tuple[bool, float]:
-    """Whether a plan meets the demands, and its value, by the definitions."""
+    """Return whether a plan meets the demands, and its value, by the definitions."""
 
-    def of(term: CoverageTerm, those: tuple[int, ...]) -> float:
-        rows = hits[list(those)] > 0 if term.each_once else hits[list(those)]
+    def term_value(term: CoverageTerm, subset: tuple[int, ...]) -> float:
+        rows = hits[list(subset)] > 0 if term.each_once else hits[list(subset)]
         return term.exact(rows.sum(axis=0).astype(int))
 
-    met = all(of(demand.term, plan) >= demand.least * (1 - 1e-12) for demand in problem.demands)
-    left = [tuple(j for j in plan if j != i) for i in plan] if problem.survives else [plan]
-    return met, min((min(of(term, those) for term in problem.objective) for those in left), default=0.0)
+    is_met = all(term_value(demand.term, plan) >= demand.least * (1 - 1e-12) for demand in problem.demands)
+    subsets = [plan]
+    if problem.survives:
+        subsets = [tuple(j for j in plan if j != i) for i in plan]
+    values = [min(term_value(term, subset) for term in problem.objective) for subset in subsets]
+    return is_met, min(values, default=0.0)

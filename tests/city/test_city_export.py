@@ -1,4 +1,4 @@
-"""A city's run is taken along: junctions, the plan and all sites as layers."""
+"""Exporting a city run: junctions, the plan and all sites as layers."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ import pyogrio
 import pytest
 
 from egvs.city import city_run
+from egvs.city.city_run import CityRunOptions
 from egvs.city.model import City
 from egvs.core.errors import InputError
 from egvs.export.export import export_run
 
-pytestmark = pytest.mark.usefixtures("here")
+pytestmark = [pytest.mark.system, pytest.mark.usefixtures("in_process_cluster")]
 
 
 @pytest.mark.slow
-def test_a_citys_run_is_exported(city: City, tmp_path: Path) -> None:
+def test_exports_city_run(city: City, tmp_path: Path) -> None:
     placed = city_run.place_city(city, tmp_path / "out", count=2)
     (path,) = export_run(tmp_path / "out", "gpkg").paths
     assert path.name == "town.gpkg"
@@ -33,12 +34,12 @@ def test_a_citys_run_is_exported(city: City, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_cannot_be_exported_of_a_city(city: City, tmp_path: Path) -> None:
+def test_leaves_out_old_plan_and_rejects_geotiff(city: City, tmp_path: Path) -> None:
     out = city_run.run_city(city, tmp_path / "out").out
     with pytest.raises(InputError, match=r"--to geotiff: .* is a city's run; a junction's"):
         export_run(out, "geotiff")
     city_run.place_city(city, out, count=1)
-    ran = city_run.run_city(city, out, sets=["roi.voxel_m=1"])
+    ran = city_run.run_city(city, out, CityRunOptions(overrides=["roi.voxel_m=1"]))
     assert "plan.parquet" not in {path.name for path in ran.files}
     done = export_run(out, "geojson")
     assert [path.stem for path in done.paths] == ["junctions", "sites"]
