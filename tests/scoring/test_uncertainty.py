@@ -146,7 +146,7 @@ def test_groups_too_short_for_the_traffic_are_joined_or_warned_of() -> None:
     assert np.mean([e.strata[0].joined > 1 for e in patient]) > 0.8
     assert all(e.groups >= MIN_GROUPS for e in patient)
     few = [ScoreUncertainty.of(wandering(7, 0.97, seed), record(np.full(7, 10))) for seed in range(200)]
-    warned = [e for e in few if e.strata[0].still_alike]
+    warned = [e for e in few if e.strata[0].still_correlated]
     assert warned
     doubts = [standard_errors.uncertainty_warnings(e, "scenario.toml: traffic.frames", 0.5) for e in warned]
     assert all("neighbouring blocks of 10 frames are correlated" in doubt.problem for (doubt,) in doubts)
