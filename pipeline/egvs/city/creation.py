@@ -362,8 +362,9 @@ def city_toml(name: str, streets: Streets, n_junctions: int) -> str:
         Number of junctions.
     """
     amount, fields = traffic_amount(streets), TrafficConfig.model_fields
-    values: dict[str, Any] = {"name": name} if name else {}
-    values |= {"description": f"{n_junctions} junctions", "attribution": ATTRIBUTION, "seed": 1}
+    values: dict[str, Any] = {"description": f"{n_junctions} junctions", "attribution": ATTRIBUTION, "seed": 1}
+    if name:
+        values = {"name": name, **values}
     traffic = {
         "network": NETWORK_FILE, "vehicles_per_lane_km": fields["vehicles_per_lane_km"].default,
         "frames": DEFAULT_FRAMES,

@@ -185,7 +185,7 @@ def make_city_traffic(
             sumo_path = folder / SUMO_FOLDER / period
             summaries[period], period_rows = _record_period(period_scenario, sumo_path, regions, paths, progress)
             rows.update(period_rows)
-        summary = summaries[""] if "" in summaries else traffic.merge_summaries(summaries)
+        summary = traffic.merge_summaries(summaries) if city.traffic.periods else summaries[""]
         warnings = [warning.to_json() for warning in _no_traffic_warnings(scenario, rows)]
         summary[WARNINGS_KEY] = [*summary.get(WARNINGS_KEY, []), *warnings]
 
@@ -281,12 +281,11 @@ def _link_scenario(city: City, junction: CityJunction) -> bool:
     """
     path = junction.scenario_folder(city) / SCENARIO_FILE
     table = reading.read_toml(path).get("traffic", {})
-    sources = {key: table[key] for key in _SOURCE_KEYS if key in table} if isinstance(table, dict) else {}
-    expected = _expected_sources(city, junction)
-    traffic_folder = f"{_TO_CITY_FOLDER}{TRAFFIC_FOLDER}/"
-    if not sources or sources == expected:
+    if not isinstance(table, dict):
         return False
-    if not all(str(name).startswith(traffic_folder) for name in _named_files(sources)):
+    sources = {key: table[key] for key in _SOURCE_KEYS if key in table}
+    expected = _expected_sources(city, junction)
+    if not sources or sources == expected or not _are_city_files(sources):
         return False
     try:
         document = tomlkit.parse(path.read_text(encoding="utf-8"))
@@ -323,13 +322,15 @@ def _relative_traffic_path(city: City, junction: CityJunction, period: str) -> s
     return _TO_CITY_FOLDER + junction.traffic_file(city, period).relative_to(city.folder).as_posix()
 
 
-def _named_files(sources: dict[str, Any]) -> Iterator[Any]:
-    """Yield the files that the keys of a ``[traffic]`` table name; "" for a period without one."""
-    if "fcd" in sources:
-        yield sources["fcd"]
+def _are_city_files(sources: dict[str, Any]) -> bool:
+    """Return whether all files of a ``[traffic]`` table are in the city's traffic folder."""
     periods = sources.get("periods", [])
-    for period in periods if isinstance(periods, list) else [periods]:
-        yield period.get("fcd", "") if isinstance(period, dict) else ""
+    if not isinstance(periods, list) or not all(isinstance(period, dict) for period in periods):
+        return False
+    names = [period.get("fcd", "") for period in periods]
+    if "fcd" in sources:
+        names.append(sources["fcd"])
+    return all(str(name).startswith(f"{_TO_CITY_FOLDER}{TRAFFIC_FOLDER}/") for name in names)
 
 
 def find_traffic_regions(city: City, overrides: Sequence[str] = ()) -> dict[str, TrafficRegion]:
