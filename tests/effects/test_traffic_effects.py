@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from egvs.artefacts import parquet
-from egvs.artefacts.traffic_frames import PITCHED_BOX_COLUMNS, FrameBoxes
+from egvs.artefacts.frame_boxes import PITCHED_BOX_COLUMNS, FrameBoxes
 from egvs.core.errors import InputError
 from egvs.core.grid import Grid, Roi
 from egvs.effects import articulated, pedestrians_bicycles, slope

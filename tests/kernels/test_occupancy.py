@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 import egvs
 from egvs.artefacts import parquet
-from egvs.artefacts.traffic_frames import FrameBoxes, read_boxes
+from egvs.artefacts.frame_boxes import FrameBoxes, read_boxes
 from egvs.core.errors import InputError
 from egvs.core.grid import Grid
 from egvs.kernels import occupancy as kernels_occupancy

@@ -22,7 +22,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from egvs.artefacts import parquet, run_folder
+from egvs.artefacts import checksums, parquet
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.tpog import read_periods
 from egvs.core.errors import InputError
@@ -194,7 +194,7 @@ def read_accuracy(path: str | Path) -> tuple[list[dict[str, Any]], dict[str, Any
     path = Path(path)
     if not path.is_file():
         return None
-    run_folder.verify_checksums(
+    checksums.verify_checksums(
         path.with_name(RunFolder.accuracy_checksums.name), "remove it, or run egvs accuracy again"
     )
     try:
@@ -212,7 +212,7 @@ def read_placement(
     paths = Path(placement), Path(curve)
     if not all(path.is_file() for path in paths):
         return None
-    run_folder.verify_checksums(
+    checksums.verify_checksums(
         paths[0].with_name(RunFolder.placement_checksums.name), "remove it, or run egvs place again"
     )
     found = []
@@ -234,7 +234,7 @@ def read_validation(
     paths = Path(detection), Path(correlation)
     if not all(path.is_file() for path in paths):
         return None
-    run_folder.verify_checksums(
+    checksums.verify_checksums(
         paths[0].with_name(RunFolder.validation_checksums.name), "remove it, or run egvs validate again"
     )
     found = []

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from egvs.artefacts import parquet, run_folder
+from egvs.artefacts import checksums, parquet
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files
 from egvs.core.errors import InputError
@@ -184,7 +184,7 @@ def write_placement(
     }
     parquet.write_artefact(RunFolder(folder).curve, "curve", curve, about)
     written = RunFolder(folder).placement, RunFolder(folder).curve
-    run_folder.write_checksums(RunFolder(folder).placement_checksums, written)
+    checksums.write_checksums(RunFolder(folder).placement_checksums, written)
     return written
 
 

@@ -28,12 +28,8 @@ from pathlib import Path
 from typing import Any
 
 from egvs._version import __version__
-from egvs.artefacts.run_folder import (
-    STAGE_NAMES,
-    RunFolder,
-    RunRecord,
-    StageRecord,
-)
+from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
+from egvs.artefacts.run_record import RunRecord, StageRecord
 from egvs.core import files
 from egvs.core.errors import InputError, RunError
 from egvs.core.runtime import ProgressCallback, no_progress

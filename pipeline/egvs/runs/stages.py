@@ -28,7 +28,8 @@ from pathlib import Path
 from typing import Any
 
 from egvs.artefacts import parquet
-from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder, RunRecord, StageRecord
+from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
+from egvs.artefacts.run_record import RunRecord, StageRecord
 from egvs.core import files
 from egvs.core.errors import with_relative_paths
 from egvs.core.runtime import ResourceUsage, measure_usage

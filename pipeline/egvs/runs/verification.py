@@ -17,8 +17,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from egvs.artefacts import run_folder
-from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder, RunRecord, StageRecord
+from egvs.artefacts import checksums
+from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
+from egvs.artefacts.run_record import RunRecord, StageRecord
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.core.runtime import ProgressCallback, no_progress
@@ -101,7 +102,7 @@ def _altered_companions(folder: Path, record: RunRecord) -> Iterator[str]:
         RunFolder.validation_checksums.name,
         RunFolder.placement_checksums.name,
     ):
-        for name in run_folder.changed_files(folder / sums, "remove it"):
+        for name in checksums.changed_files(folder / sums, "remove it"):
             yield f"{name} was altered after the study that made it"
 
 

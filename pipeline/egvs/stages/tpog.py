@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.artefacts import parquet
+from egvs.artefacts.frame_boxes import FrameBoxes, read_boxes
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.tpog import PeriodBlocks, frame_multiplicities
-from egvs.artefacts.traffic_frames import FrameBoxes, read_boxes
 from egvs.core.errors import WARNINGS_KEY, InputError
 from egvs.core.grid import Grid
 from egvs.core.runtime import ProgressCallback

@@ -13,7 +13,8 @@ from typing import Any
 import pytest
 
 import egvs
-from egvs.artefacts.run_folder import STAGE_NAMES, RunRecord
+from egvs.artefacts.run_folder import STAGE_NAMES
+from egvs.artefacts.run_record import RunRecord
 from egvs.city import scheduler, tasks
 from egvs.city.tasks import Job, JobFailure, JobResult
 from egvs.core.errors import EgvsError, InputError, RunError
