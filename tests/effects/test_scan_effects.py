@@ -33,7 +33,7 @@ from egvs.sensors.sensor import Sensor, rotation_world_sensor
 from egvs.sensors.sites import Pose
 from egvs.stages import scan, statics
 from egvs.stages.inputs import get_scene, open_folder
-from egvs.stages.site_scoring import empty_scans
+from egvs.stages.site_scans import empty_scans
 from egvs.world import ray_casting, static_world
 from egvs.world.footprints import Footprint
 from egvs.world.mesh import World, read_ply

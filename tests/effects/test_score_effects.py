@@ -30,7 +30,7 @@ from egvs.sensors.scene import Scene
 from egvs.sensors.sensor import CATALOGUE, Sensor
 from egvs.stages import scan, score, statics, tpog, traffic
 from egvs.stages.inputs import get_scene, open_folder
-from egvs.stages.site_scoring import empty_scans
+from egvs.stages.site_scans import empty_scans
 from tests import processes
 from tests.conftest import BUILDING, SCENARIO, SITES, collection, fcd, feature
 from tests.stages import run_stage

@@ -41,5 +41,5 @@ def test_the_same_findings_are_the_same_bytes(tmp_path):
 def test_other_files_are_refused(tmp_path):
     path = tmp_path / "points.parquet"
     DetectedBoxes((Detections.empty(),)).write(path, {"inputs": "x"})
-    with pytest.raises(InputError, match=r"points.parquet: column 'points' is missing"):
+    with pytest.raises(InputError, match=r"points.parquet: the column 'points' is missing"):
         PointCounts.read(path)

@@ -45,7 +45,7 @@ class RunFile:
 
 @dataclass(frozen=True)
 class RunFolder:
-    """A folder that holds the artefacts of a run and of the studies made of it.
+    """A folder with the artefacts of a run and of its studies.
 
     ``folder.scores`` is the path of ``scores.parquet`` in the folder, ``RunFolder.scores.name`` the file name.
 
@@ -114,10 +114,10 @@ class RunFolder:
 
 
 ACCURACY_FILES = (RunFolder.accuracy.name, RunFolder.accuracy_figure.name)
-"""The report shows them where the study belongs to the same settings and files as the run."""
+"""Files of an accuracy study. The report shows them if their settings and inputs are those of the run."""
 
 VALIDATION_FILES = (RunFolder.detection.name, RunFolder.correlation.name, RunFolder.validation_figure.name)
-"""The report shows them where the validation belongs to the same settings and files as the run."""
+"""Files of a validation, shown likewise."""
 
 PLACEMENT_FILES = (RunFolder.placement.name, RunFolder.curve.name)
-"""The report shows them where the plan belongs to the same settings and files as the run."""
+"""Files of a plan, shown likewise."""

@@ -378,7 +378,7 @@ def read_stored_scores(parts: int) -> Callable[[SiteScoring], Iterator[ScoredSit
     again."""
 
     def scored(scoring: SiteScoring) -> Iterator[ScoredSite]:
-        score_key = stages.stage_key("score", scoring.work).key
+        score_key = stages.stage_key("score", scoring.context).key
         for part in split_sites(len(scoring.names), parts):
             if names := scoring.names[part]:
                 with files.temporary_folder() as folder:

@@ -140,7 +140,10 @@ def test_where_no_vehicle_counts_none_can_rank(mini: Path, tmp_path: Path, run_e
     none = ("--set", "score.weights.kinds.passenger=0", "--set", "score.rank_by=seen_well")
     code, _, told = run_egvs("run", mini, "--out", tmp_path, *none)
     assert code == 2
-    assert "score.rank_by = 'seen_well': no vehicle that counts by [score.weights] has its centre in the region" in told
+    assert (
+        "score.rank_by = 'seen_well': no vehicle with a weight above 0 in [score.weights] has its centre in the region"
+        in told
+    )
 
 
 @pytest.mark.parametrize(
