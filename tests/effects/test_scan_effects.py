@@ -39,7 +39,7 @@ from egvs.world.footprints import Footprint
 from egvs.world.mesh import World, read_ply
 from egvs.world.ray_casting import Caster, EmptyScan
 from tests.conftest import collection, feature
-from tests.stages import run_stage
+from tests.stage_runner import run_stage
 
 FOLIAGE, DIVERGENCE, SWAY = (
     "effects.foliage.leaf_area_density=",

@@ -25,7 +25,7 @@ from egvs.kernels import occupancy as kernels_occupancy
 from egvs.scoring import occupancy as scoring_occupancy
 from egvs.stages import traffic
 from tests.oracles import boxes as oracle
-from tests.stages import run_stage
+from tests.stage_runner import run_stage
 
 SHAPE, VOXEL_M = (8, 7, 5), 0.25
 SCENARIO = Path(__file__).resolve().parents[2] / "scenarios" / "nishishinjuku"

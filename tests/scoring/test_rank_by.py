@@ -26,8 +26,8 @@ from egvs.scoring.targets import TargetRecord, visible_targets
 from egvs.scoring.visibility import Beams
 from egvs.sensors.scanner import Scanner
 from egvs.stages import score
-from tests.scoring.targets import scenes
-from tests.stages import inputs_of, run_stage
+from tests.scoring import target_scenes as scenes
+from tests.stage_runner import inputs_of, run_stage
 
 ALL = 'score.others=["expected_detections", "seen_well", "points_on_target", "entropy_seen"]'
 SITES = "site,x_m,y_m,z_m\n" + "".join(f"s{n},{5 + 6 * n},{11 - 22 * (n % 2)},{2 + n}\n" for n in range(5))

@@ -18,7 +18,7 @@ from egvs.scenario import loading
 from egvs.scoring.egvs import binary_entropy
 from egvs.scoring.scorer import ranks
 from egvs.stages import scan, score, statics, tpog, traffic
-from tests.stages import run_stage
+from tests.stage_runner import run_stage
 
 STAGES = (traffic, statics, tpog, scan, score)
 

@@ -254,14 +254,7 @@ _SITE_KEYS = ("site", "x_m", "y_m", "z_m", "sensor")
 _PLAN_KEYS = ("candidates", "joint", "together", "value", "bound", "certificate", "cost")
 """Numbers in the metadata of a plan."""
 
-_PERIOD_TYPES = {
-    "name": str,
-    "weight": float,
-    "frames": int,
-    "block_frames": int,
-    "memory_frames": float,
-    "times": int,
-}
+_PERIOD_TYPES = {"name": str, "weight": float, "frames": int, "block_frames": int, "memory_frames": float, "times": int}
 
 
 def _parse_metadata(path: Path, artefact: str, content: bytes) -> dict[str, Any]:

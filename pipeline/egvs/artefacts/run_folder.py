@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import overload
 
-from egvs.core import files
-
 STAGE_NAMES = ("check", "statics", "scan", "traffic", "tpog", "score", "report")
 """In the order of execution: checks come first, and the fast stages come before SUMO runs."""
 
@@ -107,10 +105,6 @@ class RunFolder:
     def has_record(self) -> bool:
         """Whether a run left its record in the folder."""
         return self.run_record.is_file()
-
-    def digest(self, name: str) -> str:
-        """Return the sha256 of a file in the folder; InputError when it is not there."""
-        return files.hash_file(self.path / name)
 
 
 ACCURACY_FILES = (RunFolder.accuracy.name, RunFolder.accuracy_figure.name)

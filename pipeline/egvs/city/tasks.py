@@ -460,7 +460,7 @@ def _run_junction(job: Job, settings: RunSettings, help_from: dict[str, dict[str
     begin = perf_counter()
     with settings.applied():
         record = run.run(
-            job.scenario(), job.out, jobs=1, help_from=help_from, wait_s=_LOCK_WAIT_S,
+            job.scenario(), job.out, jobs=1, options=help_from, wait_s=_LOCK_WAIT_S,
             listener=lambda stage, state, _: made.append(stage) if state == "done" else None,
         )  # fmt: skip
         return JobResult(job.junction, record.stages["score"].summary["sites"], perf_counter() - begin, tuple(made))

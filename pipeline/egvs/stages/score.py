@@ -17,18 +17,20 @@ import pyarrow as pa
 from egvs.artefacts import parquet, readers
 from egvs.artefacts.extra_columns import extra_columns
 from egvs.artefacts.run_folder import RunFolder
+from egvs.artefacts.tpog import Tpog
 from egvs.core.errors import WARNINGS_KEY, Diagnostic
 from egvs.effects import registry
 from egvs.effects.base import Effect
 from egvs.formats.georeference import Georeference
 from egvs.scenario.model import SCENARIO_FILE, Scenario
-from egvs.scoring import occupancy, score_table, standard_errors
+from egvs.scoring import score_table, standard_errors
 from egvs.scoring.score_table import ScoreTable
+from egvs.sensors.sites import Site
 from egvs.stages import site_scoring
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.scene_inputs import scan_dependencies, sensor_digests, sensor_settings
 from egvs.stages.site_scoring import BeamAudit, ScoredSite, SiteScoring, needs_targets
-from egvs.world import geolocation
+from egvs.world import clearances, geolocation
 
 
 def dependencies(context: StageContext) -> StageDependencies:
@@ -240,7 +242,7 @@ def _warnings(context: StageContext, scoring: SiteScoring, scores: ScoreTable) -
         for column in others:
             yield from score_table.warn_additional_all_zero(column)
     if scenario.is_recorded:  # without a network, only the recorded vehicles show where the road is
-        yield from occupancy.warn_sites_in_traffic(context.scene.sites, scoring.tpog)
+        yield from _warn_sites_in_traffic(context.scene.sites, scoring.tpog)
 
 
 def _warn_short_traffic(
@@ -256,6 +258,29 @@ def _warn_short_traffic(
     return standard_errors.uncertainty_warnings(estimate, key, traffic.frame_period_s, records, length_keys)
 
 
+def _warn_sites_in_traffic(sites: Iterable[Site], tpog: Tpog) -> Iterator[Diagnostic]:
+    """Warn about each site that is, no higher than the clearance, where vehicles drive in some frame."""
+    grid = tpog.grid
+    for site in sites:
+        at_m = np.array(site.pose.position_m)
+        ix, iy, _ = np.floor((at_m - grid.origin_m) / grid.voxel_m).astype(np.int64)
+        if not (0 <= ix < grid.shape[0] and 0 <= iy < grid.shape[1]):
+            continue
+        column = tpog.counts[ix, iy]
+        layers = np.flatnonzero(column)
+        if not len(layers):
+            continue
+        height_m = at_m[2] - (grid.origin_m[2] + layers[0] * grid.voxel_m)
+        if height_m <= clearances.CLEARANCE_M:
+            share = column.max() / tpog.frames
+            yield Diagnostic(
+                "sites on the road",
+                f"site {site.name}",
+                f"vehicles drive through its position ({at_m[0]:g}, {at_m[1]:g}) in {share:.1%} of the frames",
+                f"Move it beside the road, or more than {clearances.CLEARANCE_M:g} m above it.",
+            )
+
+
 STAGE = Stage(
     "score",
     __name__,
@@ -263,4 +288,5 @@ STAGE = Stage(
     run,
     reads=(RunFolder.tpog, RunFolder.trajectories, RunFolder.scans, RunFolder.statics),
     effect_stages=("scan", "score"),
+    neutral_options=("scored_elsewhere",),
 )

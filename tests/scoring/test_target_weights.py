@@ -18,7 +18,7 @@ from egvs.scoring.target_scores import TARGET_SCORES, saturating_gain
 from egvs.scoring.targets import TargetRecord, target_weights, visible_targets, weighted_people
 from egvs.scoring.visibility import Beams
 from egvs.sensors.scanner import Scanner
-from tests.scoring.targets.scenes import GRID, beams_to, frame
+from tests.scoring.target_scenes import GRID, beams_to, frame
 
 SQUARE = [[110.0, 205.0], [120.0, 205.0], [120.0, 215.0], [110.0, 215.0]]
 SCORES = 'score.others=["expected_detections", "seen_well", "points_on_target"]'

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from egvs.scoring import occupancy
-from tests.checks.conftest import net_xml
-from tests.checks.test_checking import found
+from tests.stages.conftest import net_xml
+from tests.stages.test_check import found
 
 DEMAND = '<routes><vType id="a"/><vehicle id="v" depart="0"><route edges="east"/></vehicle></routes>'
 

@@ -15,9 +15,9 @@ from egvs.stages import check, scene_checks
 from egvs.stages.inputs import CheckInputs
 from egvs.traffic import network, sumo, sumo_folder
 from egvs.world.carriageway import Carriageway
-from tests.checks.conftest import LANES, net_xml
 from tests.conftest import collection, feature
-from tests.stages import inputs_of
+from tests.stage_runner import inputs_of
+from tests.stages.conftest import LANES, net_xml
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "scenarios"
 

@@ -9,7 +9,7 @@ import pytest
 
 import egvs
 from egvs.scoring import occupancy
-from tests.checks.test_checking import box, sites, statics
+from tests.stages.test_check import box, sites, statics
 
 
 def warnings(folder: Path, out: Path, *settings: str) -> dict[str, list[str]]:

@@ -19,10 +19,10 @@ from egvs.stages.inputs import open_folder
 from egvs.stages.site_scans import empty_scans
 from egvs.stages.site_scoring import vehicle_spots
 from tests.conftest import SITES, write_mini
-from tests.scoring.blindspots.roads import GRID, NETWORK
-from tests.scoring.blindspots.test_spots import car
-from tests.scoring.targets.scenes import frame
-from tests.stages import inputs_of, run_stage
+from tests.scoring.roads import GRID, NETWORK
+from tests.scoring.target_scenes import frame
+from tests.scoring.test_blindspots import car
+from tests.stage_runner import inputs_of, run_stage
 
 NET = "made.net.xml"
 
