@@ -68,7 +68,7 @@ def run(context: StageContext, inputs: StageDependencies) -> Summary:
     n_blocks = scenario.tpog.blocks
     by_period = scenario.by_period()
     writer = _BlockWriter(np.flatnonzero(static_voxels(context.world, grid)))
-    periods = []
+    periods: list[PeriodBlocks] = []
     boxes_in_roi = []
     left_over = 0
     with parquet.artefact_writer(context.folder.tpog, "tpog") as file:
