@@ -35,7 +35,7 @@ import psutil
 from scipy.stats import qmc
 
 from benchmarks.scaling import Size, prepare, sides
-from egvs.artefacts.run_folder import RunRecord
+from egvs.artefacts.run_record import RunRecord
 from egvs.city import scheduler, tasks
 from egvs.city.tasks import Job, JobResult
 from egvs.runs import run

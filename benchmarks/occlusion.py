@@ -26,7 +26,7 @@ from egvs.scenario.effects_config import EffectsConfig
 from egvs.scenario.model import Scenario
 from egvs.scoring.scorer import Scorer, ranks
 from egvs.stages.inputs import get_scene, open_folder
-from egvs.stages.site_scoring import empty_scans
+from egvs.stages.site_scans import empty_scans
 
 Compared = dict[str, Any]
 

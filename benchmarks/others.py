@@ -27,7 +27,7 @@ import numpy as np
 import egvs
 from benchmarks.scenes import recorded_boxes
 from benchmarks.stability import medians, textbook, touching
-from egvs.artefacts.traffic_frames import FrameBoxes
+from egvs.artefacts.frame_boxes import FrameBoxes
 from egvs.core.grid import Grid
 from egvs.kernels import occupancy, traversal
 from egvs.scoring.egvs import EntropyField

@@ -33,7 +33,7 @@ from egvs.scenario.model import Scenario
 from egvs.scoring.egvs import EntropyField
 from egvs.scoring.scorer import Scorer
 from egvs.stages.inputs import get_scene, open_folder
-from egvs.stages.site_scoring import empty_scans
+from egvs.stages.site_scans import empty_scans
 from egvs.world.mesh import read_ply
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 import egvs
-from egvs.artefacts.traffic_frames import FrameBoxes
+from egvs.artefacts.frame_boxes import FrameBoxes
 from egvs.scoring.occupancy import count_occupancy
 from egvs.world.mesh import World
 from egvs.world.ray_casting import Caster

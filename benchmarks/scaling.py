@@ -33,7 +33,7 @@ import pyarrow as pa
 from pyarrow import csv
 
 import egvs
-from egvs.artefacts.run_folder import StageRecord
+from egvs.artefacts.run_record import StageRecord
 from egvs.core.runtime import release_memory
 from egvs.runs import run
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from egvs.artefacts.traffic_frames import FrameBoxes, read_boxes
+from egvs.artefacts.frame_boxes import FrameBoxes, read_boxes
 from egvs.scenario.model import Scenario
 from egvs.scoring.occupancy import near_grid
 from egvs.stages import traffic

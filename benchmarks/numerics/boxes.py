@@ -19,7 +19,7 @@ from tests.oracles import boxes as oracle
 import egvs
 from benchmarks.numerics.row import Row
 from benchmarks.scenes import recorded_boxes
-from egvs.artefacts.traffic_frames import FrameBoxes
+from egvs.artefacts.frame_boxes import FrameBoxes
 from egvs.core.grid import Grid
 from egvs.kernels import occupancy
 from egvs.scoring.occupancy import count_occupancy

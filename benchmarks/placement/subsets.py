@@ -16,7 +16,7 @@ from pathlib import Path
 from time import perf_counter
 
 import egvs
-from egvs.artefacts.run_folder import RunRecord
+from egvs.artefacts.run_record import RunRecord
 from egvs.placement import plan, problem_builder, solver
 from egvs.placement.plan import REQUIRED_STAGES
 from egvs.runs import run, stages

@@ -7,7 +7,7 @@ import pytest
 from benchmarks import casting, others, savings, scaling, steps
 from scipy import stats
 
-from egvs.artefacts.traffic_frames import FrameBoxes
+from egvs.artefacts.frame_boxes import FrameBoxes
 from egvs.core.grid import Grid
 
 SHAPE = np.array([12, 6, 4], np.int64)

@@ -15,7 +15,8 @@ from typing import Any
 import pytest
 
 import egvs
-from egvs.artefacts.run_folder import STAGE_NAMES, RunRecord
+from egvs.artefacts.run_folder import STAGE_NAMES
+from egvs.artefacts.run_record import RunRecord
 from egvs.city import scheduler
 from egvs.city.model import City, load_city
 from egvs.city.tasks import Job

@@ -21,7 +21,7 @@ from egvs.importers import junctions, openstreetmap, osm_network
 from egvs.stages import traffic
 from egvs.traffic import network
 from egvs.world import geolocation
-from tests.stages import run_stage
+from tests.stage_runner import run_stage
 
 pytestmark = pytest.mark.system
 LAT, LON = 50.0, 10.0

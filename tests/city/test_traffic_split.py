@@ -17,8 +17,8 @@ from egvs.city import traffic_split
 from egvs.city.model import City, load_city
 from egvs.core.errors import InputError, RunError
 from egvs.traffic import fcd
-from tests.checks.conftest import net_xml
 from tests.city.conftest import FRAMES
+from tests.stages.conftest import net_xml
 
 pytestmark = pytest.mark.system
 ARTICULATED = "\n[effects.articulated]\nkinds = { bus = { parts_m = [9.0, 8.0] } }\n"

@@ -432,9 +432,9 @@ def record_what_lies_there(out: Path, stage: str) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda about: b"{", "its metadata is no JSON"),
-        (lambda about: [about], "its metadata is \\["),
-        (lambda about: about | {"schema": 99}, "schema version 99"),
+        (lambda about: b"{", "the metadata is not JSON"),
+        (lambda about: [about], "a JSON object as metadata, got \\["),
+        (lambda about: about | {"schema": 99}, "expected schema version 1, got 99"),
         (lambda about: about | {"grid": None}, "grid = None"),
         (lambda about: about | {"grid": {"origin_m": [0, 0, 0], "voxel_m": 0, "shape": [1, 1, 1]}}, "grid = "),
         (

@@ -173,8 +173,8 @@ SOURCE_BEFORE = {
 }
 """Code lines behind the key of each stage before the layout with one module per subject."""
 
-GROWTH = {"scan": 1.14, "tpog": 1.18, "report": 1.26}
-"""A stage runs again whenever a line behind its key changes, so the source behind a key may hardly grow."""
+GROWTH = {"tpog": 1.125, "report": 1.2}
+"""Allowed growth, 1.1 for the others: a stage runs again whenever a line behind its key changes."""
 
 
 def code_lines(path: Path) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
-from egvs.artefacts.run_folder import StageRecord
+from egvs.artefacts.run_record import StageRecord
 from egvs.cli.console import ProgressDisplay
 from egvs.core.errors import WARNINGS_KEY, Diagnostic, DiagnosticsError, collect_warnings, with_relative_paths
 from egvs.core.runtime import ResourceUsage

@@ -29,7 +29,7 @@ from egvs.scoring.visibility import UNIT, Beams, HitCounter
 from egvs.sensors import voxel_crossings
 from egvs.sensors.sites import Pose
 from egvs.stages import score
-from tests.stages import inputs_of, run_stage
+from tests.stage_runner import inputs_of, run_stage
 
 ON = "effects.moving_occlusion.method=frames"
 ALL = "effects.moving_occlusion.frames=all"

@@ -33,13 +33,13 @@ from egvs.sensors.sensor import Sensor, rotation_world_sensor
 from egvs.sensors.sites import Pose
 from egvs.stages import scan, statics
 from egvs.stages.inputs import get_scene, open_folder
-from egvs.stages.site_scoring import empty_scans
+from egvs.stages.site_scans import empty_scans
 from egvs.world import ray_casting, static_world
 from egvs.world.footprints import Footprint
 from egvs.world.mesh import World, read_ply
 from egvs.world.ray_casting import Caster, EmptyScan
 from tests.conftest import collection, feature
-from tests.stages import run_stage
+from tests.stage_runner import run_stage
 
 FOLIAGE, DIVERGENCE, SWAY = (
     "effects.foliage.leaf_area_density=",

@@ -30,10 +30,10 @@ from egvs.sensors.scene import Scene
 from egvs.sensors.sensor import CATALOGUE, Sensor
 from egvs.stages import scan, score, statics, tpog, traffic
 from egvs.stages.inputs import get_scene, open_folder
-from egvs.stages.site_scoring import empty_scans
+from egvs.stages.site_scans import empty_scans
 from tests import processes
 from tests.conftest import BUILDING, SCENARIO, SITES, collection, fcd, feature
-from tests.stages import run_stage
+from tests.stage_runner import run_stage
 
 SENSOR = sensor.Sensor("test", (0.0,), (0.0,), 1, 100.0, "this test", rated_range_m=40.0)
 RANGES_M = np.linspace(0.01, 200.0, 400)
@@ -557,7 +557,7 @@ import warnings
 warnings.simplefilter("error")
 import egvs
 from egvs.stages import score
-from tests.stages import run_stage
+from tests.stage_runner import run_stage
 egvs.load({folder!r}, {settings!r})
 run_stage(score, egvs.load({folder!r}, {settings!r}), __import__("pathlib").Path({out!r}), jobs=1)
 print(sorted(name for name in sys.modules if name.startswith({MODULES})))

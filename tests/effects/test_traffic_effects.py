@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from egvs.artefacts import parquet
-from egvs.artefacts.traffic_frames import PITCHED_BOX_COLUMNS, FrameBoxes
+from egvs.artefacts.frame_boxes import PITCHED_BOX_COLUMNS, FrameBoxes
 from egvs.core.errors import InputError
 from egvs.core.grid import Grid, Roi
 from egvs.effects import articulated, pedestrians_bicycles, slope
@@ -38,7 +38,7 @@ from egvs.traffic.vehicle_boxes import VehicleSize
 from egvs.world import terrain
 from egvs.world.mesh import read_ply
 from tests import processes
-from tests.stages import inputs_of, run_stage
+from tests.stage_runner import inputs_of, run_stage
 
 HILL = Path(__file__).resolve().parents[2] / "scenarios" / "hill"
 GRADE = 0.04
@@ -145,7 +145,7 @@ def test_an_effect_that_cannot_act_gives_the_bytes_of_the_plain_scene_and_says_s
 def test_a_flat_network_imports_no_effect(flat, tmp_path):
     values = scenario(flat, **(SMALL | {"frames": 8})).model_dump(mode="json")
     code = f"""
-import sys; from pathlib import Path; from egvs.stages import statics, traffic; from tests.stages import run_stage
+import sys; from pathlib import Path; from egvs.stages import statics, traffic; from tests.stage_runner import run_stage
 from egvs.scenario.loading import scenario_from_dict
 scene = scenario_from_dict({values!r}, Path({str(flat)!r}), "place")
 run_stage(traffic, scene, Path({str(tmp_path)!r})); run_stage(statics, scene, Path({str(tmp_path)!r}))

@@ -25,7 +25,7 @@ from egvs.importers import openstreetmap
 from egvs.scenario import loading
 from egvs.sensors import sites
 from tests.formats.test_osm import pbf_of
-from tests.stages import run_stage
+from tests.stage_runner import run_stage
 
 SMALL = Path(__file__).parent / "data" / "small.osm"
 REAL = Path(__file__).parents[3] / "shared" / "real" / "bad_hersfeld.osm"

@@ -18,14 +18,14 @@ from hypothesis import strategies as st
 
 import egvs
 from egvs.artefacts import parquet
-from egvs.artefacts.traffic_frames import FrameBoxes, read_boxes
+from egvs.artefacts.frame_boxes import FrameBoxes, read_boxes
 from egvs.core.errors import InputError
 from egvs.core.grid import Grid
 from egvs.kernels import occupancy as kernels_occupancy
 from egvs.scoring import occupancy as scoring_occupancy
 from egvs.stages import traffic
 from tests.oracles import boxes as oracle
-from tests.stages import run_stage
+from tests.stage_runner import run_stage
 
 SHAPE, VOXEL_M = (8, 7, 5), 0.25
 SCENARIO = Path(__file__).resolve().parents[2] / "scenarios" / "nishishinjuku"

@@ -25,7 +25,7 @@ from egvs.scenario.score_config import RefinementConfig
 from egvs.sensors.sites import Pose, Site
 from egvs.sensors.sites import candidate_sites as sites_of
 from egvs.traffic import network, sumo_folder
-from tests.checks.conftest import net_xml
+from tests.stages.conftest import net_xml
 from tests.conftest import BUILDING
 
 HALVES = 'traffic.periods=[{name="a", length_s=12, weight=3}, {name="b", begin_s=12, length_s=8}]'

@@ -36,10 +36,10 @@ from egvs.scoring.egvs import EntropyField
 from egvs.scoring.scorer import Scorer
 from egvs.stages import scan, score
 from egvs.stages.inputs import get_scene, open_folder
-from egvs.stages.site_scoring import empty_scans
+from egvs.stages.site_scans import empty_scans
 from egvs.studies import accuracy, score_errors, study_settings
 from egvs.world.mesh import World, write_ply
-from tests.stages import inputs_of, run_stage
+from tests.stage_runner import inputs_of, run_stage
 
 NASTY = '<b>&"x'
 SITES = [("north", 6, 9, 2), ("south", 6, -1, 2), (NASTY, 6, -1, 3), ("west", -2, 4, 1.5)]

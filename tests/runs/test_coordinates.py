@@ -17,9 +17,9 @@ from egvs.core.errors import InputError
 from egvs.formats.georeference import WorldFrame
 from egvs.report.ranking import Ranking
 from egvs.stages import traffic
-from tests.checks.conftest import net_xml
 from tests.conftest import write_mini
-from tests.stages import inputs_of
+from tests.stage_runner import inputs_of
+from tests.stages.conftest import net_xml
 
 CRS = "\n[crs]\nepsg = 32632\noffset_m = [-550700, -5635200]\n"
 FRAME = WorldFrame("EPSG:32632", (-550_700.0, -5_635_200.0))

@@ -186,22 +186,25 @@ def test_a_gamma_without_bound_is_json_and_comes_back(mini: Path, tmp_path: Path
 
 
 NOTHING = {
-    "gamma": (["score.gamma=0"], "score.gamma: egvs is 0 at every site, so none is best: gamma is 0; a gamma above 0"),
+    "gamma": (
+        ["score.gamma=0"],
+        "score.gamma: egvs is 0 at every site, so there is no ranking: gamma is 0. Set gamma above 0.",
+    ),
     "roi above the traffic": (
         ["roi.center_m=[20,0,42.5]"],
-        "roi: egvs is 0 at every site, so none is best: no traffic comes and goes in the region; "
-        "a region with traffic in it",
+        "roi: egvs is 0 at every site, so there is no ranking: the traffic in the region never changes. "
+        "Move or enlarge the region of interest.",
     ),
     "sensors that look up": (
         ["sensors.small.elevations_deg=[60,80]"],
-        "sites: egvs is 0 at every site, so none is best: no beam crosses a place with traffic; "
-        "sites and sensors that look at the traffic in the region",
+        "sites: egvs is 0 at every site, so there is no ranking: no beam crosses a voxel with traffic. "
+        "Check poses, sensors and the region of interest.",
     ),
 } | {
     score: (
         ["sensors.small.elevations_deg=[60,80]", f"score.rank_by='{score}'"],
-        f"sites: {score} is 0 at every site, so none is best: no beam crosses a place with traffic; "
-        "sites and sensors that look at the traffic in the region",
+        f"sites: {score} is 0 at every site, so there is no ranking: no beam crosses a voxel with traffic. "
+        "Check poses, sensors and the region of interest.",
     )
     for score in ("expected_detections", "seen_well", "points_on_target", "entropy_seen", "coverage")
 }
@@ -230,9 +233,9 @@ def test_another_score_that_is_0_everywhere_is_told(mini: Path, tmp_path: Path, 
     settings = ("--set", "score.rank_by='seen_well'", "--set", "score.gamma=0")
     code, printed, error = run_egvs("run", mini, "--out", tmp_path / "out", *settings)
     assert code == 0, error
-    told = "egvs is 0 at every site, so it tells none from another; sites, sensors and settings by which it is above 0"
     assert [line for line in error.splitlines() if "is 0 at" in line] == [
-        f"warning: scenario.toml: score: {told} somewhere"
+        "warning: scenario.toml: score: egvs is 0 at every site, so it does not distinguish them. "
+        "Check sites, sensors and effects."
     ]
     assert "   1  pole_" in printed, "the other score ranks all the same"
     assert "is 0 at every site" not in run_egvs("run", mini, "--out", tmp_path / "two")[2]

@@ -15,7 +15,6 @@ from egvs.core.errors import InputError
 from egvs.core.files import add_checksum
 from egvs.runs import run
 from egvs.stages import inputs
-from egvs.stages.base import static_world
 from egvs.stages.inputs import open_folder
 from egvs.studies.effect_study import EffectTrials
 
@@ -135,7 +134,7 @@ def test_the_report_of_a_run_is_not_drawn_anew_of_altered_artefacts(runs, out: P
 
 @pytest.mark.parametrize("name", ["trajectories.parquet", "tpog.parquet", "statics.ply"])
 def test_effects_are_tried_on_no_altered_traffic(runs, out: Path, name: str) -> None:
-    scene = inputs.resolve_scene(runs[0], static_world(open_folder(runs[0], out)))
+    scene = inputs.resolve_scene(runs[0], open_folder(runs[0], out).world)
     assert EffectTrials.of(scene, out) is not None
     shutil.copyfile(runs[2] / name, out / name)
     assert EffectTrials.of(scene, out) is None

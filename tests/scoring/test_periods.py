@@ -21,9 +21,10 @@ from egvs.artefacts.readers import PeriodRanking, read_scores_by_period
 from egvs.artefacts.tpog import read_periods, read_tpog
 from egvs.core.errors import Diagnostic, InputError, collect_warnings
 from egvs.core.grid import Grid
-from egvs.scoring import score_table, scorer
+from egvs.scoring import score_table
 from egvs.scoring.egvs import EntropyField, binary_entropy
-from egvs.scoring.score_table import ScoreColumn
+from egvs.scoring.score_table import ScoreTable, SiteScores
+from egvs.scoring.scorer import SiteScore
 from egvs.scoring.standard_errors import BlockGroups, BlockJackknife, ScoreUncertainty
 from egvs.stages import traffic
 from egvs.stages.inputs import open_folder
@@ -206,21 +207,45 @@ def test_errors_of_a_mix_and_of_its_periods_are_told(split: Path, tmp_path: Path
     assert all(finding.hint.startswith("Set length_s to at least ") for finding in doubts)
 
 
-def test_a_period_whose_best_site_is_another_is_told() -> None:
-    tpog = egvs.Tpog(
-        Grid.from_json({"origin_m": [0.0] * 3, "voxel_m": 1.0, "shape": [1, 1, 1]}), 1, np.zeros((1, 1, 1), np.int64)
-    )
-    named = [scorer.PeriodTpog(name, tpog) for name in ("morning", "night")]
+def score_table_of(**sites: tuple[float, ...]) -> ScoreTable:
+    """The EGVS of each site: of the mix, then of the periods ``morning`` and ``night``."""
+    scores = []
+    for name, (mix, *by_period) in sites.items():
+        periods = tuple(SiteScore(value, 0.0) for value in by_period)
+        scores.append(SiteScores(name, SiteScore(mix, 0.0, by_period=periods), None))
+    return ScoreTable.of(scores, {}, periods=("morning", "night"))
 
-    def judged(*sites: tuple[float, ...]) -> ScoreColumn:
-        mix, *apart = (np.array(values) for values in zip(*sites, strict=True))
-        return ScoreColumn("egvs", mix, None, (), tuple(apart))
 
-    (found,) = score_table.period_disagreements(["a", "b"], judged((9.0, 9.0, 3.0), (7.0, 6.0, 4.0)), named)
-    assert found.where == "scenario.toml: traffic.periods (night)"
-    assert found.problem == "b is the best site, not a of the mix, which is rank 2 there and scores 25.0% less"
-    assert score_table.period_disagreements(["a", "b"], judged((9.0, 9.0, 4.0), (7.0, 6.0, 4.0)), named) == []
-    assert score_table.period_disagreements(["a"], judged((9.0, 0.0, math.nan)), named) == []
+def test_warns_of_period_with_other_best_site() -> None:
+    table = score_table_of(a=(9.0, 9.0, 3.0), b=(7.0, 6.0, 4.0))
+    (warning,) = score_table.warn_period_disagreements(table, "egvs")
+    assert warning.where == "scenario.toml: traffic.periods (night)"
+    assert warning.problem == "the best site is b; a, the best of the mix, has rank 2 and scores 25.0% less"
+    assert not list(score_table.warn_period_disagreements(score_table_of(a=(9, 9, 4), b=(7, 6, 4)), "egvs"))
+    assert not list(score_table.warn_period_disagreements(score_table_of(a=(9, 0, math.nan)), "egvs"))
+
+
+def test_score_table_is_long_and_labelled() -> None:
+    table = score_table_of(a=(9.0, 9.0, 3.0), b=(7.0, 6.0, 4.0))
+    assert table.table.column_names == ["site", "period", "replicate", "score", "value"]
+    rows = [tuple(row.values()) for row in table.table.to_pylist() if row["score"] == "egvs"]
+    assert rows[:3] == [("a", "", 0, "egvs", 9.0), ("a", "morning", 0, "egvs", 9.0), ("a", "night", 0, "egvs", 3.0)]
+    assert table.column("egvs", "night").values.tolist() == [3.0, 4.0]
+    assert [column.best for column in table.by_period("egvs").values()] == [{0}, {1}]
+    assert table.ranking("egvs", "night") == [(1, "b", 4.0), (2, "a", 3.0)]
+
+
+def test_score_table_keeps_replicates_of_each_period() -> None:
+    groups = {"": (BlockGroups(np.array([5, 5]), 0.0),)}
+    scores = SiteScore(9.0, 0.5, np.array([9.1, 8.0, 10.0]), {"coverage": np.array([0.5, 0.4, 0.6])})
+    table = ScoreTable.of([SiteScores("a", scores, None)], groups)
+    egvs = table.column("egvs")
+    assert egvs.values.tolist() == [9.0]
+    assert egvs.left_out is not None and egvs.left_out.tolist() == [[9.1, 8.0, 10.0]]
+    coverage = table.column("coverage")
+    assert coverage.left_out is not None and coverage.left_out.tolist() == [[0.5, 0.4, 0.6]]
+    assert table.column("entropy_seen").left_out is None
+    assert math.isnan(table.column("entropy_seen").se[0])
 
 
 @pytest.mark.slow
@@ -228,7 +253,7 @@ def test_periods_disagree_without_standard_errors_too(
     split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told = Diagnostic("periods disagree", "scenario.toml: traffic.periods (night)", "b is the best site, not a", "")
-    monkeypatch.setattr(score_table, "period_disagreements", lambda *_: [told])
+    monkeypatch.setattr(score_table, "warn_period_disagreements", lambda *_: [told])
     for override in ("score.standard_error=true", "score.standard_error=false", "tpog.blocks=1"):
         record = egvs.run(egvs.load(split, [override]), tmp_path / override)
         assert told in collect_warnings([record.stages["score"].summary]), override
@@ -289,7 +314,7 @@ def test_the_world_frame_counts_where_a_period_alone_is_a_finished_file(
         ("length_s = 8", "length_s = 8.1", "period 'night': length_s = 8.1 is no whole number of 0.5 s"),
         ("length_s = 8", "length_s = 9", "tpog.blocks = 4 does not divide traffic.frames = 18 of the period 'night'"),
         ("weight = 2.5", "weight = 0", r"traffic\.periods\.0\.weight: 0; input should be greater than 0\n$"),
-        ("weight = 2.5", "weight = 2.123456789", "make a mix of .* frames; weights with fewer digits"),
+        ("weight = 2.5", "weight = 2.123456789", "make a mix of .* frames\\. Use weights with fewer digits"),
         ("begin_s = 12", "begin = 12", "begin"),
         ("blocks = 4", "blocks = 40000", "blocks = 40000 in each period are 80000 blocks: at most 65535"),
         ("length_s = 8", "length_s = 80", "frames"),
@@ -330,14 +355,14 @@ def test_a_key_that_acts_in_one_period_may_stand_for_all(split: Path) -> None:
 
 def test_a_period_that_is_not_there_is_refused(split: Path, tmp_path: Path) -> None:
     egvs.run(egvs.load(split), tmp_path)
-    with pytest.raises(InputError, match="no period 'noon'; one of day, night"):
+    with pytest.raises(InputError, match=r"there is no period 'noon'\. The periods are day, night"):
         read_tpog(tmp_path / "tpog.parquet", "noon")
     path = tmp_path / "tpog.parquet"
     table, about = parquet.read_artefact(path, "tpog")
     columns = {name: table.column(name).to_numpy() for name in table.column_names}
     for broken in ([], [{}], [about["periods"][0] | {"times": 0}], "day"):
         parquet.write_artefact(path, "tpog", columns, about | {"periods": broken})
-        with pytest.raises(InputError, match="its metadata says periods"):
+        with pytest.raises(InputError, match="invalid metadata: periods = "):
             read_tpog(path)
 
 

@@ -18,7 +18,7 @@ from egvs.scenario import loading
 from egvs.scoring.egvs import binary_entropy
 from egvs.scoring.scorer import ranks
 from egvs.stages import scan, score, statics, tpog, traffic
-from tests.stages import run_stage
+from tests.stage_runner import run_stage
 
 STAGES = (traffic, statics, tpog, scan, score)
 
@@ -179,12 +179,12 @@ def put(name, row, value):
 @pytest.mark.parametrize(
     ("artefact", "change", "message"),
     [
-        ("tpog", put("ix", 0, 10**6), "ix leaves the grid"),
-        ("tpog", put("iz", -1, -1), "iz leaves the grid"),
+        ("tpog", put("ix", 0, 10**6), "expected ix from 0 to "),
+        ("tpog", put("iz", -1, -1), "expected iz from 0 to "),
         ("tpog", put("count", 0, 41), "occupied in 41 of 40 frames"),
         ("tpog", put("count", 0, 2**32 - 1), "of 40 frames"),
-        ("tpog", lambda t, a: (t, a | {"schema": 999}), "schema version 999"),
-        ("tpog", lambda t, a: (t.drop_columns("count"), a), "column 'count' is missing"),
+        ("tpog", lambda t, a: (t, a | {"schema": 999}), "expected schema version 1, got 999"),
+        ("tpog", lambda t, a: (t.drop_columns("count"), a), "the column 'count' is missing"),
         ("scans", put("dx_m", 5, np.nan), "not finite"),
         ("scans", put("dz_m", 5, np.inf), "not finite"),
     ],

@@ -31,7 +31,7 @@ from egvs.runs.run import lock_run_folder
 from egvs.runs.store import Store
 from egvs.scoring.scorer import Scorer
 from egvs.stages.inputs import get_scene, open_folder
-from egvs.stages.site_scoring import empty_scans
+from egvs.stages.site_scans import empty_scans
 from egvs.studies import accuracy, measurement, score_errors, study_settings
 from egvs.studies.accuracy import AccuracyStudy
 from egvs.studies.measurement import SettingRunner

@@ -5,7 +5,7 @@ import pytest
 from egvs.artefacts import parquet
 from egvs.stages import traffic
 from egvs.traffic import sumo
-from tests.stages import run_stage
+from tests.stage_runner import run_stage
 from tests.traffic.helpers import SMALL, netgenerate, scenario
 
 

@@ -9,7 +9,7 @@ from egvs.core.errors import InputError, RunError
 from egvs.scenario.loading import load
 from egvs.stages import traffic
 from egvs.traffic import demand, network
-from tests.stages import run_stage
+from tests.stage_runner import run_stage
 from tests.traffic.helpers import car, drawn, scenario
 
 CONFIG = """<configuration>

@@ -11,7 +11,7 @@ from egvs.scenario.traffic_config import CountConfig
 from egvs.stages import traffic
 from egvs.traffic import demand, network
 from egvs.traffic.demand import RouteFinder
-from tests.stages import run_stage
+from tests.stage_runner import run_stage
 from tests.traffic.helpers import drawn, netgenerate, scenario
 
 LASTING = {"frames": 900, "warmup_s": 100.0, "frame_period_s": 1.0, "step_s": 0.5}

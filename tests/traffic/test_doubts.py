@@ -9,7 +9,7 @@ from egvs.stages import traffic
 from egvs.traffic import network, recording, sumo_folder, trajectories, vehicle_boxes
 from egvs.traffic.recording import Recording
 from egvs.traffic.trajectories import TrafficStatistics
-from tests.stages import run_stage
+from tests.stage_runner import run_stage
 from tests.traffic.helpers import SIZES, group_of, scenario
 
 ROI = Roi.around((0, 0, 2.5), (50, 100, 5))

@@ -13,7 +13,7 @@ from egvs.stages import traffic
 from egvs.traffic import recording, trajectories
 from egvs.traffic.vehicle_boxes import ExtraTraffic, VehicleSize
 from egvs.world import geolocation
-from tests.stages import run_stage
+from tests.stage_runner import run_stage
 from tests.traffic.helpers import SMALL, scenario
 
 TRAM = VehicleSize(30.0, 2.4, 3.5, "tram")

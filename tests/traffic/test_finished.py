@@ -15,9 +15,9 @@ from egvs.scenario.traffic_config import TrafficConfig
 from egvs.stages import traffic
 from egvs.stages.inputs import open_folder
 from egvs.studies.study_settings import counted_frames
-from tests.checks.conftest import net_xml
 from tests.conftest import fcd
-from tests.stages import inputs_of
+from tests.stage_runner import inputs_of
+from tests.stages.conftest import net_xml
 
 LORRY = '<vType id="lorry" vClass="truck"/>'
 CAR = '<vType id="car" length="4" width="1.7" height="1.4"/>'

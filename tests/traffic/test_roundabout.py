@@ -10,7 +10,7 @@ from egvs.artefacts import parquet
 from egvs.scenario.loading import load
 from egvs.stages import traffic
 from egvs.traffic import sumo
-from tests.stages import run_stage
+from tests.stage_runner import run_stage
 
 ROUNDABOUT = Path(__file__).resolve().parents[2] / "scenarios" / "roundabout"
 

@@ -22,7 +22,7 @@ from egvs.artefacts import parquet
 from egvs.core.errors import InputError, RunError
 from egvs.stages import traffic
 from egvs.traffic import demand, network, recording, sumo
-from tests.stages import inputs_of, run_stage
+from tests.stage_runner import inputs_of, run_stage
 from tests.traffic.helpers import SMALL, car, drawn, netgenerate, scenario
 
 

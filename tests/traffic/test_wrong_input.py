@@ -6,7 +6,7 @@ import pytest
 
 from egvs.core.errors import InputError
 from egvs.stages import traffic
-from tests.stages import run_stage
+from tests.stage_runner import run_stage
 from tests.traffic.helpers import car, scenario
 
 

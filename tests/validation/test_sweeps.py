@@ -57,5 +57,5 @@ def test_equal_detections_have_equal_bytes(tmp_path):
 def test_rejects_file_of_other_artefact(tmp_path):
     path = tmp_path / "points.parquet"
     DetectedBoxes((Detections.empty(),)).write(path, {"inputs": "x"})
-    with pytest.raises(InputError, match=r"points.parquet: column 'points' is missing"):
+    with pytest.raises(InputError, match=r"points.parquet: the column 'points' is missing"):
         PointCounts.read(path)

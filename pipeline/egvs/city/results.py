@@ -21,7 +21,8 @@ import pyarrow as pa
 
 from egvs.artefacts import parquet
 from egvs.artefacts.planned_sensor import PlannedSensor, plan_columns
-from egvs.artefacts.run_folder import RunFolder, RunRecord
+from egvs.artefacts.run_folder import RunFolder
+from egvs.artefacts.run_record import RunRecord
 from egvs.city.model import City, CityJunction
 from egvs.core import files
 from egvs.core.errors import InputError

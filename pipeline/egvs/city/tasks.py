@@ -334,7 +334,7 @@ def read_stored_scores(parts: int) -> Callable[[SiteScoring], Iterator[ScoredSit
     """
 
     def scored_sites(scoring: SiteScoring) -> Iterator[ScoredSite]:
-        score_key = stages.stage_key("score", scoring.work).key
+        score_key = stages.stage_key("score", scoring.context).key
         for part in split_sites(len(scoring.names), parts):
             names = scoring.names[part]
             if names:
@@ -437,6 +437,6 @@ def _run_junction(job: Job, settings: RunSettings, help_from: dict[str, dict[str
 
     start_s = perf_counter()
     with settings.applied():
-        record = run.run(job.scenario(), job.out, jobs=1, help_from=help_from, wait_s=_LOCK_WAIT_S, listener=listener)
+        record = run.run(job.scenario(), job.out, jobs=1, options=help_from, wait_s=_LOCK_WAIT_S, listener=listener)
         n_sites = record.stages["score"].summary["sites"]
         return JobResult(job.junction, n_sites, perf_counter() - start_s, tuple(stages_run))

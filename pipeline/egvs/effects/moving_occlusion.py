@@ -44,8 +44,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.artefacts import parquet
+from egvs.artefacts.frame_boxes import FrameBoxes, read_boxes
 from egvs.artefacts.tpog import Tpog
-from egvs.artefacts.traffic_frames import FrameBoxes, read_boxes, spaced_frames
+from egvs.artefacts.traffic_frames import spaced_frames
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.effects.base import TransmitScore

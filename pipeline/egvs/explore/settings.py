@@ -19,7 +19,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from egvs.artefacts.run_folder import RunFolder, RunRecord
+from egvs.artefacts.run_folder import RunFolder
+from egvs.artefacts.run_record import RunRecord
 from egvs.core.errors import InputError
 from egvs.core.runtime import ProgressCallback, no_progress
 from egvs.effects import registry

@@ -40,7 +40,7 @@ from egvs.report.figures import column_entropy
 from egvs.report.maps import Backdrop, SiteViewFigure
 from egvs.report.ranking import RankedSite, Ranking
 from egvs.report.svg_figures import Bar, bar_chart, extent
-from egvs.stages.site_scoring import empty_scans
+from egvs.stages.site_scans import empty_scans
 
 FONTS = "DejaVu Sans, Arial, Helvetica, sans-serif"
 

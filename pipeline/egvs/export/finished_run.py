@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.artefacts import parquet
-from egvs.artefacts.run_folder import RunFolder, RunRecord
+from egvs.artefacts.run_folder import RunFolder
+from egvs.artefacts.run_record import RunRecord
 from egvs.artefacts.tpog import Tpog
 from egvs.core.errors import InputError
 from egvs.formats import georeference

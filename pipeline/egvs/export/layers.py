@@ -39,7 +39,6 @@ from egvs.core.errors import InputError
 from egvs.export.finished_run import FinishedRun
 from egvs.report import colours
 from egvs.report.basemap import network_file, union_of_triangles
-from egvs.stages.base import static_world
 from egvs.traffic import network
 
 JUNCTIONS, SITES, PLAN, MISSED, MISSED_LANES, FOOTPRINTS, REGION = NAMES = (
@@ -183,7 +182,7 @@ def _footprint_layers(run: FinishedRun, notes: list[str]) -> Iterator[Layer]:
 
     del notes
     run.artefact(RunFolder.statics.name)
-    world = static_world(run.work)
+    world = run.work.world
     if not len(world.faces):
         return
     low, high = world.bounds_xy_m

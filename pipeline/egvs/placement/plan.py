@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from egvs.artefacts import parquet, run_folder
+from egvs.artefacts import checksums, parquet
 from egvs.artefacts.planned_sensor import PlannedSensor, plan_columns
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files
@@ -538,7 +538,7 @@ def write_placement(
         "sites": [json.dumps(list(names), ensure_ascii=False) for names in placed.curve_sites],
     }
     parquet.write_artefact(paths.curve, "curve", curve, metadata)
-    run_folder.write_checksums(paths.placement_checksums, (paths.placement, paths.curve))
+    checksums.write_checksums(paths.placement_checksums, (paths.placement, paths.curve))
     return paths.placement, paths.curve
 
 

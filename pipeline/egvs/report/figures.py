@@ -43,7 +43,7 @@ from egvs.scoring.egvs import EntropyField
 from egvs.scoring.scorer import Scorer
 from egvs.scoring.visibility import Beams
 from egvs.stages.base import StageContext
-from egvs.stages.site_scoring import empty_scans
+from egvs.stages.site_scans import empty_scans
 
 
 @dataclass(frozen=True)

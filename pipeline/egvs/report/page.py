@@ -17,14 +17,8 @@ from typing import Any
 
 from egvs._version import __version__
 from egvs.artefacts.readers import DISTINCT_PROBABILITY, MIN_VEHICLES, PeriodRanking
-from egvs.artefacts.run_folder import (
-    ACCURACY_FILES,
-    PLACEMENT_FILES,
-    VALIDATION_FILES,
-    RunFolder,
-    RunRecord,
-    StageRecord,
-)
+from egvs.artefacts.run_folder import ACCURACY_FILES, PLACEMENT_FILES, VALIDATION_FILES, RunFolder
+from egvs.artefacts.run_record import RunRecord, StageRecord
 from egvs.artefacts.tpog import Tpog, read_tpog
 from egvs.core import files
 from egvs.core.errors import WARNINGS_KEY, collect_warnings

@@ -24,7 +24,8 @@ from pathlib import Path
 from typing import Any
 
 from egvs.artefacts.readers import read_accuracy, read_placement, read_validation
-from egvs.artefacts.run_folder import ACCURACY_FILES, PLACEMENT_FILES, VALIDATION_FILES, StageRecord
+from egvs.artefacts.run_folder import ACCURACY_FILES, PLACEMENT_FILES, VALIDATION_FILES
+from egvs.artefacts.run_record import StageRecord
 from egvs.artefacts.tpog import Tpog
 from egvs.core.errors import Diagnostic, collect_warnings
 from egvs.report import maps, svg_figures

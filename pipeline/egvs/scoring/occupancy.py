@@ -22,7 +22,7 @@ there).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.artefacts import parquet
-from egvs.artefacts.traffic_frames import FrameBoxes
+from egvs.artefacts.frame_boxes import FrameBoxes
 from egvs.core.errors import Diagnostic
 from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.kernels import occupancy
@@ -39,8 +39,7 @@ from egvs.world import clearances
 from egvs.world.mesh import World
 
 if TYPE_CHECKING:
-    from egvs.artefacts.tpog import Tpog
-    from egvs.sensors.sites import Site
+    pass
 
 MEMORY_WINDOW = 5.0
 """Sokal's c: the window in autocorrelation times."""
@@ -262,26 +261,3 @@ def _solid_at(world: World, at_m: FloatArray, within_m: float) -> str:
         if kind != "ground":
             return f"{name} ({kind})"
     return ""
-
-
-def warn_sites_in_traffic(sites: Iterable[Site], tpog: Tpog) -> Iterator[Diagnostic]:
-    """Warn about each site at a position where vehicles drive, unless it is higher than the clearance."""
-    grid = tpog.grid
-    for site in sites:
-        at_m = np.array(site.pose.position_m)
-        ix, iy, _ = np.floor((at_m - grid.origin_m) / grid.voxel_m).astype(np.int64)
-        if not (0 <= ix < grid.shape[0] and 0 <= iy < grid.shape[1]):
-            continue
-        column = tpog.counts[ix, iy]
-        layers = np.flatnonzero(column)
-        if not len(layers):
-            continue
-        height_m = at_m[2] - (grid.origin_m[2] + layers[0] * grid.voxel_m)
-        if height_m <= clearances.CLEARANCE_M:
-            share = column.max() / tpog.frames
-            yield Diagnostic(
-                "sites on the road",
-                f"site {site.name}",
-                f"vehicles drive through its position ({at_m[0]:g}, {at_m[1]:g}) in {share:.1%} of the frames",
-                f"Move it beside the road, or more than {clearances.CLEARANCE_M:g} m above it.",
-            )

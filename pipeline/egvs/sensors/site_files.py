@@ -11,6 +11,7 @@ name is nearly one of the program's, which the file lacks, is rejected as misspe
 from __future__ import annotations
 
 import csv
+import io
 import json
 import math
 import re
@@ -22,6 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from egvs.core import files
 from egvs.core.errors import InputError, find_misspelling
 from egvs.core.grid import FloatArray
 from egvs.core.reading import read_json
@@ -69,7 +71,10 @@ def read_csv(path: Path, world: Georeference) -> Iterator[SiteRow]:
     """Yield the rows of a CSV; InputError with file and row for a malformed one."""
     located = []
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        with (
+            files.open_input(path) as content,
+            io.TextIOWrapper(content, encoding="utf-8-sig", newline="") as file,
+        ):
             reader = csv.DictReader(file, skipinitialspace=True)
             _check_header(path, list(reader.fieldnames or ()))
             for values in reader:

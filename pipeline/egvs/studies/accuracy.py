@@ -16,7 +16,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from egvs.artefacts import parquet, run_folder
+from egvs.artefacts import checksums, parquet
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files
 from egvs.core.errors import EgvsError, InputError
@@ -180,7 +180,7 @@ class _StudyRun:
         times = times if REFERENCE in scores else 1
         _write_study(written[0], scenario, rows, own, times, tolerance)
         pareto_figure.draw_figure(rows, tolerance, scenario.name, written[1])
-        run_folder.write_checksums(RunFolder(out).accuracy_checksums, written)
+        checksums.write_checksums(RunFolder(out).accuracy_checksums, written)
         neighbours = scores.get(REFERENCE, own).neighbours
         empty = not any(own.shares)
         return AccuracyStudy(rows, self.skipped, tolerance, best, times, neighbours, written, None, repeated, empty)

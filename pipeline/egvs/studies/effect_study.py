@@ -31,7 +31,8 @@ import numpy as np
 
 from egvs.artefacts import parquet
 from egvs.artefacts.readers import read_accuracy, read_scores
-from egvs.artefacts.run_folder import RunFolder, RunRecord
+from egvs.artefacts.run_folder import RunFolder
+from egvs.artefacts.run_record import RunRecord
 from egvs.artefacts.tpog import Tpog, read_tpog
 from egvs.core import files, plugins
 from egvs.core.errors import InputError, MissingBackendError, format_problem

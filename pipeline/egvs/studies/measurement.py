@@ -38,7 +38,7 @@ from egvs.runs.store import Store
 from egvs.scenario.loading import load
 from egvs.scenario.model import Scenario, SiteGrid
 from egvs.scoring.egvs import EntropyField
-from egvs.scoring.score_table import ScoreColumn
+from egvs.scoring.score_table import MIX, ScoreColumn, ScoreTable, SiteScores
 from egvs.scoring.scorer import Scorer
 from egvs.scoring.standard_errors import BlockJackknife, ScoreUncertainty, rank_order
 from egvs.scoring.target_scores import TARGET_SCORES
@@ -46,7 +46,8 @@ from egvs.sensors import sites
 from egvs.stages.base import StageContext
 from egvs.stages.inputs import get_scene, open_folder
 from egvs.stages.scene_inputs import site_digests
-from egvs.stages.site_scoring import ScoredSite, TargetScorer, empty_scans
+from egvs.stages.site_scans import empty_scans
+from egvs.stages.site_scoring import ScoredSite, TargetScorer
 from egvs.studies.study_settings import Setting, counted_frames
 
 STUDY_FOLDER = "accuracy"
@@ -346,16 +347,17 @@ def _score_column(work: StageContext, tpog: Tpog, leave_out: BlockJackknife, sco
     """The sites by the score that ranks, with groups of traffic left out, whatever the scenario says of errors."""
     wanted = work.scenario.score
     if scored and wanted.standard_error:
-        return ScoreColumn.of(wanted.rank_by, [(site.score, site.targets) for site in scored], leave_out.groups)
+        scores = [SiteScores(site.site.name, site.score, site.targets) for site in scored]
+        return ScoreTable.of(scores, {MIX: leave_out.groups}).column(wanted.rank_by)
     with_errors = {"score": wanted.model_copy(update={"standard_error": True})}
     again = open_folder(work.scenario.model_copy(update=with_errors), work.folder.path)
     scorer = Scorer(get_scene(again), tpog, again.folder.trajectories, leave_out)
     targets = TargetScorer(again, tpog.grid) if wanted.rank_by in TARGET_SCORES else None
-    found = [
-        (scorer.score(scan.beams), targets.scores(targets.see(scan.beams)) if targets is not None else None)
-        for scan in empty_scans(again)
-    ]
-    return ScoreColumn.of(wanted.rank_by, found, leave_out.groups)
+    scores = []
+    for scan in empty_scans(again):
+        visible = targets.scores(targets.visible(scan.beams)) if targets is not None else None
+        scores.append(SiteScores(scan.site.name, scorer.score(scan.beams), visible))
+    return ScoreTable.of(scores, {MIX: leave_out.groups}).column(wanted.rank_by)
 
 
 def _neighbours(estimate: ScoreUncertainty, names: list[str], frames: int) -> list[tuple[str, str, float, float]]:

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from egvs.artefacts import parquet
-from egvs.artefacts.run_folder import RunFolder, RunRecord
+from egvs.artefacts.run_folder import RunFolder
+from egvs.artefacts.run_record import RunRecord
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.studies.score_errors import best_sites, rank_agreement, regret

@@ -34,7 +34,7 @@ import numpy as np
 import pyarrow.compute as pc
 from pydantic import Field, ValidationError
 
-from egvs.artefacts.traffic_frames import MAX_BOX_M, MIN_BOX_M
+from egvs.artefacts.frame_boxes import MAX_BOX_M, MIN_BOX_M
 from egvs.core import reading
 from egvs.core.errors import InputError
 from egvs.core.files import temporary_folder

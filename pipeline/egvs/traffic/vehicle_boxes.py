@@ -31,7 +31,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from egvs.artefacts.traffic_frames import MAX_BOX_M, MIN_BOX_M
+from egvs.artefacts.frame_boxes import MAX_BOX_M, MIN_BOX_M
 from egvs.core.errors import InputError
 from egvs.traffic.fcd import FrameGroup
 

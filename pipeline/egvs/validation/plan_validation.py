@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from egvs.artefacts import parquet, run_folder
+from egvs.artefacts import checksums, parquet
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files
 from egvs.core.errors import Diagnostic, InputError
@@ -247,7 +247,7 @@ def read_fused_plan(folder: Path, scenario: Scenario) -> FusedPlan:
             "no such file: the folder contains no plan",
             f"Run egvs place {scenario.name} --count 3, or name the folder of another run with --plan-from.",
         )
-    run_folder.verify_checksums(path.with_name(RunFolder.placement_checksums.name), "Run egvs place again.")
+    checksums.verify_checksums(path.with_name(RunFolder.placement_checksums.name), "Run egvs place again.")
     table, metadata = parquet.read_artefact(path, "placement")
     _check_plan_scenario(path, metadata.get("scenario"), scenario)
 

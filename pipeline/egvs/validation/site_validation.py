@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from egvs.artefacts import parquet, run_folder
+from egvs.artefacts import checksums, parquet
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files
 from egvs.core.errors import InputError
@@ -206,7 +206,7 @@ def _write_artefacts(
     validation.surrogates.write(folder / surrogates.SURROGATES_TABLE, scenario)
     _write_correlation(folder / CORRELATION_TABLE, validation, metadata)
     results.write_figure(folder / results.FIGURE_FILE, scenario, validation)
-    run_folder.write_checksums(RunFolder(folder).validation_checksums, sorted(folder.iterdir()))
+    checksums.write_checksums(RunFolder(folder).validation_checksums, sorted(folder.iterdir()))
     for path in sorted(folder.iterdir()):
         path.replace(out / path.name)
 

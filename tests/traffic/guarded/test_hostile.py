@@ -4,7 +4,7 @@ import pytest
 
 from egvs.core.errors import InputError
 from egvs.stages import traffic
-from tests.stages import run_stage
+from tests.stage_runner import run_stage
 from tests.traffic.guarded.lanes import KEPT, SHORT, configured, first_lane
 from tests.traffic.helpers import car, scenario
 

@@ -5,7 +5,7 @@ import pytest
 from egvs.core.errors import RunError
 from egvs.stages import traffic
 from egvs.traffic import sumo
-from tests.stages import run_stage
+from tests.stage_runner import run_stage
 from tests.traffic.guarded.lanes import configured
 from tests.traffic.helpers import SMALL, scenario
 

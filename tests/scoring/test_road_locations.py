@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from egvs.scoring.road_locations import RoadLocation, RoadLocations, compass, describe_lane, describe_turn, disambiguate
-from tests.scoring.blindspots.roads import GRID, NETWORK, read
+from tests.scoring.roads import GRID, NETWORK, read
 
 
 def words_of_lanes(places: RoadLocations) -> dict[tuple[float, ...], list[str]]:

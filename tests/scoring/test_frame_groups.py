@@ -12,7 +12,7 @@ from egvs.artefacts.tpog import PeriodBlocks
 from egvs.scoring.standard_errors import ScoreUncertainty
 from egvs.scoring.targets import FrameGroups, TargetRecord, weighted_mean
 from tests.conftest import write_mini
-from tests.scoring.targets.scenes import GRID, frame
+from tests.scoring.target_scenes import GRID, frame
 
 
 def record_of(vehicles, numbers=None) -> TargetRecord:

@@ -18,7 +18,7 @@ from egvs.scoring.target_scores import TARGET_SCORES, saturating_gain
 from egvs.scoring.targets import TargetRecord, target_weights, visible_targets, weighted_people
 from egvs.scoring.visibility import Beams
 from egvs.sensors.scanner import Scanner
-from tests.scoring.targets.scenes import GRID, beams_to, frame
+from tests.scoring.target_scenes import GRID, beams_to, frame
 
 SQUARE = [[110.0, 205.0], [120.0, 205.0], [120.0, 215.0], [110.0, 215.0]]
 SCORES = 'score.others=["expected_detections", "seen_well", "points_on_target"]'
@@ -140,7 +140,10 @@ def test_where_no_vehicle_counts_none_can_rank(mini: Path, tmp_path: Path, run_e
     none = ("--set", "score.weights.kinds.passenger=0", "--set", "score.rank_by=seen_well")
     code, _, told = run_egvs("run", mini, "--out", tmp_path, *none)
     assert code == 2
-    assert "score.rank_by = 'seen_well': no vehicle that counts by [score.weights] has its centre in the region" in told
+    assert (
+        "score.rank_by = 'seen_well': no vehicle with a weight above 0 in [score.weights] has its centre in the region"
+        in told
+    )
 
 
 @pytest.mark.parametrize(

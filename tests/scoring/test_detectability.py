@@ -10,8 +10,8 @@ import pytest
 
 from egvs.scoring import target_scores
 from egvs.scoring.target_scores import DETECTORS, FEATURES, MONOTONICITY, DetectabilityModel
-from tests.scoring.targets.scenes import beams_to, frame, seen
-from tests.scoring.targets.test_seen import AT, car, fan
+from tests.scoring.target_scenes import beams_to, frame, seen
+from tests.scoring.test_visible_targets import AT, car, fan
 
 DATA = json.loads(target_scores.MODEL_FILE.read_text(encoding="utf-8"))
 HIGH = {"log_points": 8.0, "log_points_on_sides": 8.0, "length_share": 1.0, "width_share": 1.0, "hole_m": 6.0,

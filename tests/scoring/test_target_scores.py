@@ -10,7 +10,7 @@ import pytest
 
 from egvs.scoring.target_scores import log_points, points_on_target, saturating_gain, seen_well
 from egvs.scoring.targets import SEEN_WELL_POINTS, TargetRecord, weighted_mean
-from tests.scoring.targets.scenes import GRID, beams_to, frame, seen
+from tests.scoring.target_scenes import GRID, beams_to, frame, seen
 
 
 def with_points(*points: float):

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from egvs.artefacts import parquet
 from egvs.core.errors import InputError
 from egvs.scoring.targets import REPLAYED_FRAMES, TargetRecord
-from tests.scoring.targets.scenes import GRID, axes_of, frame, random_boxes
+from tests.scoring.target_scenes import GRID, axes_of, frame, random_boxes
 
 CAR = (4.0, 2.0, 1.5)
 

@@ -15,7 +15,7 @@ from egvs.scoring.visibility import Beams
 from egvs.sensors import sensor
 from egvs.sensors.sites import Pose
 from tests.conftest import write_mini
-from tests.scoring.targets.scenes import COLUMNS, GRID, SENSOR, beams_to, frame, random_boxes, seen, seen_slowly
+from tests.scoring.target_scenes import COLUMNS, GRID, SENSOR, beams_to, frame, random_boxes, seen, seen_slowly
 
 AT = (101.0, 210.0, 1.0)
 

@@ -15,9 +15,9 @@ from egvs.stages import check, scene_checks
 from egvs.stages.inputs import CheckInputs
 from egvs.traffic import network, sumo, sumo_folder
 from egvs.world.carriageway import Carriageway
-from tests.checks.conftest import LANES, net_xml
 from tests.conftest import collection, feature
-from tests.stages import inputs_of
+from tests.stage_runner import inputs_of
+from tests.stages.conftest import LANES, net_xml
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "scenarios"
 
@@ -63,8 +63,8 @@ def test_a_site_is_in_a_lane_when_it_is_deeper_in_it_than_a_quarter_metre(street
     sites(street, "in,10,2.94,3", "kerb,10,2.96,3", "middle,12,0,3", "walk,10,-4.2,3", "bicycles,10,4.2,3", "e,9,-1,3")
     assert found(street) == {
         "sites on lanes": [
-            "[sites.csv: site in: (10, 2.94, 3) stands in lane west_1]",
-            "[sites.csv: site e: (9, -1, 3) stands in lane east_1]",
+            "[sites.csv: site in: (10, 2.94, 3) is in lane west_1]",
+            "[sites.csv: site e: (9, -1, 3) is in lane east_1]",
         ]
     }
 
@@ -72,7 +72,7 @@ def test_a_site_is_in_a_lane_when_it_is_deeper_in_it_than_a_quarter_metre(street
 def test_a_sensor_on_a_gantry_stands_in_nobodys_way(street: Path) -> None:
     sites(street, "low,10,1.6,4.5", "high,10,1.6,4.51")
     assert [line for lines in found(street).values() for line in lines] == [
-        "[sites.csv: site low: (10, 1.6, 4.5) stands in lane west_1]"
+        "[sites.csv: site low: (10, 1.6, 4.5) is in lane west_1]"
     ]
 
 
@@ -86,8 +86,8 @@ def test_a_site_amid_a_junction_is_told_unless_it_hangs_over_the_road() -> None:
     candidates = tuple(Site(name, Pose(*place), "VLP-32C") for name, place in places.items())
     subject = CheckInputs(egvs.load(SCENARIOS / "hill"), carriageway=roads, sites=candidates)
     assert [str(finding) for finding in scene_checks.warn_sites_on_lanes(subject)] == [
-        f"sites.csv: site low: (0, -2, {road_m + 2:g}) stands amid a junction; "
-        "a place beside the road, or more than 4.5 m above it"
+        f"sites.csv: site low: (0, -2, {road_m + 2:g}) is within a junction. "
+        "Move it beside the road, or more than 4.5 m above it."
     ]
 
 
@@ -98,14 +98,16 @@ def test_the_height_over_the_road_counts(street: Path) -> None:
     (street / "net.net.xml").write_text(net_xml(lifted))
     sites(street, "low,10,1.6,8.4", "high,10,1.6,8.6")
     told = found(street, "roi.center_m=[20,0,6.5]")
-    assert [line.partition(" stands")[0] for line in told["sites on lanes"]] == ["[sites.csv: site low: (10, 1.6, 8.4)"]
+    assert [line.partition(" is in lane")[0] for line in told["sites on lanes"]] == [
+        "[sites.csv: site low: (10, 1.6, 8.4)"
+    ]
 
 
 def test_many_sites_in_lanes_share_a_line(street: Path) -> None:
     sites(street, *(f"s{i:02d},{i},1.6,3" for i in range(1, 13)))
     lines = found(street)["sites on lanes"]
     assert len(lines) == 9
-    assert lines[-1] == "[sites.csv: 4 more of 12 stand in lanes or junctions: s09, s10, s11, s12]"
+    assert lines[-1] == "[sites.csv: 4 more of 12 are in lanes or junctions: s09, s10, s11, s12]"
 
 
 def rule(folder: Path, grid: str) -> None:
@@ -120,8 +122,8 @@ def test_a_rule_drops_places_in_lanes_and_solids_and_says_how_many(street: Path)
     rule(street, "{ low_m=[6,-6], high_m=[26,9], spacing_m=5, heights_m=[3.0, 7.0] }")
     checked = check.check_scenario(egvs.load(street))
     assert [str(finding) for finding in checked.findings] == [
-        "sites.grid: 11 of 40 candidates are dropped, since no pole can stand there (10 in a lane, 1 in a solid);"
-        " name a sensor on a gantry or an island in a file of sites"
+        "sites.grid: 11 of 40 candidates are dropped, since no pole can stand there (10 in a lane, 1 in a solid). "
+        "Name a sensor on a gantry or an island in a file of sites."
     ]
     scene = egvs.build_scene(egvs.load(street))
     assert (len(scene.sites), checked.sites) == (29, 29)
@@ -186,7 +188,7 @@ def test_all_that_is_wrong_with_poses_is_told_at_once(street: Path) -> None:
 def test_a_shelter_in_mid_road_is_told_with_its_place(street: Path) -> None:
     """2 x 2 m of two lanes that are 2.7 m wide without their edges and 120 m long: 4 of 2 * 2.7 * 120 m2."""
     statics(street, box((20, 0.5), (22, 2.5), "shelter", base_m=2.4, height_m=2.6))
-    share, lanes = 4 / (2 * 2.7 * 120), "of the lanes in and round the region"
+    share, lanes = 4 / (2 * 2.7 * 120), "of the lanes in and around the region"
     assert found(street) == {
         "solids over lanes": [f"[statics: a solid covers {share:.1%} {lanes}: shelter (kiosk) 4 m2 at (21, 2)]"]
     }
@@ -225,7 +227,7 @@ def test_buildings_of_another_place_are_told(street: Path) -> None:
     statics(street, box((1000, 2000), (1010, 2010)), box((1100, 2000), (1110, 2010)))
     assert found(street) == {
         "statics far away": [
-            "[statics: the nearest solid is 2,209 m from the region of interest; all lie round (1055, 2005)]"
+            "[statics: the nearest solid is 2,209 m from the region of interest; all solids are around (1055, 2005)]"
         ]
     }
 
@@ -239,15 +241,17 @@ def test_a_region_without_lanes(street: Path) -> None:
     told = found(street, "roi.center_m=[20,200,2.5]")
     assert told == {
         "region": [
-            "scenario.toml: roi: no lane leads through it: the nearest is 187.1 m away, "
-            "lanes reach from (-40, -3) to (80, 3)"
+            "scenario.toml: roi: no lane passes through the region: the nearest is 187.1 m away, "
+            "lanes extend from (-40, -3) to (80, 3)"
         ]
     }
 
 
 def test_a_region_above_the_road(street: Path) -> None:
     told = found(street, "roi.center_m=[20,0,22.5]")
-    assert told["region"] == ["scenario.toml: roi: reaches from z = 20 to 25 m, but the road there lies at z = 0.0 m"]
+    assert told["region"] == [
+        "scenario.toml: roi: the region extends from z = 20 to 25 m, but the road is at z = 0.0 m"
+    ]
 
 
 # ---- all at once
@@ -327,9 +331,7 @@ def test_a_table_with_beams_twice_is_told_with_the_beams(street: Path) -> None:
     (street / "beams.csv").write_text("elevation_deg,azimuth_deg\n-5,0\n-5,90\n-5,360\n-9,0\n")
     told = found(street, 'sensors.own={beams="beams.csv",range_m=90}', 'sites.sensor="own"', 'sites.aim="roi"')
     assert told == {
-        "repeated beams": [
-            "[beams.csv: 1 of 4 beams point where an earlier one does (beam 2 as beam 0) and count again]"
-        ]
+        "repeated beams": ["[beams.csv: 1 of 4 beams repeat an earlier direction (beam 2 as beam 0) and count twice]"]
     }
 
 
@@ -378,7 +380,7 @@ def test_warnings_are_told_beside_the_errors_that_stop_a_run(street: Path, run_e
     code, _, err = run_egvs("run", street, "--set", "traffic.edge_weights={north=2}")
     assert code == 2
     warning, error = err.splitlines()
-    assert warning.startswith("warning: sites.csv: site amid: (10, 1.6, 3) stands in lane west_1")
+    assert warning.startswith("warning: sites.csv: site amid: (10, 1.6, 3) is in lane west_1")
     assert error.startswith("egvs: ") and "the network has no edge 'north'" in error
 
 

@@ -16,12 +16,13 @@ from egvs.scenario import loading, model
 from egvs.scoring.targets import TargetRecord, visible_targets
 from egvs.stages import scan, score, statics
 from egvs.stages.inputs import open_folder
-from egvs.stages.site_scoring import empty_scans, vehicle_spots
+from egvs.stages.site_scans import empty_scans
+from egvs.stages.site_scoring import vehicle_spots
 from tests.conftest import SITES, write_mini
-from tests.scoring.blindspots.roads import GRID, NETWORK
-from tests.scoring.blindspots.test_spots import car
-from tests.scoring.targets.scenes import frame
-from tests.stages import inputs_of, run_stage
+from tests.scoring.roads import GRID, NETWORK
+from tests.scoring.target_scenes import frame
+from tests.scoring.test_blindspots import car
+from tests.stage_runner import inputs_of, run_stage
 
 NET = "made.net.xml"
 
@@ -218,9 +219,9 @@ def outside(table: pa.Table, groups: int) -> tuple[pa.Table, int]:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (outside, "a square of site pole_a lies outside the region"),
-        (lambda table, rows: (table, rows * 2), "1 row groups for 2 sites; one a site"),
-        (lambda table, rows: (table.drop_columns(["words"]), rows), "column 'words' is missing"),
+        (outside, "a cell of site pole_a lies outside the region"),
+        (lambda table, rows: (table, rows * 2), "expected 2 row groups for 2 sites, got 1"),
+        (lambda table, rows: (table.drop_columns(["words"]), rows), "the column 'words' is missing"),
     ],
 )
 def test_a_damaged_file_is_named(  # type: ignore[no-untyped-def]
@@ -239,7 +240,7 @@ def test_squares_that_metadata_does_not_describe_are_refused(
     about = parquet.read_metadata(on_roads[1] / "blindspots.parquet", "blindspots") | {"cells": cells}
     columns = pq.read_table(on_roads[1] / "blindspots.parquet").to_pydict()
     parquet.write_artefact(tmp_path / "blindspots.parquet", "blindspots", columns, about)
-    with pytest.raises(InputError, match="its metadata says cells = "):
+    with pytest.raises(InputError, match="invalid metadata: cells = "):
         list(readers.read_blindspots(tmp_path / "blindspots.parquet"))
 
 

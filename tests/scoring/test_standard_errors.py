@@ -26,7 +26,7 @@ from egvs.scoring.egvs import EntropyField, binary_entropy
 from egvs.scoring.scorer import Scorer
 from egvs.scoring.standard_errors import MIN_GROUPS, BlockGroups, BlockJackknife, ScoreUncertainty, group_sizes
 from egvs.stages.inputs import get_scene, open_folder
-from egvs.stages.site_scoring import empty_scans
+from egvs.stages.site_scans import empty_scans
 
 GRID = Grid.from_json({"origin_m": [0.0, 0.0, 0.0], "voxel_m": 1.0, "shape": [6, 5, 2]})
 CELLS = np.arange(60)
@@ -246,7 +246,7 @@ def test_a_block_that_does_not_exist_is_refused(mini: Path, tmp_path: Path) -> N
     table, about = parquet.read_artefact(path, "tpog")
     columns = {name: table.column(name).to_numpy() for name in table.column_names}
     parquet.write_artefact(path, "tpog", columns | {"block": np.full(len(table), 4, dtype=np.uint16)}, about)
-    with pytest.raises(InputError, match="block 4 of 4; 0 to 3"):
+    with pytest.raises(InputError, match="expected blocks 0 to 3, got 4"):
         BlockJackknife.of(path, egvs.read_tpog(path))
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from egvs.scoring import occupancy
-from tests.checks.conftest import net_xml
-from tests.checks.test_checking import found
+from tests.stages.conftest import net_xml
+from tests.stages.test_check import found
 
 DEMAND = '<routes><vType id="a"/><vehicle id="v" depart="0"><route edges="east"/></vehicle></routes>'
 
@@ -140,13 +140,13 @@ MAPPED = net_xml().replace('projParameter="!"', f'projParameter="{UTM}"').replac
         (
             net_xml(),
             moved(net_xml(), 3000),
-            "no lane of its network leads through the region: the nearest is 2,920.0 m away",
+            "no lane of its network passes through the region: the nearest is 2,920.0 m away",
         ),
         (
             MAPPED,
             MAPPED.replace("-500000", "-500009"),
-            "its network has another zero or projection than that of the first period"
-            " (netOffset [-500009.0, -5600000.0], not [-500000.0, -5600000.0])",
+            "its network has another origin or projection than that of the first period"
+            " (netOffset [-500009.0, -5600000.0] instead of [-500000.0, -5600000.0])",
         ),
         (net_xml(), net_xml().replace("80,", "90,"), None),
         (net_xml(), net_xml().replace("0.00,0.00", "9.00,0.00"), None),  # made without a map: zeros say nothing

@@ -16,8 +16,8 @@ from egvs.core.grid import Grid
 from egvs.scoring.blindspots import VehicleSpots, cells_of
 from egvs.scoring.road_locations import RoadLocations
 from egvs.scoring.targets import TargetRecord
-from tests.scoring.blindspots.roads import GRID, read
-from tests.scoring.targets.scenes import frame
+from tests.scoring.roads import GRID, read
+from tests.scoring.target_scenes import frame
 
 CAR = (4.0, 1.8, 1.5)
 

@@ -9,7 +9,7 @@ import pytest
 
 import egvs
 from egvs.scoring import occupancy
-from tests.checks.test_checking import box, sites, statics
+from tests.stages.test_check import box, sites, statics
 
 
 def warnings(folder: Path, out: Path, *settings: str) -> dict[str, list[str]]:
@@ -42,7 +42,8 @@ def test_a_region_that_no_vehicle_enters(mini: Path, tmp_path: Path) -> None:
             "roi: no vehicle ever enters the region, all are between (-1, -2) and (41, 3): the sites cannot be ranked"
         ],
         "score": [
-            "scenario.toml: roi: egvs is 0 at every site, so none is best: no traffic comes and goes in the region"
+            "scenario.toml: roi: egvs is 0 at every site, so there is no ranking:"
+            " the traffic in the region never changes"
         ],
     }
 
