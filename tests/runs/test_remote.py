@@ -97,7 +97,7 @@ def test_a_place_that_cannot_be_reached_is_told_once(
     monkeypatch.setenv("EGVS_STORE", url)
     run.run(egvs.load(mini), tmp_path / "out")
     told = [line for line in capsys.readouterr().err.splitlines() if url in line]
-    assert told and all("the run goes on without it" in line for line in told)
+    assert told and all("The run continues without it" in line for line in told)
     with pytest.raises(InputError, match="cannot be written"):
         RemoteStore(url).check()
 

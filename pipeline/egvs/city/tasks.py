@@ -303,7 +303,7 @@ class _ArrayPool:
         return {
             "scores": self.many(targets.scores),
             "by_period": [dict(period) for period in targets.by_period],
-            "missed": None if missed is None else [self.add(a) for a in (missed.seen, missed.share, missed.se)],
+            "missed": None if missed is None else [self.add(a) for a in (missed.visible, missed.share, missed.se)],
         }
 
 
