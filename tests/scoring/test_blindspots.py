@@ -244,7 +244,7 @@ def test_crossings_against_shapely(tmp_path: Path) -> None:
     assert by_place(spots, spots.vehicle_frames)["crossing", ":j_c0_0"] == on
 
 
-def test_nobody(tmp_path: Path) -> None:
+def test_no_vehicles(tmp_path: Path) -> None:
     record = TargetRecord.of([frame([])], GRID)
     spots = spots_of(record, RoadLocations.of(read(tmp_path), GRID.roi))
     assert len(spots) == 0 and spots.visibility(np.empty(0)).share.shape == (0,)
