@@ -18,7 +18,7 @@ def sums(tmp_path: Path) -> Path:
     return tmp_path / "study.sha256"
 
 
-def test_what_is_as_it_was_and_what_is_gone_are_right(sums: Path) -> None:
+def test_unchanged_and_missing_files_pass(sums: Path) -> None:
     checksums.verify_checksums(sums, "again")
     sums.with_name("b.png").unlink()
     checksums.verify_checksums(sums, "again")

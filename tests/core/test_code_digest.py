@@ -46,7 +46,7 @@ def by_syntax_tree(text: str, package: str) -> set[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_the_pattern_sees_what_the_syntax_tree_sees(path: Path) -> None:
+def test_import_pattern_matches_syntax_tree(path: Path) -> None:
     text, package = path.read_text(encoding="utf-8"), "egvs.x"
     assert by_syntax_tree(text, package) <= set(stages.imported_names(text, package))
     assert set(stages.imported_names(text, package)) - by_syntax_tree(text, package) <= {"egvs"}  # in docstrings
@@ -68,7 +68,7 @@ def n():
 """
 
 
-def test_every_way_to_import_is_seen() -> None:
+def test_finds_every_kind_of_import() -> None:
     expected = ["a", "b.c", "x.y", "x.y.e", "x.f", "x.f.g", "x.f.i", "o.p", "o.p.q", "o.p.r"]
     assert list(stages.imported_names(ODD, "x.y")) == expected
     assert by_syntax_tree(ODD, "x.y") == set(expected)
@@ -122,7 +122,7 @@ CHANGED = {
 @pytest.mark.slow
 @pytest.mark.system
 @pytest.mark.parametrize("file", CHANGED)
-def test_a_changed_line_changes_the_digest_of_what_imports_it(file: str, tmp_path: Path) -> None:
+def test_changed_line_changes_digest_of_importers(file: str, tmp_path: Path) -> None:
     shutil.copytree(PACKAGE, tmp_path / "egvs", ignore=shutil.ignore_patterns("__pycache__"))
     before = digests(tmp_path)
     assert before == [
@@ -134,7 +134,7 @@ def test_a_changed_line_changes_the_digest_of_what_imports_it(file: str, tmp_pat
     assert {name for name, one, other in zip(STAGES, before, after, strict=True) if one != other} == CHANGED[file]
 
 
-def test_the_module_of_somebody_elses_class_counts_with_what_it_imports(tmp_path: Path, monkeypatch) -> None:
+def test_module_of_other_package_counts_with_its_imports(tmp_path: Path, monkeypatch) -> None:
     package = tmp_path / "somebody"
     package.mkdir()
     (package / "__init__.py").write_text("")
@@ -154,7 +154,7 @@ def test_the_module_of_somebody_elses_class_counts_with_what_it_imports(tmp_path
     assert digest() != before
 
 
-def test_versions_are_those_installed() -> None:
+def test_library_versions_are_those_installed() -> None:
     import numpy
 
     assert stages.library_versions(frozenset({"numpy"})) == {"numpy": numpy.__version__}

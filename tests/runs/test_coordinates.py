@@ -102,9 +102,7 @@ def in_metres(tmp_path_factory: pytest.TempPathFactory) -> pa.Table:
         pytest.param(to_gauss_kruger, "urn:ogc:def:crs:EPSG::31467", id="geopandas-another-datum"),
     ],
 )
-def test_geojson_in_every_system_ends_in_the_scores_of_metres(
-    tmp_path: Path, in_metres: pa.Table, move: Move, crs: str | None
-) -> None:
+def test_geojson_in_any_crs_gives_same_scores(tmp_path: Path, in_metres: pa.Table, move: Move, crs: str | None) -> None:
     found = scores(moved_mini(tmp_path / "mini", move, crs), tmp_path / "run")
     assert len(set(in_metres["egvs"].to_pylist())) == 2
     if move is to_gauss_kruger:
@@ -116,7 +114,7 @@ def test_geojson_in_every_system_ends_in_the_scores_of_metres(
 
 
 @pytest.mark.parametrize("columns", ["lon,lat", "Longitude,Latitude", "longitude_deg,latitude_deg", "x_m,y_m,lon,lat"])
-def test_a_csv_may_have_longitude_and_latitude(tmp_path: Path, in_metres: pa.Table, columns: str) -> None:
+def test_csv_with_longitude_and_latitude_gives_same_scores(tmp_path: Path, in_metres: pa.Table, columns: str) -> None:
     folder = write_mini(tmp_path / "mini")
     rows = [f"site,z_m,{columns}"]
     for name, x, y, z in (("pole_a", 10.0, 12.0, 3), ("pole_b", 30.5, -12.0, 3)):
@@ -137,7 +135,7 @@ def fcd_in_degrees(folder: Path) -> None:
     (folder / "fcd.csv").write_text("\n".join([head, *moved]) + "\n")
 
 
-def test_a_periods_fcd_lies_where_the_scenarios_network_says(tmp_path: Path, in_metres: pa.Table) -> None:
+def test_period_fcd_uses_georeference_of_network(tmp_path: Path, in_metres: pa.Table) -> None:
     """Another place for the world is other traffic: the stage runs again."""
     folder = write_mini(tmp_path / "mini")
     fcd_in_degrees(folder)
@@ -156,7 +154,7 @@ def test_a_periods_fcd_lies_where_the_scenarios_network_says(tmp_path: Path, in_
     assert inputs_of(traffic, egvs.load(folder), tmp_path / "run").to_json() != before
 
 
-def test_fcd_in_degrees_ends_in_the_scores_of_metres(tmp_path: Path, in_metres: pa.Table) -> None:
+def test_fcd_in_degrees_gives_same_scores(tmp_path: Path, in_metres: pa.Table) -> None:
     """As ``--fcd-output.geo`` writes it; a scene whose frame is unknown refuses it."""
     folder = write_mini(tmp_path / "mini")
     fcd_in_degrees(folder)
@@ -168,7 +166,7 @@ def test_fcd_in_degrees_ends_in_the_scores_of_metres(tmp_path: Path, in_metres: 
     assert scores(folder, tmp_path / "run").equals(in_metres)
 
 
-def test_scores_say_where_the_sites_are_and_nothing_else_changes(tmp_path: Path, in_metres: pa.Table) -> None:
+def test_scores_have_longitude_and_latitude(tmp_path: Path, in_metres: pa.Table) -> None:
     places = zip(in_metres["longitude_deg"].to_pylist(), in_metres["latitude_deg"].to_pylist(), strict=True)
     for place, metres in zip(places, [(10.0, 12.0), (30.5, -12.0)], strict=True):
         assert place == pytest.approx(to_degrees(*metres), abs=1e-9)
@@ -179,7 +177,7 @@ def test_scores_say_where_the_sites_are_and_nothing_else_changes(tmp_path: Path,
     assert "Latitude" not in (tmp_path / "run" / "report.html").read_text()
 
 
-def test_the_report_says_where_the_sites_are(tmp_path: Path) -> None:
+def test_report_shows_coordinates(tmp_path: Path) -> None:
     folder = write_mini(tmp_path / "mini")
     (folder / "scenario.toml").write_text((folder / "scenario.toml").read_text() + CRS)
     scores(folder, tmp_path / "run")
@@ -190,7 +188,7 @@ def test_the_report_says_where_the_sites_are(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_new_crs_makes_the_sites_stand_elsewhere(tmp_path: Path) -> None:
+def test_changed_crs_moves_sites(tmp_path: Path) -> None:
     """Stages that read degrees run again when the frame is another; those that do not know it are left."""
     folder = moved_mini(tmp_path / "mini", to_degrees, None)
     scores(folder, tmp_path / "run")

@@ -48,7 +48,7 @@ def done(mini: Path, tmp_path: Path) -> tuple[Path, Path]:
     return mini, out
 
 
-def test_artefacts_are_there_and_the_record_names_them(done: tuple[Path, Path]) -> None:
+def test_record_names_all_artefacts(done: tuple[Path, Path]) -> None:
     _, out = done
     record = json.loads((out / "run.json").read_text())
     assert list(record["stages"]) == list(STAGE_NAMES)
@@ -62,7 +62,7 @@ def test_artefacts_are_there_and_the_record_names_them(done: tuple[Path, Path]) 
     assert not list(out.glob(".*.partial"))
 
 
-def test_columns_and_metadata_are_those_declared(done: tuple[Path, Path]) -> None:
+def test_columns_and_metadata_match_schemas(done: tuple[Path, Path]) -> None:
     _, out = done
     for name in ("trajectories", "tpog", "scans", "scores"):
         table, about = parquet.read_artefact(out / f"{name}.parquet", name)
@@ -79,7 +79,7 @@ def test_columns_and_metadata_are_those_declared(done: tuple[Path, Path]) -> Non
     assert (about["frames"], about["block_frames"]) == (40, 10)
 
 
-def test_a_second_run_does_nothing_and_says_so(done: tuple[Path, Path], run_egvs) -> None:
+def test_second_run_skips_every_stage(done: tuple[Path, Path], run_egvs) -> None:
     mini, out = done
     before = {p.name: p.stat().st_mtime_ns for p in out.iterdir() if p.is_file() and p.name != ".lock"}
     assert set(states(egvs.load(mini), out).values()) == {"skipped"}
@@ -101,7 +101,7 @@ CHANGES = {
 
 
 @pytest.mark.parametrize(("change", "again"), CHANGES.items(), ids=CHANGES.keys())
-def test_a_changed_setting_runs_what_depends_on_it(
+def test_changed_setting_runs_dependent_stages(
     done: tuple[Path, Path], tmp_path: Path, change: str, again: set[str]
 ) -> None:
     mini, out = done
@@ -120,9 +120,7 @@ def test_a_changed_setting_runs_what_depends_on_it(
         ("traffic.frames=4000",),  # the finished file has fewer; the stages before are as they were
     ],
 )
-def test_a_refused_run_leaves_the_folder_as_it_was(
-    done: tuple[Path, Path], settings: tuple[str, ...], run_egvs
-) -> None:
+def test_rejected_run_leaves_folder_unchanged(done: tuple[Path, Path], settings: tuple[str, ...], run_egvs) -> None:
     scenario, out = done
     before = {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()}
     code, _, said = run_egvs("run", scenario, "--out", out, *(word for its in settings for word in ("--set", its)))
@@ -131,9 +129,7 @@ def test_a_refused_run_leaves_the_folder_as_it_was(
     assert verification.verify(out) == []
 
 
-def test_a_run_that_ends_on_its_way_leaves_a_record_of_one_scenario(
-    done: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_interrupted_run_records_one_scenario(done: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     """Of what was made by then, and of no score of the scenario before; what did not change is not made again."""
     mini, out = done
     other, make = egvs.load(mini, ["statics.ground=false", "traffic.frames=20"]), stages.run_stage
@@ -173,7 +169,7 @@ def test_scores_are_the_same_without_kept_scans(done: tuple[Path, Path], tmp_pat
     assert egvs.read_scores(lean / "scores.parquet") == egvs.read_scores(out / "scores.parquet")
 
 
-def test_threads_change_no_byte(done: tuple[Path, Path], tmp_path: Path) -> None:
+def test_number_of_threads_changes_no_byte(done: tuple[Path, Path], tmp_path: Path) -> None:
     mini, out = done
     for jobs in (1, 3):
         other = tmp_path / str(jobs)
@@ -182,9 +178,7 @@ def test_threads_change_no_byte(done: tuple[Path, Path], tmp_path: Path) -> None
 
 
 @pytest.mark.slow
-def test_verify_passes_elsewhere_and_names_an_altered_artefact(
-    done: tuple[Path, Path], tmp_path: Path, run_egvs
-) -> None:
+def test_verify_names_altered_artefact(done: tuple[Path, Path], tmp_path: Path, run_egvs) -> None:
     mini, out = done
     moved, source = tmp_path / "elsewhere" / "run", tmp_path / "elsewhere" / "scenario"
     shutil.copytree(out, moved)
@@ -200,7 +194,7 @@ def test_verify_passes_elsewhere_and_names_an_altered_artefact(
     assert "scans.parquet" not in printed
 
 
-def test_verify_tells_when_the_scenario_is_another(done: tuple[Path, Path], run_egvs) -> None:
+def test_verify_reports_changed_scenario(done: tuple[Path, Path], run_egvs) -> None:
     mini, out = done
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m\npole_a,11,12,3\npole_b,30.5,-12,3\n")
     code, printed, _ = run_egvs("verify", out)
@@ -208,7 +202,7 @@ def test_verify_tells_when_the_scenario_is_another(done: tuple[Path, Path], run_
     assert "scans.parquet differs" in printed
 
 
-def test_verify_of_an_unfinished_run_says_what_is_missing(done: tuple[Path, Path]) -> None:
+def test_verify_rejects_unfinished_run(done: tuple[Path, Path]) -> None:
     _, out = done
     record = json.loads((out / "run.json").read_text())
     del record["stages"]["score"]
@@ -217,13 +211,13 @@ def test_verify_of_an_unfinished_run_says_what_is_missing(done: tuple[Path, Path
         verification.verify(out)
 
 
-def test_two_runs_in_one_folder_are_kept_apart(done: tuple[Path, Path]) -> None:
+def test_rejects_second_run_in_same_folder(done: tuple[Path, Path]) -> None:
     mini, out = done
     with lock_run_folder(out), pytest.raises(RunError, match="another run is at work"):
         egvs.run(egvs.load(mini), out)
 
 
-def test_a_record_that_is_none_is_refused(done: tuple[Path, Path]) -> None:
+def test_rejects_file_that_is_no_record(done: tuple[Path, Path]) -> None:
     mini, out = done
     (out / "run.json").write_text("[]")
     with pytest.raises(InputError, match="is not the record of a run"):
@@ -231,7 +225,7 @@ def test_a_record_that_is_none_is_refused(done: tuple[Path, Path]) -> None:
 
 
 @pytest.mark.parametrize("key", ["scenario", "scenario_folder", "egvs", "seed"])
-def test_a_record_with_an_odd_value_is_refused(done: tuple[Path, Path], key: str, run_egvs) -> None:
+def test_rejects_record_with_invalid_value(done: tuple[Path, Path], key: str, run_egvs) -> None:
     mini, out = done
     record = json.loads((out / "run.json").read_text())
     (out / "run.json").write_text(json.dumps(add_checksum(record | {key: [None]})))
@@ -240,7 +234,7 @@ def test_a_record_with_an_odd_value_is_refused(done: tuple[Path, Path], key: str
         assert (code, f"'{key}' is" in said) == (2, True), said
 
 
-def test_a_record_that_was_damaged_at_any_depth_is_refused(done: tuple[Path, Path], run_egvs) -> None:
+def test_rejects_damaged_record(done: tuple[Path, Path], run_egvs) -> None:
     mini, out = done
     text = (out / "run.json").read_text()
     for old, new in (('"peak_mb": ', '"peak_mb": 1'), ('"triangles"', '"triangle"'), ("4", '"4"'), ("9", "9" * 5000)):
@@ -253,7 +247,7 @@ def test_a_record_that_was_damaged_at_any_depth_is_refused(done: tuple[Path, Pat
 
 
 @pytest.mark.slow
-def test_a_single_stage_with_other_settings_leaves_no_mixed_record(done: tuple[Path, Path], run_egvs) -> None:
+def test_single_stage_drops_stages_of_other_settings(done: tuple[Path, Path], run_egvs) -> None:
     mini, out = done
     assert run_egvs("score", mini, "--out", out, "--set", "score.gamma=7", "--set", "sites.yaw_deg=5")[0] == 0
     code, _, said = run_egvs("verify", out)
@@ -262,7 +256,7 @@ def test_a_single_stage_with_other_settings_leaves_no_mixed_record(done: tuple[P
     assert run_egvs("verify", out)[0] == 0
 
 
-def test_an_artefacts_name_that_is_a_folder_is_told_and_nothing_is_left(mini: Path, tmp_path: Path, run_egvs) -> None:
+def test_rejects_folder_in_place_of_artefact(mini: Path, tmp_path: Path, run_egvs) -> None:
     (tmp_path / "out" / "scans.parquet").mkdir(parents=True)
     code, _, said = run_egvs("run", mini, "--out", tmp_path / "out")
     assert (code, "scans.parquet: expected a file, got a folder" in said) == (2, True), said
@@ -289,9 +283,7 @@ def test_editor_schema_is_not_stale() -> None:
 
 
 @pytest.mark.slow
-def test_another_seed_in_the_same_folder_changes_no_byte_of_what_is_not_random(
-    mini: Path, tmp_path: Path, run_egvs
-) -> None:
+def test_seed_changes_only_random_artefacts(mini: Path, tmp_path: Path, run_egvs) -> None:
     out = tmp_path / "out"
     assert run_egvs("run", mini, "--out", out, "--set", "seed=5")[0] == 0
     before = {name: (out / name).read_bytes() for name in ("statics.ply", "scans.parquet")}
@@ -305,7 +297,7 @@ def test_another_seed_in_the_same_folder_changes_no_byte_of_what_is_not_random(
 @pytest.mark.slow
 @pytest.mark.parametrize("by", ["egvs", "seen_well", "points_on_target", "entropy_seen"])
 @pytest.mark.parametrize("width", [80, 120, 190])
-def test_a_ranking_fits_the_terminal(mini: Path, tmp_path: Path, width: int, by: str) -> None:
+def test_ranking_fits_terminal_width(mini: Path, tmp_path: Path, width: int, by: str) -> None:
     """No number is cut, on the narrowest terminal too."""
     from rich.console import Console
 
@@ -326,7 +318,7 @@ def test_a_ranking_fits_the_terminal(mini: Path, tmp_path: Path, width: int, by:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("words", [("run",), ("accuracy", "--budget", "20s")])
-def test_an_interrupt_is_answered_in_words(tmp_path: Path, words: tuple[str, ...]) -> None:
+def test_interrupt_prints_message(tmp_path: Path, words: tuple[str, ...]) -> None:
     """It comes while SUMO is at work, which is seen by what SUMO writes."""
     out = tmp_path / "out"
     scenario = ROOT / "scenarios" / "nishishinjuku"
@@ -340,7 +332,7 @@ def test_an_interrupt_is_answered_in_words(tmp_path: Path, words: tuple[str, ...
     assert "Traceback" not in done.stderr
 
 
-def test_a_record_of_an_earlier_version_is_one_of_nothing(done: tuple[Path, Path]) -> None:
+def test_record_of_earlier_version_has_no_stages(done: tuple[Path, Path]) -> None:
     """Its stages are run again, or fetched; there is nothing to verify."""
     mini, out = done
     record = json.loads((out / "run.json").read_text())
@@ -357,7 +349,7 @@ def test_a_record_of_an_earlier_version_is_one_of_nothing(done: tuple[Path, Path
 
 
 @pytest.mark.slow
-def test_the_best_sites_alone_are_printed_and_the_others_counted(mini: Path, tmp_path: Path, run_egvs) -> None:
+def test_prints_best_sites_and_counts_others(mini: Path, tmp_path: Path, run_egvs) -> None:
     rows = [f"p{i:02d},{2 + i},12,{3 + i / 8}" for i in range(9)]
     (mini / "sites.csv").write_text("\n".join(["site,x_m,y_m,z_m", *rows]) + "\n")
     code, whole, _ = run_egvs("run", mini, "--out", tmp_path / "out")

@@ -25,7 +25,7 @@ def scores(folder: Path) -> list[tuple[float, int]]:
 
 
 @pytest.mark.slow
-def test_the_ranking_of_a_poly_xml_is_that_of_footprints(mini: Path, tmp_path: Path, run_egvs) -> None:
+def test_poly_xml_gives_ranking_of_footprints(mini: Path, tmp_path: Path, run_egvs) -> None:
     house = feature({"type": "Polygon", "coordinates": BUILDING}, height_m=6)
     (mini / "statics.geojson").write_text(collection(house), encoding="utf-8")
     (mini / "map.poly.xml").write_text(f'<additional>{HOUSE} height="6.00"/>{GROUNDS}</additional>', encoding="utf-8")

@@ -76,7 +76,7 @@ def on_roads(tmp_path_factory: pytest.TempPathFactory) -> tuple[model.Scenario, 
     return scenario, out
 
 
-def test_lanes_turns_and_those_on_none_add_up(on_roads: tuple[model.Scenario, Path]) -> None:
+def test_vehicle_frames_add_up(on_roads: tuple[model.Scenario, Path]) -> None:
     _, out = on_roads
     for site in ("pole_a", "pole_b"):
         rows = rows_of(out, site)
@@ -136,7 +136,7 @@ def test_recorded_traffic_has_a_map_alone(ran: tuple[Path, Path]) -> None:
 
 
 @pytest.mark.slow
-def test_the_switch_acts(ran: tuple[Path, Path], tmp_path: Path) -> None:
+def test_blindspots_can_be_disabled(ran: tuple[Path, Path], tmp_path: Path) -> None:
     off = loading.load(ran[0], ["score.blindspots=false"])
     egvs.run(loading.load(ran[0]), tmp_path, jobs=1)
     assert (tmp_path / "blindspots.parquet").is_file() and 'data-view="vehicles"' in (
@@ -224,7 +224,7 @@ def outside(table: pa.Table, groups: int) -> tuple[pa.Table, int]:
         (lambda table, rows: (table.drop_columns(["words"]), rows), "the column 'words' is missing"),
     ],
 )
-def test_a_damaged_file_is_named(  # type: ignore[no-untyped-def]
+def test_error_names_damaged_file(  # type: ignore[no-untyped-def]
     on_roads: tuple[model.Scenario, Path], tmp_path: Path, change, message: str
 ) -> None:
     path = damaged(on_roads[1] / "blindspots.parquet", tmp_path / "blindspots.parquet", change)
@@ -234,7 +234,7 @@ def test_a_damaged_file_is_named(  # type: ignore[no-untyped-def]
 
 
 @pytest.mark.parametrize("cells", [None, {}, {"origin_m": [0, 0], "cell_m": 0, "shape": [1, 1]}, {"origin_m": [0]}])
-def test_squares_that_metadata_does_not_describe_are_refused(
+def test_rejects_invalid_cells_in_metadata(
     on_roads: tuple[model.Scenario, Path], tmp_path: Path, cells: object
 ) -> None:
     about = parquet.read_metadata(on_roads[1] / "blindspots.parquet", "blindspots") | {"cells": cells}
@@ -244,7 +244,7 @@ def test_squares_that_metadata_does_not_describe_are_refused(
         list(readers.read_blindspots(tmp_path / "blindspots.parquet"))
 
 
-def test_a_file_that_is_cut_off_is_refused_by_the_report(ran: tuple[Path, Path], tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
+def test_report_rejects_truncated_file(ran: tuple[Path, Path], tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
     egvs.run(loading.load(ran[0]), tmp_path, jobs=1)
     path = tmp_path / "blindspots.parquet"
     path.write_bytes(path.read_bytes()[:-100])

@@ -68,7 +68,7 @@ def test_a_hidden_lane_by_hand(tmp_path: Path) -> None:
         ("turn", "near:straight"): 1,
         ("crossing", ":j_c0_0"): 1,
     }
-    assert by_place(spots, found.seen) == {
+    assert by_place(spots, found.visible) == {
         ("all", ""): 5,
         ("no lane", ""): 1,
         ("approach", "near"): 2,
@@ -79,7 +79,7 @@ def test_a_hidden_lane_by_hand(tmp_path: Path) -> None:
         ("turn", "near:straight"): 1,
         ("crossing", ":j_c0_0"): 1,
     }
-    assert found.share.tolist() == (found.seen / spots.vehicle_frames).tolist()
+    assert found.share.tolist() == (found.visible / spots.vehicle_frames).tolist()
     left = [place.name for place in spots.locations].index("near_2")
     assert spots.at_m[left].tolist() == pytest.approx([(23 + 18 + 27) / 3, -1.6])
 
@@ -155,8 +155,8 @@ def test_counts_against_plain_python(seed):
     assert cells == sorted(counted)
     assert spots.vehicle_frames[first:].tolist() == [counted[cell] for cell in cells]
     assert spots.vehicles[first:].tolist() == [len(who[cell]) for cell in cells]
-    assert found.seen[first:].tolist() == [well[cell] for cell in cells]
-    assert found.seen[:first].tolist() == [int((points >= 20).sum())] * first
+    assert found.visible[first:].tolist() == [well[cell] for cell in cells]
+    assert found.visible[:first].tolist() == [int((points >= 20).sum())] * first
     slow = [share_slowly(weighed[cell]) for cell in cells]
     assert found.share[first:] == pytest.approx([share for share, _ in slow])
     assert found.se[first:] == pytest.approx([se for _, se in slow], nan_ok=True)
@@ -195,7 +195,7 @@ def test_weights_count_in_shares() -> None:
     record = TargetRecord.of([frame([car(20, 10), car(40, 10)])], GRID)
     spots = spots_of(record, weight=[3.0, 1.0])
     found = spots.visibility(np.array([20.0, 0.0]))
-    assert (found.seen[0], found.share[0], spots.weights[0]) == (1, 0.75, 4.0)
+    assert (found.visible[0], found.share[0], spots.weights[0]) == (1, 0.75, 4.0)
 
 
 def test_a_rear_part_is_where_its_own_front_is(tmp_path: Path) -> None:
@@ -215,9 +215,9 @@ def test_people_whom_a_score_counts_are_no_vehicles(tmp_path: Path) -> None:
     assert by_place(both, both.vehicle_frames) == by_place(alone, alone.vehicle_frames)
     assert both.cells.tolist() == alone.cells.tolist()
     assert (
-        both.visibility(np.array([50.0, 0.0, 50.0])).seen.sum()
+        both.visibility(np.array([50.0, 0.0, 50.0])).visible.sum()
         == 0
-        < both.visibility(np.array([0.0, 20.0, 0.0])).seen.sum()
+        < both.visibility(np.array([0.0, 20.0, 0.0])).visible.sum()
     )
 
 
@@ -244,7 +244,7 @@ def test_crossings_against_shapely(tmp_path: Path) -> None:
     assert by_place(spots, spots.vehicle_frames)["crossing", ":j_c0_0"] == on
 
 
-def test_nobody(tmp_path: Path) -> None:
+def test_no_vehicles(tmp_path: Path) -> None:
     record = TargetRecord.of([frame([])], GRID)
     spots = spots_of(record, RoadLocations.of(read(tmp_path), GRID.roi))
     assert len(spots) == 0 and spots.visibility(np.empty(0)).share.shape == (0,)

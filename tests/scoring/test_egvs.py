@@ -58,7 +58,7 @@ def test_entropy_by_hand():
 
 
 @pytest.mark.parametrize(("count", "frames"), [(-1, 5), (6, 5), (0, 0), (1, 0), (0, -1)])
-def test_senseless_counts_are_refused(count, frames):
+def test_rejects_invalid_counts(count, frames):
     with pytest.raises(ValueError, match=r"0 <= count <= frames"):
         binary_entropy(count, frames)
 
@@ -150,7 +150,7 @@ def test_counters_at_the_limit_of_their_types():
     assert 2**30 * LARGEST < 2**63
 
 
-def test_counts_beyond_the_frames_are_refused():
+def test_rejects_counts_above_frames():
     with pytest.raises(InputError, match="occupied in 6 of 5 frames"):
         field_of([1, 6], 5)
 

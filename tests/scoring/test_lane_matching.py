@@ -56,7 +56,7 @@ def test_round_the_outside_of_a_bend_either_piece_leads_the_way():
     assert match_lanes(at, yaw, [bend]).tolist() == [0, 0, -1]
 
 
-def test_nobody_and_no_lanes():
+def test_no_vehicles_and_no_lanes():
     assert match_lanes(np.empty((0, 2)), np.empty(0), [EAST]).shape == (0,)
     assert match_lanes(np.array([[1.0, 0.0]]), np.zeros(1), []).tolist() == [-1]
 

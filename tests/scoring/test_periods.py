@@ -55,7 +55,7 @@ def of(table: object) -> list[dict[str, object]]:
     return table.to_pylist()  # type: ignore[attr-defined, no-any-return]
 
 
-def test_the_mix_is_exact(split: Path, tmp_path: Path) -> None:
+def test_mix_is_exact(split: Path, tmp_path: Path) -> None:
     record = egvs.run(egvs.load(split), tmp_path)
     path = tmp_path / "tpog.parquet"
     day, night, mix = read_tpog(path, "day"), read_tpog(path, "night"), read_tpog(path)
@@ -78,7 +78,7 @@ def test_the_mix_is_exact(split: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_each_period_is_scored_as_if_it_were_alone(split: Path, tmp_path: Path) -> None:
+def test_period_scores_equal_those_of_separate_run(split: Path, tmp_path: Path) -> None:
     egvs.run(egvs.load(split), tmp_path / "both")
     by_period = of(read_scores_by_period(tmp_path / "both" / "scores_by_period.parquet"))
     text = (split / "scenario.toml").read_text().replace(PERIODS, "")
@@ -95,7 +95,7 @@ def test_each_period_is_scored_as_if_it_were_alone(split: Path, tmp_path: Path) 
 
 
 @pytest.mark.slow
-def test_frames_stand_one_after_another_and_weights_need_no_new_traffic(split: Path, tmp_path: Path) -> None:
+def test_changed_weights_need_no_new_traffic(split: Path, tmp_path: Path) -> None:
     egvs.run(egvs.load(split), tmp_path)
     table, about = parquet.read_artefact(tmp_path / "trajectories.parquet", "trajectories")
     assert (about["frames"], about["periods"]) == (40, [{"name": "day", "frames": 24}, {"name": "night", "frames": 16}])
@@ -110,7 +110,7 @@ def test_frames_stand_one_after_another_and_weights_need_no_new_traffic(split: P
 
 
 @pytest.mark.slow
-def test_a_run_with_periods_is_the_same_again_and_shows_them(split: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
+def test_run_with_periods_is_reproducible_and_reported(split: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
     code, printed, told = run_egvs("run", split, "--out", tmp_path / "out")
     assert code == 0
     (night,) = (line for line in told.splitlines() if line.split()[0] == "night")
@@ -147,7 +147,7 @@ def test_frames_count_in_the_ratio_of_the_weights(rows: list[tuple[int, int]], u
     assert np.gcd.reduce(found) == 1
 
 
-def test_of_a_mix_each_group_is_left_out_of_its_own_record() -> None:
+def test_jackknife_of_mix_leaves_groups_out_by_period() -> None:
     rng, grid = np.random.default_rng(2), Grid.from_json({"origin_m": [0.0] * 3, "voxel_m": 1.0, "shape": [5, 4, 1]})
     records = (BlockGroups(np.array([10, 20]), 0.0), BlockGroups(np.array([8, 8, 8]), 0.0))
     counts = [rng.integers(0, 8, size=(k, 20)).astype(np.uint32) for k in (2, 3)]
@@ -190,7 +190,7 @@ def test_variances_and_biases_of_a_mix_add_up_by_hand() -> None:
     assert estimate.freedom == pytest.approx((1 + 121 / 18) ** 2 / (1 + (121 / 18) ** 2))  # one degree each
 
 
-def test_errors_of_a_mix_and_of_its_periods_are_told(split: Path, tmp_path: Path) -> None:
+def test_standard_errors_of_mix_and_periods_are_reported(split: Path, tmp_path: Path) -> None:
     record = egvs.run(egvs.load(split), tmp_path)
     rows = of(egvs.read_scores(tmp_path / "scores.parquet"))
     assert all(row["egvs_se"] > 0 for row in rows)  # type: ignore[operator]
@@ -259,9 +259,7 @@ def test_periods_disagree_without_standard_errors_too(
         assert told in collect_warnings([record.stages["score"].summary]), override
 
 
-def test_the_report_tells_what_its_tables_leave_out(
-    split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_report_counts_rows_that_are_not_shown(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rows = "".join(f"p{n},{10 + n},12,3\n" for n in range(4))
     (split / "sites.csv").write_text(f"site,x_m,y_m,z_m\n{rows}")
     for name, count in (("LISTED", 2), ("FIRST", 1), ("LAST", 1)):
@@ -273,7 +271,7 @@ def test_the_report_tells_what_its_tables_leave_out(
     assert re.search(r"Vehicles at a time</dt><dd>2<small>", html)
 
 
-def test_an_effect_that_periods_forbid_is_not_advised(split: Path) -> None:
+def test_effect_that_periods_forbid_is_not_recommended(split: Path) -> None:
     """Replaying the frames of all periods alike is refused in a scenario; it must not be recommended for one."""
     (found,) = (call for call in effect_statuses(egvs.load(split)) if call.name == "moving_occlusion")
     assert (found.state, found.why) == (
@@ -329,7 +327,7 @@ def test_the_world_frame_counts_where_a_period_alone_is_a_finished_file(
         ("[score]", "[effects.moving_occlusion]\n[score]", 'method = "frames" replays all periods alike'),
     ],
 )
-def test_periods_that_cannot_be_are_refused(
+def test_rejects_invalid_periods(
     split: Path,
     tmp_path: Path,
     old: str,
@@ -353,7 +351,7 @@ def test_a_key_that_acts_in_one_period_may_stand_for_all(split: Path) -> None:
     assert (day.fcd, night.sumocfg, night.step_s) == ("fcd.csv", "night.sumocfg", 0.5)
 
 
-def test_a_period_that_is_not_there_is_refused(split: Path, tmp_path: Path) -> None:
+def test_rejects_unknown_period(split: Path, tmp_path: Path) -> None:
     egvs.run(egvs.load(split), tmp_path)
     with pytest.raises(InputError, match=r"there is no period 'noon'\. The periods are day, night"):
         read_tpog(tmp_path / "tpog.parquet", "noon")
@@ -370,7 +368,7 @@ def test_entropy_of_a_mix_is_that_of_its_share() -> None:
     assert binary_entropy(3, 8) == binary_entropy(15, 40)
 
 
-def test_a_file_that_a_period_lacks_is_told_before_the_first_stage(split: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
+def test_rejects_missing_file_of_period(split: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
     file = split / "scenario.toml"
     file.write_text(file.read_text().replace("begin_s = 12", 'fcd = "nacht.csv"'))
     code, _, complaint = run_egvs("run", split, "--out", tmp_path / "out")

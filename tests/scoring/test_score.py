@@ -59,7 +59,7 @@ def test_score_is_its_definition(mini, tmp_path, gamma):
     assert float(about["gamma"]) == gamma
 
 
-def test_threads_change_no_byte(mini, tmp_path):
+def test_number_of_threads_changes_no_byte(mini, tmp_path):
     write_sites(mini, *(f"s{n},{9 + 3 * n},11,{3 + n / 2},small" for n in range(8)))
     run(mini, tmp_path)
     files = ("scans.parquet", "scores.parquet", "visibility.parquet")
@@ -189,7 +189,7 @@ def put(name, row, value):
         ("scans", put("dz_m", 5, np.inf), "not finite"),
     ],
 )
-def test_altered_artefacts_are_refused(mini, tmp_path, artefact, change, message):
+def test_rejects_altered_artefacts(mini, tmp_path, artefact, change, message):
     run(mini, tmp_path)
     rewrite(tmp_path / f"{artefact}.parquet", change)
     if artefact == "scans":  # one row group a site, as the stage writes it

@@ -240,7 +240,7 @@ def test_many_blocks_are_joined_as_they_are_read(mini: Path, tmp_path: Path) -> 
         assert found[column] == pytest.approx(float(np.minimum(weights, 5) @ entropy), rel=1e-12)
 
 
-def test_a_block_that_does_not_exist_is_refused(mini: Path, tmp_path: Path) -> None:
+def test_rejects_unknown_block(mini: Path, tmp_path: Path) -> None:
     egvs.run(egvs.load(mini), tmp_path)
     path = tmp_path / "tpog.parquet"
     table, about = parquet.read_artefact(path, "tpog")

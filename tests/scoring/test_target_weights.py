@@ -95,7 +95,7 @@ def test_a_weight_of_one_for_all_changes_nothing(mini: Path, tmp_path: Path) -> 
     assert {site: set(row.items()) for site, row in one.items()} == {s: set(row.items()) for s, row in plain.items()}
 
 
-def test_weights_are_told(mini: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
+def test_weights_are_reported(mini: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
     weights = ("--set", WEST, "--set", "score.weights.kinds.passenger=2")
     code, printed, told = run_egvs("run", mini, "--out", tmp_path, "--set", "score.rank_by=seen_well", *weights)
     assert code == 0
@@ -124,7 +124,7 @@ def test_periods_are_weighted_each_by_itself(mini: Path, tmp_path: Path) -> None
             assert apart[name, site.name] == pytest.approx(np.average(worth[its], weights=weight[its]), rel=1e-12)
 
 
-def test_weights_that_hold_for_nobody_are_told(mini: Path, tmp_path: Path) -> None:
+def test_warns_of_unused_weights(mini: Path, tmp_path: Path) -> None:
     far = "score.weights.zones.far={weight=4, polygon_m=[[90, 90], [91, 90], [91, 91]]}"
     record = egvs.run(loading.load(mini, [far, "score.weights.kinds.bus=2"]), tmp_path, jobs=1)
     told = [(it.where, it.problem) for it in collect_warnings([record.stages["score"].summary]) if it.rule == "weights"]
@@ -136,7 +136,7 @@ def test_weights_that_hold_for_nobody_are_told(mini: Path, tmp_path: Path) -> No
     ]
 
 
-def test_where_no_vehicle_counts_none_can_rank(mini: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
+def test_rejects_ranking_without_weighted_vehicles(mini: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
     none = ("--set", "score.weights.kinds.passenger=0", "--set", "score.rank_by=seen_well")
     code, _, told = run_egvs("run", mini, "--out", tmp_path, *none)
     assert code == 2
@@ -158,7 +158,7 @@ def test_where_no_vehicle_counts_none_can_rank(mini: Path, tmp_path: Path, run_e
         ("score.weights.zone={}", "did you mean zones?"),
     ],
 )  # fmt: skip
-def test_wrong_weights_are_refused(mini: Path, run_egvs, override: str, message: str) -> None:  # type: ignore[no-untyped-def]
+def test_rejects_wrong_weights(mini: Path, run_egvs, override: str, message: str) -> None:  # type: ignore[no-untyped-def]
     code, _, told = run_egvs("check", mini, "--set", override)
     assert code == 2
     assert message in told, told

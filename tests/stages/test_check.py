@@ -45,12 +45,12 @@ def statics(folder: Path, *features: dict) -> None:
     (folder / "statics.geojson").write_text(collection(*features))
 
 
-def test_a_sound_scenario_has_no_finding(street: Path, mini: Path) -> None:
+def test_valid_scenario_has_no_finding(street: Path, mini: Path) -> None:
     checked = check.check_scenario(egvs.load(street))
     assert (checked.findings, checked.sites, checked.solids, checked.lanes) == ((), 2, 3, 2)
 
 
-def test_without_a_network_nothing_is_known_of_lanes(mini: Path) -> None:
+def test_no_lane_rule_applies_without_network(mini: Path) -> None:
     checked = check.check_scenario(egvs.load(mini))
     assert (checked.findings, checked.lanes) == ((), 0)
 
@@ -58,7 +58,7 @@ def test_without_a_network_nothing_is_known_of_lanes(mini: Path) -> None:
 # ---- sites
 
 
-def test_a_site_is_in_a_lane_when_it_is_deeper_in_it_than_a_quarter_metre(street: Path) -> None:
+def test_site_is_in_lane_from_a_quarter_metre_inside(street: Path) -> None:
     """Lanes of 3.2 m round y = +-1.6: from 0 to 3.2 m, so 2.94 is in one and 2.96 is not; 0 is the line between."""
     sites(street, "in,10,2.94,3", "kerb,10,2.96,3", "middle,12,0,3", "walk,10,-4.2,3", "bicycles,10,4.2,3", "e,9,-1,3")
     assert found(street) == {
@@ -69,14 +69,14 @@ def test_a_site_is_in_a_lane_when_it_is_deeper_in_it_than_a_quarter_metre(street
     }
 
 
-def test_a_sensor_on_a_gantry_stands_in_nobodys_way(street: Path) -> None:
+def test_sensor_on_gantry_is_not_in_lane(street: Path) -> None:
     sites(street, "low,10,1.6,4.5", "high,10,1.6,4.51")
     assert [line for lines in found(street).values() for line in lines] == [
         "[sites.csv: site low: (10, 1.6, 4.5) is in lane west_1]"
     ]
 
 
-def test_a_site_amid_a_junction_is_told_unless_it_hangs_over_the_road() -> None:
+def test_warns_of_site_within_junction_unless_above_road() -> None:
     """Of the hill's junction (0, -2) is in no lane, and (60, 12) is beside the road."""
     roads = Carriageway.of(network.read_net_xml(SCENARIOS / "hill" / "network.net.xml"))
     at_m = np.array([0.0, -2.0])
@@ -91,7 +91,7 @@ def test_a_site_amid_a_junction_is_told_unless_it_hangs_over_the_road() -> None:
     ]
 
 
-def test_the_height_over_the_road_counts(street: Path) -> None:
+def test_height_above_road_decides(street: Path) -> None:
     lifted = LANES.replace("80,1.60 -40,1.60", "80,1.60,4.00 -40,1.60,4.00").replace(
         "-40,-1.60 80,-1.60", "-40,-1.60,4.00 80,-1.60,4.00"
     )
@@ -103,7 +103,7 @@ def test_the_height_over_the_road_counts(street: Path) -> None:
     ]
 
 
-def test_many_sites_in_lanes_share_a_line(street: Path) -> None:
+def test_many_sites_in_lanes_share_one_warning(street: Path) -> None:
     sites(street, *(f"s{i:02d},{i},1.6,3" for i in range(1, 13)))
     lines = found(street)["sites on lanes"]
     assert len(lines) == 9
@@ -115,7 +115,7 @@ def rule(folder: Path, grid: str) -> None:
     (folder / "scenario.toml").write_text(text.replace('file = "sites.csv"', f"grid = {grid}"))
 
 
-def test_a_rule_drops_places_in_lanes_and_solids_and_says_how_many(street: Path) -> None:
+def test_rule_drops_candidates_in_lanes_and_solids(street: Path) -> None:
     """Rows at y = -6, -1, 4 and 9: the second is in a lane, whatever the height; of the last, one is in the house (from
     x = 14 to 18, y = 5 to 8, made wider here), but not above it."""
     statics(street, box((14, 5), (18, 10), "house", height_m=6))
@@ -133,7 +133,7 @@ def test_a_rule_drops_places_in_lanes_and_solids_and_says_how_many(street: Path)
     ]
 
 
-def test_a_rule_drops_places_amid_a_junction_but_not_where_people_walk(street: Path) -> None:
+def test_rule_drops_candidates_within_junction_but_not_on_walkways(street: Path) -> None:
     """A junction of 8 x 8 m beside the lanes, its corner in the north-east a walking area of 2 x 2 m."""
     area = '<edge id=":j_w0" function="walkingarea"><lane id=":j_w0_0" index="0" allow="pedestrian" length="2"'
     corner = f'{area} width="2" shape="18,-6 20,-6 20,-8 18,-8"/></edge>'
@@ -146,24 +146,24 @@ def test_a_rule_drops_places_amid_a_junction_but_not_where_people_walk(street: P
     assert dropped == {(x, y) for x in (13, 15, 17, 19) for y in (-13, -11, -9, -7)} - {(19, -7)}
 
 
-def test_a_rule_may_keep_all_and_is_then_told_as_a_file_is(street: Path) -> None:
+def test_rule_that_drops_nothing_is_checked_like_a_file(street: Path) -> None:
     rule(street, "{ low_m=[6,-6], high_m=[16,9], spacing_m=5, heights_m=[3.0] }")
     told = found(street, "sites.only_free=false")
     assert {key: len(lines) for key, lines in told.items()} == {"sites on lanes": 3}
 
 
-def test_a_rule_of_which_nothing_is_left_is_an_error(street: Path) -> None:
+def test_rejects_rule_without_feasible_candidate(street: Path) -> None:
     rule(street, "{ low_m=[6,1], high_m=[16,1], spacing_m=5, heights_m=[3.0] }")
     assert found(street) == {"sites": ["scenario.toml: sites: no place can hold a pole (3 in a lane)"]}
 
 
-def test_a_dropped_site_cannot_be_kept(street: Path) -> None:
+def test_rejects_visibility_of_dropped_site(street: Path) -> None:
     rule(street, "{ low_m=[6,-6], high_m=[6,-1], spacing_m=5, heights_m=[3.0] }")
     told = found(street, 'score.keep_visibility=["g02"]')
     assert told == {"sites": ["scenario.toml: score.keep_visibility: the site 'g02' is dropped: it stands in a lane"]}
 
 
-def test_beams_that_never_meet_the_region(street: Path) -> None:
+def test_warns_of_beams_that_miss_region(street: Path) -> None:
     sensor = "{elevations_deg=[5,15],channels=4,azimuth_step_deg=1.0,range_m=100}"
     told = found(street, f"sensors.small={sensor}", "roi.center_m=[20,0,1.0]", "roi.size_m=[40,20,2]")
     assert told == {
@@ -171,7 +171,7 @@ def test_beams_that_never_meet_the_region(street: Path) -> None:
     }
 
 
-def test_all_that_is_wrong_with_poses_is_told_at_once(street: Path) -> None:
+def test_reports_all_wrong_poses_at_once(street: Path) -> None:
     sites(street, "inside,16,6,3", "deep,10,12,-1", "far,300,12,3", "fine,10,12,3")
     assert found(street) == {
         "sites": [
@@ -185,7 +185,7 @@ def test_all_that_is_wrong_with_poses_is_told_at_once(street: Path) -> None:
 # ---- solids
 
 
-def test_a_shelter_in_mid_road_is_told_with_its_place(street: Path) -> None:
+def test_warns_of_solid_on_lane_with_position(street: Path) -> None:
     """2 x 2 m of two lanes that are 2.7 m wide without their edges and 120 m long: 4 of 2 * 2.7 * 120 m2."""
     statics(street, box((20, 0.5), (22, 2.5), "shelter", base_m=2.4, height_m=2.6))
     share, lanes = 4 / (2 * 2.7 * 120), "of the lanes in and around the region"
@@ -207,12 +207,12 @@ def test_a_shelter_in_mid_road_is_told_with_its_place(street: Path) -> None:
         (box((200, 0.5), (222, 2.5)), False),  # too far away to matter
     ],
 )
-def test_what_is_in_the_way_on_a_lane(street: Path, solid: dict, is_found: bool) -> None:
+def test_solid_in_the_way_on_lane(street: Path, solid: dict, is_found: bool) -> None:
     statics(street, solid)
     assert set(found(street)) == ({"solids over lanes"} if is_found else set())
 
 
-def test_an_open_surface_is_in_the_way_where_it_is_above_the_kerb(street: Path) -> None:
+def test_open_surface_above_kerb_is_in_the_way(street: Path) -> None:
     """A sheet over the whole street is the road at 0.1 m, and in everybody's way at 1 m."""
     for height_m, is_found in ((0.1, False), (1.0, True)):
         corners = "".join(f"v {x} {y} {height_m}\n" for x, y in ((-40, -6), (80, -6), (80, 6), (-40, 6)))
@@ -223,7 +223,7 @@ def test_an_open_surface_is_in_the_way_where_it_is_above_the_kerb(street: Path) 
             assert "a solid covers 100.0% of the lanes" in told["solids over lanes"][0]
 
 
-def test_buildings_of_another_place_are_told(street: Path) -> None:
+def test_warns_of_distant_buildings(street: Path) -> None:
     statics(street, box((1000, 2000), (1010, 2010)), box((1100, 2000), (1110, 2010)))
     assert found(street) == {
         "statics far away": [
@@ -235,7 +235,7 @@ def test_buildings_of_another_place_are_told(street: Path) -> None:
 # ---- the region
 
 
-def test_a_region_without_lanes(street: Path) -> None:
+def test_rejects_region_without_lanes(street: Path) -> None:
     sites(street, "a,20,210,3")
     statics(street)
     told = found(street, "roi.center_m=[20,200,2.5]")
@@ -247,7 +247,7 @@ def test_a_region_without_lanes(street: Path) -> None:
     }
 
 
-def test_a_region_above_the_road(street: Path) -> None:
+def test_rejects_region_above_road(street: Path) -> None:
     told = found(street, "roi.center_m=[20,0,22.5]")
     assert told["region"] == [
         "scenario.toml: roi: the region extends from z = 20 to 25 m, but the road is at z = 0.0 m"
@@ -257,7 +257,7 @@ def test_a_region_above_the_road(street: Path) -> None:
 # ---- all at once
 
 
-def test_everything_that_is_wrong_is_told_at_once(street: Path, run_egvs) -> None:
+def test_reports_all_errors_at_once(street: Path, run_egvs) -> None:
     sites(street, "in,10,1.6,3", "house,16,6,3")
     (street / "broken.geojson").write_text("{")
     settings = (
@@ -281,7 +281,7 @@ def test_everything_that_is_wrong_is_told_at_once(street: Path, run_egvs) -> Non
     assert not list((street / "out").glob("[!.]*"))
 
 
-def test_a_truncated_network_is_refused_before_anything_is_built(street: Path) -> None:
+def test_rejects_truncated_network_before_building(street: Path) -> None:
     (street / "net.net.xml").write_text(net_xml()[:300])
     told = found(street)
     assert list(told) == ["network"]
@@ -290,7 +290,7 @@ def test_a_truncated_network_is_refused_before_anything_is_built(street: Path) -
 
 
 @pytest.mark.parametrize("softness", [0, 0.3])
-def test_a_range_limit_without_a_rated_range_is_refused_first(street: Path, softness: float) -> None:
+def test_rejects_range_limit_without_rated_range(street: Path, softness: float) -> None:
     told = found(street, f"effects.range_limit={{reflectivity=0.1, softness={softness}}}")
     assert told == {"effects": ["effects.range_limit: sensor small: rated_range_m is missing"]}
 
@@ -298,7 +298,7 @@ def test_a_range_limit_without_a_rated_range_is_refused_first(street: Path, soft
 # ---- the command, and the run
 
 
-def test_the_command_says_so_when_nothing_is_found_and_writes_nothing(street: Path, run_egvs) -> None:
+def test_check_command_without_findings_writes_nothing(street: Path, run_egvs) -> None:
     before = sorted(street.rglob("*"))
     code, printed, _ = run_egvs("check", street)
     assert (code, printed.splitlines()) == (
@@ -309,7 +309,7 @@ def test_the_command_says_so_when_nothing_is_found_and_writes_nothing(street: Pa
 
 
 @pytest.mark.slow
-def test_a_run_keeps_the_warnings_and_shows_them(mini: Path, run_egvs) -> None:
+def test_run_records_and_shows_warnings(mini: Path, run_egvs) -> None:
     statics(mini, box((1000, 2000), (1010, 2010)))
     for state in ("nearest solid", "unchanged"):
         code, _, said = run_egvs("run", mini, "--out", mini / "out")
@@ -320,13 +320,13 @@ def test_a_run_keeps_the_warnings_and_shows_them(mini: Path, run_egvs) -> None:
     assert run_egvs("verify", mini / "out")[0] == 0
 
 
-def test_findings_errors_are_errors_of_input(street: Path) -> None:
+def test_diagnostics_error_is_input_error(street: Path) -> None:
     with pytest.raises(InputError) as caught:
         egvs.run(egvs.load(street, ['sites.sensor="smal"', "traffic.edge_weights={north=2}"]), street / "out")
     assert len(str(caught.value).splitlines()) == 2
 
 
-def test_a_table_with_beams_twice_is_told_with_the_beams(street: Path) -> None:
+def test_warns_of_repeated_beams(street: Path) -> None:
     """They count twice, since a table is taken as it is."""
     (street / "beams.csv").write_text("elevation_deg,azimuth_deg\n-5,0\n-5,90\n-5,360\n-9,0\n")
     told = found(street, 'sensors.own={beams="beams.csv",range_m=90}', 'sites.sensor="own"', 'sites.aim="roi"')
@@ -338,7 +338,7 @@ def test_a_table_with_beams_twice_is_told_with_the_beams(street: Path) -> None:
 # ---- files, and the keys of the stage
 
 
-def test_all_wrong_rows_of_a_sites_file_are_told_at_once(street: Path) -> None:
+def test_reports_all_wrong_rows_of_sites_file(street: Path) -> None:
     sites(street, "a,10,12,x", "b,10,12,3", "b,11,12,3", "c,,12,3", "d,10,12,3")
     assert found(street) == {
         "sites": [
@@ -349,13 +349,13 @@ def test_all_wrong_rows_of_a_sites_file_are_told_at_once(street: Path) -> None:
     }
 
 
-def test_what_is_the_same_of_many_sites_is_told_once(street: Path) -> None:
+def test_equal_findings_of_many_sites_are_joined(street: Path) -> None:
     """An aim needs the sensor, so each row is refused for it."""
     told = found(street, 'sites.sensor="smal"', 'sites.aim="roi"')
     assert told == {"sites": ["sites.csv: row pole_a: sensor and 1 more: unknown sensor 'smal'"]}
 
 
-def test_files_that_are_not_there_or_have_no_reader(street: Path) -> None:
+def test_reports_missing_files_and_unknown_formats(street: Path) -> None:
     (street / "sites.csv").write_text("site,x_m,y_m,z_m,points\na,10,12,3,gone.pcd\nb,12,12,3,scan.xyz\nc,14,12,3,\n")
     (street / "scan.xyz").write_text("")
     told = found(street, 'statics.polygons=["gone.poly.xml"]', 'sensors.own={beams="beams.csv",range_m=50}')
@@ -368,14 +368,14 @@ def test_files_that_are_not_there_or_have_no_reader(street: Path) -> None:
     assert len(told["files"]) == 4
 
 
-def test_a_periods_missing_file_is_told_once_where_it_is_named(street: Path) -> None:
+def test_missing_file_of_period_is_reported_once(street: Path) -> None:
     """The rules that would read it find it missing too."""
     told = found(street, 'traffic.periods=[{name="a",sumocfg="gone.sumocfg"},{name="b",vehicles=3}]')
     (line,) = (line for lines in told.values() for line in lines)
     assert line.startswith("scenario.toml: traffic.periods (a).sumocfg = 'gone.sumocfg': no such file")
 
 
-def test_warnings_are_told_beside_the_errors_that_stop_a_run(street: Path, run_egvs) -> None:
+def test_reports_warnings_beside_errors(street: Path, run_egvs) -> None:
     sites(street, "amid,10,1.6,3")
     code, _, err = run_egvs("run", street, "--set", "traffic.edge_weights={north=2}")
     assert code == 2
@@ -386,9 +386,7 @@ def test_warnings_are_told_beside_the_errors_that_stop_a_run(street: Path, run_e
 
 @pytest.mark.slow
 @pytest.mark.system
-def test_a_map_that_netconvert_refuses_is_wrong_input_and_told_once(
-    street: Path, monkeypatch: pytest.MonkeyPatch, run_egvs
-) -> None:
+def test_rejects_map_that_netconvert_rejects(street: Path, monkeypatch: pytest.MonkeyPatch, run_egvs) -> None:
     (street / "map.osm").write_text('<osm version="0.6"></osm>')
     monkeypatch.chdir(street.parent)
     code, _, err = run_egvs("check", street.name, "--set", 'traffic.network="map.osm"')
@@ -403,7 +401,7 @@ def test_a_map_that_netconvert_refuses_is_wrong_input_and_told_once(
     assert err.startswith(f"egvs: {street.name}/map.osm: is not well-formed XML: unclosed token")
 
 
-def test_counts_at_edges_and_of_kinds_that_are_not_there(street: Path) -> None:
+def test_reports_counts_at_unknown_edges_and_kinds(street: Path) -> None:
     counts = (
         '[{edge="east",per_hour=100},{edge="north",per_hour=9},{from_edge="east",to_edge="up",per_hour=9,kind="ox"}]'
     )
@@ -413,24 +411,24 @@ def test_counts_at_edges_and_of_kinds_that_are_not_there(street: Path) -> None:
     ]  # fmt: skip
 
 
-def test_a_count_on_a_way_that_nobody_can_drive_is_told_before_the_first_stage(street: Path) -> None:
+def test_rejects_count_on_impossible_route(street: Path) -> None:
     (told,) = found(street, 'traffic.counts=[{from_edge="east",to_edge="west",per_hour=9}]')["traffic"]
     assert told == "scenario.toml: traffic.counts (east to west): there is no way from 'east' to 'west'"
 
 
-def test_a_junction_whose_walking_areas_are_no_sound_outlines_sorts_out_places() -> None:
+def test_junction_with_invalid_walking_areas_drops_candidates() -> None:
     """Those of the hill, made valid, are areas with lines beside them, which GEOS subtracts from nothing."""
     roads = Carriageway.of(network.read_net_xml(SCENARIOS / "hill" / "network.net.xml"))
     at_m = np.array([[0.0, 0.0], [2.0, -2.0], [15.0, 14.0], [60.0, 12.0]])
     assert roads.in_junctions(at_m).tolist() == [True, True, False, False]
 
 
-def test_a_file_keeps_all_its_sites(street: Path) -> None:
+def test_file_keeps_all_sites(street: Path) -> None:
     with pytest.raises(InputError, match="only_free acts on grid and along"):
         egvs.load(street, ["sites.only_free=false"])
 
 
-def test_what_the_check_reads_makes_it_again(street: Path) -> None:
+def test_changed_input_repeats_check(street: Path) -> None:
     """Each file that it reads, and no setting of what comes of a run."""
     (street / "scan.csv").write_text("x_m,y_m,z_m\n30.5,0,0\n")
     (street / "sites.csv").write_text("site,x_m,y_m,z_m,points\na,10,12,3,\nb,12,12,3,scan.csv\n")
@@ -452,7 +450,7 @@ def test_what_the_check_reads_makes_it_again(street: Path) -> None:
     assert key() != before
 
 
-def test_a_map_is_converted_once_for_all_who_ask(street: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_map_is_converted_once(street: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The check, the rule of sites and the traffic all need the network of a map."""
     calls = []
 

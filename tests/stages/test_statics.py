@@ -12,7 +12,7 @@ from egvs.runs import run
 
 
 @pytest.mark.system
-def test_another_buffer_makes_the_statics_anew(mini: Path, tmp_path: Path) -> None:
+def test_changed_mesh_buffer_repeats_statics(mini: Path, tmp_path: Path) -> None:
     out, scenario = tmp_path / "out", mini / "scenario.toml"
     scenario.write_text(scenario.read_text() + '\n[[statics.meshes]]\nfile = "box.gltf"\nkind = "building"\n')
 
@@ -38,13 +38,13 @@ def test_another_buffer_makes_the_statics_anew(mini: Path, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"buffers": 3}', '{"buffers": [{"uri": 5}, 7]}', "[" * 100_000])
-def test_a_damaged_file_pulls_in_nothing(tmp_path: Path, text: str) -> None:
+def test_damaged_mesh_references_no_file(tmp_path: Path, text: str) -> None:
     for name in ("a.gltf", "a.glb", "a.obj"):
         (tmp_path / name).write_text(text)
         assert referenced_files(tmp_path / name) == []
 
 
-def test_parts_of_glb_and_obj(tmp_path: Path) -> None:
+def test_referenced_files_of_glb_and_obj(tmp_path: Path) -> None:
     (tmp_path / "b.bin").write_bytes(b"")
     body = b'{"buffers": [{"uri": "b.bin"}, {"uri": "data:,"}, {"uri": "absent.bin"}]}'
     (tmp_path / "a.glb").write_bytes(b"glTF" + bytes(8) + len(body).to_bytes(4, "little") + b"JSON" + body)
@@ -67,12 +67,12 @@ def test_textures_and_percent_encoded_names(tmp_path: Path) -> None:
     assert [part.name for part in referenced_files(tmp_path / "a.ply")] == ["c.png"]
 
 
-def test_a_name_that_no_file_can_have_is_none(tmp_path: Path) -> None:
+def test_impossible_file_name_is_ignored(tmp_path: Path) -> None:
     (tmp_path / "a.obj").write_bytes(b"mtllib " + b"x" * 5000 + b"\nmtllib \0\n")
     assert referenced_files(tmp_path / "a.obj") == []
 
 
-def test_digests_tell_parts_of_one_name_apart(tmp_path: Path) -> None:
+def test_digests_distinguish_files_of_equal_name(tmp_path: Path) -> None:
     for folder in ("a", "b"):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "t.bin").write_text(folder)

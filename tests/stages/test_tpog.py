@@ -23,7 +23,7 @@ def warnings(folder: Path, out: Path, *settings: str) -> dict[str, list[str]]:
     return {name: lines for name, lines in told.items() if lines}
 
 
-def test_two_vehicles_in_a_mean_frame_are_enough(mini: Path, tmp_path: Path) -> None:
+def test_two_vehicles_per_frame_are_enough(mini: Path, tmp_path: Path) -> None:
     """Two cars pass each other along the whole region, but in the first and last frames one of them is outside."""
     assert list(occupancy.warn_empty_region(2.0, tmp_path / "is not read")) == []
     assert warnings(mini, tmp_path / "out") == {}
@@ -34,7 +34,7 @@ def test_two_vehicles_in_a_mean_frame_are_enough(mini: Path, tmp_path: Path) -> 
     )
 
 
-def test_a_region_that_no_vehicle_enters(mini: Path, tmp_path: Path) -> None:
+def test_warns_of_region_without_vehicles(mini: Path, tmp_path: Path) -> None:
     sites(mini, "a,10,52,3")
     told = warnings(mini, tmp_path / "out", "roi.center_m=[20,60,2.5]")
     assert told == {
@@ -48,7 +48,7 @@ def test_a_region_that_no_vehicle_enters(mini: Path, tmp_path: Path) -> None:
     }
 
 
-def test_vehicles_that_drive_through_a_wall_are_told_with_the_place(mini: Path, tmp_path: Path) -> None:
+def test_warns_of_vehicles_driving_through_solid(mini: Path, tmp_path: Path) -> None:
     """A wall across the lane of one car, which goes through it at 2 m a second; the house is beside the road."""
     statics(mini, box((20, -3), (22, -1), "wall", kind="wall"), box((14, 5), (18, 8), "house", height_m=6))
     lines = warnings(mini, tmp_path / "out")["tpog"]
@@ -67,7 +67,7 @@ def test_vehicles_that_drive_through_a_wall_are_told_with_the_place(mini: Path, 
 @pytest.mark.parametrize(
     ("row", "is_found"), [("in,20,-2,3", True), ("gantry,20,-2,4.6", False), ("off,20,-4,3", False)]
 )
-def test_a_site_where_recorded_vehicles_drive(mini: Path, tmp_path: Path, row: str, is_found: bool) -> None:
+def test_warns_of_site_where_vehicles_drive(mini: Path, tmp_path: Path, row: str, is_found: bool) -> None:
     """With a finished file the record alone tells the road: the car of 1.8 m drives along y = -2."""
     sites(mini, row)
     told = warnings(mini, tmp_path / "out")

@@ -43,9 +43,7 @@ def simulated(street: Path, source: str) -> None:
         ("<routes/>", '<additional><calibrator><flow begin="0"/></calibrator></additional>', False),
     ],
 )
-def test_a_configuration_without_vehicles_is_told_before_it_is_simulated(
-    street: Path, routes: str, additional: str, is_found: bool
-) -> None:
+def test_rejects_configuration_without_vehicles(street: Path, routes: str, additional: str, is_found: bool) -> None:
     (street / "more.add.xml").write_text(additional)
     configured(street, routes, additional="more.add.xml" if additional else "")
     simulated(street, 'sumocfg = "own.sumocfg"\n')
@@ -70,16 +68,14 @@ def test_a_configuration_without_vehicles_is_told_before_it_is_simulated(
         ),
     ],
 )
-def test_what_sumo_may_not_read_is_told_before_it_is_simulated(
-    street: Path, routes: str, additional: str, told: str
-) -> None:
+def test_rejects_files_that_sumo_may_not_read(street: Path, routes: str, additional: str, told: str) -> None:
     (street / "more.add.xml").write_text(additional)
     configured(street, routes, additional="more.add.xml" if additional else "")
     simulated(street, 'sumocfg = "own.sumocfg"\n')
     assert found(street).get("traffic", []) == [told]
 
 
-def test_routes_of_a_period_without_vehicles_are_told_with_its_name(street: Path, run_egvs) -> None:
+def test_rejects_period_routes_without_vehicles(street: Path, run_egvs) -> None:
     configured(street, DEMAND, name="day")
     configured(street, "<routes/>", name="night")
     simulated(street, 'network = "net.net.xml"\n')
@@ -93,14 +89,14 @@ def test_routes_of_a_period_without_vehicles_are_told_with_its_name(street: Path
     assert not list((street / "out").glob("*.p*"))
 
 
-def test_an_effect_may_bring_the_traffic(street: Path) -> None:
+def test_effect_may_add_all_traffic(street: Path) -> None:
     configured(street, "<routes/>")
     simulated(street, 'sumocfg = "own.sumocfg"\n')
     assert "traffic" not in found(street, "effects.pedestrians_bicycles={bicycles_per_h=100}")
 
 
 @pytest.mark.parametrize("lasts", ["length_s=10", ""])
-def test_weights_that_no_mix_can_have_are_told_before_the_first_stage(mini: Path, lasts: str) -> None:
+def test_rejects_weights_of_too_large_mix(mini: Path, lasts: str) -> None:
     """Also where a finished file alone says how many frames there are; the message stays short."""
     of = [
         f'{{name="{name}",weight={weight}{f",{lasts}" * bool(lasts)}}}'
@@ -152,7 +148,7 @@ MAPPED = net_xml().replace('projParameter="!"', f'projParameter="{UTM}"').replac
         (net_xml(), net_xml().replace("0.00,0.00", "9.00,0.00"), None),  # made without a map: zeros say nothing
     ],
 )
-def test_a_period_whose_network_lies_elsewhere_is_told(street: Path, first: str, other: str, told: str | None) -> None:
+def test_rejects_period_network_elsewhere(street: Path, first: str, other: str, told: str | None) -> None:
     (street / "net.net.xml").write_text(first)
     (street / "other.net.xml").write_text(other)
     for name in ("day", "night"):
@@ -167,7 +163,7 @@ def test_a_period_whose_network_lies_elsewhere_is_told(street: Path, first: str,
     assert found(street).get("region", []) == ([] if told is None else [place + told])
 
 
-def test_a_period_that_nobody_drives_in_is_told() -> None:
+def test_warns_of_period_without_traffic() -> None:
     (told,) = occupancy.warn_empty_periods({"day": 3.0, "night": 0.0})
     assert told.where == "scenario.toml: traffic.periods (night)"
     assert "no vehicle ever enters the region" in told.problem

@@ -559,7 +559,7 @@ def test_what_was_kept_and_removed_or_damaged_is_made_again(
         path.write_bytes(b"bad")
     again = study_of(mini, [], tmp_path / "out", budget_s=0.001)
     assert compared(again) == compared(study)
-    assert "the kept tpog is damaged" in capsys.readouterr().err
+    assert "the cached tpog is damaged" in capsys.readouterr().err
     assert not (tmp_path / "out" / "accuracy" / ".work-left").exists()
 
 
