@@ -79,7 +79,7 @@ def test_lanes_junctions_sidewalks_and_the_location_are_views_of_one_reading(tmp
 def test_a_shape_without_coordinates_is_named_when_it_is_asked_for(tmp_path):
     path = tmp_path / "n.net.xml"
     path.write_text(WALKED.replace("0,0 5,5", "0,0 near,1 5,5"))
-    with pytest.raises(InputError, match=r"n\.net\.xml: lane out_0: a shape holds no coordinates \(.*'near'"):
+    with pytest.raises(InputError, match=r"n\.net\.xml: lane out_0: invalid coordinates in a shape \(.*'near'"):
         _ = network.read_net_xml(path).edges[1].lanes[0].shape_m
 
 
@@ -160,10 +160,10 @@ def test_a_coordinate_of_no_place_on_earth_is_refused(tmp_path: Path, far: str) 
     """Of a road; of a lane that is not a road's, when somebody asks for it."""
     text = '<net><edge id="e" from="a" to="b"><lane id="e_0" shape="0,0,1 {},9,2"/></edge></net>'
     (tmp_path / "n.net.xml").write_text(text.format(far))
-    with pytest.raises(InputError, match=rf"n.net.xml: <edge id='e'> is not as .*coordinate {far} is beyond 1e\+08 m"):
+    with pytest.raises(InputError, match=rf"n.net.xml: invalid <edge id='e'>.*coordinate {far} is beyond 1e\+08 m"):
         network.read_net_xml(tmp_path / "n.net.xml")
     shape = network.Shape(f"0,0 {far},1", "n.net.xml: lane x")
-    with pytest.raises(InputError, match=rf"n.net.xml: lane x: a shape holds no coordinates \(the coordinate {far}"):
+    with pytest.raises(InputError, match=rf"n.net.xml: lane x: invalid coordinates in a shape \(the coordinate {far}"):
         _ = shape.shape_m
 
 

@@ -19,7 +19,9 @@ def fake_sumo(folder, monkeypatch, script):
 def test_a_missing_system_library_is_named_with_its_packages(tmp_path, monkeypatch):
     says = "sumo: error while loading shared libraries: libX11.so.6: cannot open shared object file: No such file"
     fake_sumo(tmp_path, monkeypatch, f"echo '{says}' >&2; exit 127")
-    with pytest.raises(MissingBackendError, match=r"libX11\.so\.6 is missing; on Debian: apt-get install .*libx11-6"):
+    with pytest.raises(
+        MissingBackendError, match=r"libX11\.so\.6 is missing. On Debian, run apt-get install .*libx11-6"
+    ):
         sumo.run_program("sumo", ["--version"], tmp_path)
 
 

@@ -153,12 +153,12 @@ def test_traci_to_nobody_is_refused(town, tmp_path):
 )
 def test_who_does_not_answer_as_sumo_does_is_refused(town, tmp_path, monkeypatch, answer):
     """One that listens and is silent, and some that say something else, and wait."""
-    monkeypatch.setattr(sumo, "_ANSWERS_WITHIN_S", 0.2)
+    monkeypatch.setattr(sumo, "_ANSWER_TIMEOUT_S", 0.2)
     with socket.create_server(("localhost", 0)) as server, ThreadPoolExecutor(1) as threads:
         taken = threads.submit(server.accept)
         port = server.getsockname()[1]
         answered = threads.submit(lambda: taken.result()[0].sendall(answer))
-        with pytest.raises(InputError, match=r"who listens there does not answer as SUMO does within 0\.2 s"):
+        with pytest.raises(InputError, match=r"the server there does not answer as SUMO does within 0\.2 s"):
             run_stage(traffic, scenario(town, network="net.xml", **SMALL), tmp_path, traci=("localhost", port))
         answered.result()
         taken.result()[0].close()
@@ -167,12 +167,12 @@ def test_who_does_not_answer_as_sumo_does_is_refused(town, tmp_path, monkeypatch
 
 @pytest.mark.usefixtures("patient")
 def test_a_sumo_that_falls_silent_is_told(town, recorded, tmp_path, monkeypatch):
-    monkeypatch.setattr(sumo, "_STEPS_WITHIN_S", 0.2)
+    monkeypatch.setattr(sumo, "_STEP_TIMEOUT_S", 0.2)
     process, port = serve(recorded[3] / "sumo")
     with process:
         try:
             with (
-                pytest.raises(RunError, match=rf"SUMO at localhost:{port} ended .*, or did not answer for 0\.2 s"),
+                pytest.raises(RunError, match=rf"SUMO at localhost:{port} closed .*, or did not answer for 0\.2 s"),
                 sumo.connect_traci("localhost", port) as connection,
             ):
                 process.send_signal(signal.SIGSTOP)

@@ -76,7 +76,7 @@ BAD = {
         write("e.xml", '<net><edge id="a" from="b"/></net>'),
         {"network": "e.xml"},
         InputError,
-        r"<edge id='a'> is not as in a",
+        r"invalid <edge id='a'>",
     ),
     "kind unknown to SUMO": (
         nothing,

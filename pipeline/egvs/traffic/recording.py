@@ -385,14 +385,14 @@ def check_complete(prepared: SimulationFolder) -> None:
         and _vehicle_counts(prepared)["running"]
         and (_last_time_ms(folder / FCD_FILE) or 0) < last_ms
     ):
-        raise sumo.truncated_file_error(folder / FCD_FILE)
+        raise sumo.incomplete_file_error(folder / FCD_FILE)
 
 
 def _last_time_ms(path: Path) -> int | None:
     """The time of the last whole row of a CSV that is being written."""
     if not path.is_file():
         return None
-    lines = sumo.last_bytes(path).split(b"\n")
+    lines = sumo.read_tail(path).split(b"\n")
     try:
         return round(float(lines[-2].split(b";")[0]) * 1000) if len(lines) > 2 else None
     except ValueError:

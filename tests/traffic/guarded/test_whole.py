@@ -17,7 +17,7 @@ def test_a_full_disk_is_told(town, tmp_path, monkeypatch, blocks):
     limited.write_text(f"#!/bin/sh\ntrap '' XFSZ\nulimit -f {blocks}\n{sumo.sumo_binary('sumo')} \"$@\"\nexit 0\n")
     limited.chmod(0o755)
     monkeypatch.setenv("SUMO_BINARY", str(limited))
-    with pytest.raises(RunError, match=r"fcd\.csv: SUMO did not write it to its end; is the disk full\? \([\d,]+ MB"):
+    with pytest.raises(RunError, match=r"fcd\.csv: SUMO wrote an incomplete file. Is the disk full\? \([\d,]+ MB"):
         run_stage(traffic, scenario(town, network="net.xml", **SMALL), tmp_path / "out")
 
 
@@ -43,14 +43,14 @@ def empty(path):
 )  # fmt: skip
 def test_a_file_that_is_cut_is_told(place, tmp_path, monkeypatch, name, damage):
     damaged(monkeypatch, name, damage)
-    with pytest.raises(RunError, match=f"{name}: SUMO did not write it to its end"):
+    with pytest.raises(RunError, match=f"{name}: SUMO wrote an incomplete file"):
         run_stage(traffic, configured(place), tmp_path / "out")
 
 
 @pytest.mark.parametrize(
     ("hold", "message"),
     [
-        ("at_most", r"fcd\.csv: SUMO did not write it to its end"),
+        ("at_most", r"fcd\.csv: SUMO wrote an incomplete file"),
         ("exactly", r"12 vehicles are in 1\d\d of 240 frames"),
     ],
 )
@@ -74,7 +74,7 @@ def damaged(monkeypatch, name, damage):
 
 def test_a_network_that_netconvert_did_not_write_to_its_end_is_told(tmp_path, monkeypatch):
     monkeypatch.setattr(sumo, "run_program", lambda *_: (tmp_path / "a.net.xml").write_text("<net>\n <edge"))
-    with pytest.raises(RunError, match=r"a\.net\.xml: SUMO did not write it to its end; is the disk full\?"):
+    with pytest.raises(RunError, match=r"a\.net\.xml: SUMO wrote an incomplete file. Is the disk full\?"):
         sumo.run_netconvert([], tmp_path, "a.net.xml")
     monkeypatch.setattr(sumo, "run_program", lambda *_: (tmp_path / "a.net.xml").write_text("<net>\n</net>\n"))
     sumo.run_netconvert([], tmp_path, "a.net.xml")
