@@ -60,7 +60,7 @@ def test_a_configuration_without_vehicles_is_told_before_it_is_simulated(
         (
             "<routes/>",
             '<additional><include href="more.xml"/></additional>',
-            "more.add.xml: <include href='more.xml'> has SUMO read a further file",
+            "more.add.xml: <include href='more.xml'> makes SUMO read a further file",
         ),
         ("<routes", "", "own.rou.xml: is not well-formed XML: unclosed token: line 1, column 0"),
         (

@@ -185,7 +185,7 @@ def test_the_files_are_what_sumo_writes(city: City) -> None:
          "city.toml: traffic.periods.0.name: 'a/b'"),
         ("city.toml", "seed = 7", "seed = 7\n[effects.rain]\nrate_mm_h = 20.0\n",
          "city.toml: effects.rain: adds no traffic; in junctions/scenario.toml"),
-        ("city.toml", 'name = "bus"', 'name = "coach"', "vehicle type 'bus' of fcd.csv has no known size"),
+        ("city.toml", 'name = "bus"', 'name = "coach"', "the size of vehicle type 'bus' of fcd.csv is unknown"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_told_in_one_message(city: City, file: str, old: str, new: str, told: str) -> None:
@@ -291,10 +291,10 @@ def test_two_processes_do_not_make_it_at_once(city: City) -> None:
 @pytest.mark.parametrize(
     ("changed", "told"),
     [
-        ({"frames": 0}, "its metadata says frames = 0"),
+        ({"frames": 0}, "invalid metadata: frames = 0"),
         ({"types": {"car": {"length_m": -1, "width_m": 1, "height_m": 1, "vclass": "bus"}}}, "types.car.length_m = -1"),
-        ({"more": 1}, "its metadata says more = 1"),
-        (b"{", "its metadata is no JSON"),
+        ({"more": 1}, "invalid metadata: more = 1"),
+        (b"{", "its metadata is not valid JSON"),
     ],
 )
 def test_a_file_that_says_nonsense_of_itself_is_refused(city: City, changed: dict | bytes, told: str) -> None:

@@ -65,7 +65,9 @@ def test_drawn_trips_follow_the_lanes_of_the_network(town, tmp_path):
 
 def test_a_network_that_cannot_hold_what_its_lanes_call_for_says_so(town, tmp_path):
     keys = {"network": "net.xml", "frames": 40, "warmup_s": 60.0, "vehicles_per_lane_km": 100.0}
-    with pytest.raises(RunError, match=r"4\d\d vehicles are in 0 of 40 frames.*vehicles_per_lane_km"):
+    with pytest.raises(
+        RunError, match=r"expected 4\d\d vehicles in every frame, got them in 0 of 40 frames.*vehicles_per_lane_km"
+    ):
         run_stage(traffic, scenario(town, **keys), tmp_path)
 
 

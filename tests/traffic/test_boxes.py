@@ -63,7 +63,7 @@ def test_boxes_are_sorted_by_frame_and_vehicle_and_carry_their_types_size():
 
 
 def test_a_type_without_a_size_is_named():
-    with pytest.raises(InputError, match=r"vehicle type 'tram' has no known size; .*known: bus, car"):
+    with pytest.raises(InputError, match=r"the size of vehicle type 'tram' is unknown.*known: bus, car"):
         vehicle_boxes.boxes_from_bumpers(group_of([(0, "v", "tram", 0, 0, 0, 1)]), SIZES, 1.0, "place")
 
 
@@ -71,7 +71,7 @@ def test_a_type_without_a_size_is_named():
 def test_a_size_that_no_vehicle_has_is_named(width_m):
     sizes = {"car": dataclasses.replace(SIZES["car"], width_m=width_m)}
     with pytest.raises(
-        InputError, match=r"place: vehicle type 'car' has width_m = .*; at least 0.001 m, at most 2000 m"
+        InputError, match=r"place: vehicle type 'car' has width_m = .*at least 0.001 m and at most 2000 m"
     ):
         vehicle_boxes.boxes_from_bumpers(group_of([(0, "v", "car", 0, 0, 0, 1)]), sizes, 1.0, "place")
 

@@ -30,15 +30,15 @@ def test_who_stands_longer_than_a_signal_keeps_it_is_told_with_the_place():
     rows = [(f, "stuck", "car", 100, 62, 0, 0.0 if 10 <= f < 210 else 5.0) for f in range(300)]
     rows += [(f, "parked", "car", 0, 20 if f < 299 else 30, 0, 0.0) for f in range(300)]
     tally = counted(rows, on_purpose={"parked"})
-    (found,) = trajectories.traffic_warnings(tally, recorded(patience_s=180.0), ROI)
+    (found,) = trajectories.traffic_warnings(tally, recorded(standing_limit_s=180.0), ROI)
     assert found.rule == "standing" and not found.is_error
     assert found.where == "s.toml: traffic: x 100 m, y 60 m (76 m from the region of interest)"  # the box's centre
-    assert found.problem.startswith("vehicle 'stuck' stood there for 199 s")
+    assert found.problem.startswith("vehicle 'stuck' was standing for 199 s")
     assert tally.to_json(1.0)["longest_standing_s"] == 299
     short = counted([row for row in rows if row[0] < 130])
-    assert [d.rule for d in trajectories.traffic_warnings(short, recorded(patience_s=180.0), ROI)] == ["standing"]
+    assert [d.rule for d in trajectories.traffic_warnings(short, recorded(standing_limit_s=180.0), ROI)] == ["standing"]
     brief = counted([row for row in rows if row[0] < 100])
-    assert trajectories.traffic_warnings(brief, recorded(patience_s=180.0), ROI) == []
+    assert trajectories.traffic_warnings(brief, recorded(standing_limit_s=180.0), ROI) == []
     assert trajectories.traffic_warnings(tally, recorded(), ROI) == []  # of a finished file nothing is promised
 
 
@@ -49,7 +49,7 @@ def test_overlaps_in_many_frames_are_told_where_most_are():
     (found,) = trajectories.traffic_warnings(counted(sorted(rows)), recorded(), ROI)
     assert found.rule == "overlaps"
     assert found.where == "s.toml: traffic: x 10 m, y 30 m (in the region of interest)"
-    assert found.problem == "vehicles overlap in 7% of the frames; 20 of 25 pairs do so there"
+    assert found.problem == "vehicles overlap in 7% of the frames; 20 of 25 overlaps are here"
 
 
 COLLISION = '<collision time="{}" lane="{}" collider="{}" victim="{}"{}/>'
@@ -64,11 +64,11 @@ def test_collisions_are_told_with_junction_and_edge(tmp_path):
     text = "".join(COLLISION.format(*one) for one in seen)
     (tmp_path / sumo_folder.COLLISIONS_FILE).write_text(f"<collisions>{text}</collisions>")
     prepared = SimpleNamespace(folder=tmp_path, timing=SimpleNamespace(first_ms=10_000))
-    crashes = recording._collisions(prepared)
+    crashes = recording._read_collisions(prepared)
     assert len(crashes) == 4
     (found,) = recording._collision_warning(crashes, scenario(tmp_path, network="net.xml"))
     assert found.problem == (
-        "4 pairs of vehicles collided, and drove on through each other: 2 at junction J_1 (in the region of interest), "
+        "4 pairs of vehicles collided and drove through each other: 2 at junction J_1 (in the region of interest), "
         "1 at edge out (300 m from the region of interest), 1 at edge old"
     )
     assert recording._collision_warning({}, scenario(tmp_path, network="net.xml")) == []
@@ -83,7 +83,7 @@ def test_a_demand_that_does_not_fit_is_told(town, tmp_path):
     keys = {"network": str(town / "net.xml"), "routes": ["own.rou.xml"], "frames": 60, "warmup_s": 10.0}
     result = run_stage(traffic, scenario(tmp_path, **keys), tmp_path / "out")
     found = [warning for warning in result["warnings"] if warning["rule"] == "waiting"]
-    assert len(found) == 1 and "vehicles could not start to the end" in found[0]["problem"]
+    assert len(found) == 1 and "vehicles could not start" in found[0]["problem"]
     assert not (tmp_path / "out" / "sumo" / "statistics.xml").exists()
 
 

@@ -99,8 +99,8 @@ def test_two_extensions_have_a_route_file_each_and_change_boxes_one_after_anothe
 
 def test_what_an_extension_refuses_is_raised_before_anything_is_laid_out(town, tmp_path):
     class Choosy(Guests):
-        def refuses(self, scenario):
-            return InputError("guests", "this is no place for guests", "another place")
+        def scenario_error(self, scenario):
+            return InputError("guests", "this is no place for guests", "Use another place.")
 
     with pytest.raises(InputError, match="no place for guests"):
         recorded(scenario(town, network="net.xml", **SMALL), tmp_path, Choosy(EffectParameters()))

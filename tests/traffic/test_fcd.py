@@ -105,16 +105,19 @@ BAD = {
     "without angle": (HEADER.replace("vehicle_angle", "vehicle_lane").encode() + b"\n", "no column for 'angle'"),
     "without type": (HEADER.replace("vehicle_type", "vehicle_lane").encode() + b"\n", "no column for 'type'"),
     "not a number": (f"{HEADER}\n{row(x='here')}\n".encode(), r"cannot be read as CSV.*here"),
-    "NaN angle": (f"{HEADER}\n{row()}\n{row(angle='nan')}\n".encode(), r"row 2: angle of vehicle 'v' is nan; a finite"),
+    "NaN angle": (
+        f"{HEADER}\n{row()}\n{row(angle='nan')}\n".encode(),
+        r"row 2: angle of vehicle 'v' is nan. Use a finite",
+    ),
     "empty angle": (f"{HEADER}\n{row(angle='')}\n".encode(), r"row 1: angle of vehicle 'v' is empty"),
     "x beyond the Earth": (
         f"{HEADER}\n{row(x='1e9')}\n".encode(),
-        r"row 1: x of vehicle 'v' is 1000000000.0; a finite number, at most",
+        r"row 1: x of vehicle 'v' is 1000000000.0. Use a finite number, at most",
     ),
     "infinite x": (f"{HEADER}\n{row(x='inf')}\n".encode(), r"row 1: x of vehicle 'v' is inf"),
     "no type given": (f"{HEADER}\n{row(type='')}\n".encode(), r"row 1: vehicle 'v' has no type"),
     "time runs back": (f"{HEADER}\n{row(time='2')}\n{row()}\n".encode(), r"row 2: time 1 s comes after 2 s"),
-    "time too fine": (f"{HEADER}\n{row(time='0.0005')}\n".encode(), r"row 1: time 0\.000500 s.*milliseconds"),
+    "time too fine": (f"{HEADER}\n{row(time='0.0005')}\n".encode(), r"row 1: .*milliseconds, got time 0\.000500 s"),
     "clock time": (f"{HEADER}\n{row(time='00:00:01')}\n".encode(), r"cannot be read as CSV"),
     "short row": (f"{HEADER}\n{row()}\n1.0;v;1\n".encode(), r"cannot be read as CSV"),
     "truncated gzip, CSV": (gzip.compress(CSV.encode() * 900)[:-30], r"damaged gzip|cannot be read as CSV"),
@@ -134,7 +137,7 @@ BAD = {
     "Parquet with an id that is no text": (parquet_bytes(b"\xff"), r"cannot be read as Parquet \(.*UTF8"),
     "infinite speed": (
         f"{HEADER}\n{row(speed='inf')}\n".encode(),
-        r"row 1: speed of vehicle 'v' is inf; a finite number",
+        r"row 1: speed of vehicle 'v' is inf. Use a finite number",
     ),
 }
 
@@ -198,12 +201,12 @@ def test_too_few_frames_are_counted():
 
 
 def test_a_period_between_the_files_steps_is_refused():
-    with pytest.raises(InputError, match=r"frame_period_s = 0.25: the file's time steps are 1 s apart"):
+    with pytest.raises(InputError, match=r"frame_period_s = 0.25: the time steps of the file are 1 s apart"):
         list(group_frames([steps(0, 1, 2, 3)], FrameWindow(2, 250), 10, "place"))
 
 
 def test_a_file_without_vehicles_is_refused():
-    with pytest.raises(InputError, match="holds no vehicle"):
+    with pytest.raises(InputError, match="the file has no vehicle"):
         list(group_frames([], FrameWindow(2, 250), 10, "place"))
 
 
@@ -233,7 +236,7 @@ def test_frames_of_too_many_vehicles_are_refused(monkeypatch):
     monkeypatch.setenv("EGVS_MAX_ROWS", "5")
     tables = [steps(*[0.0] * 4), steps(*[0.0] * 4)]
     with pytest.raises(
-        InputError, match=r"has more than 5 vehicles in frames side by side\. The limit is 5 rows; set EGVS_MAX_RO"
+        InputError, match=r"has more than 5 vehicles in the frames of a group\. The limit is 5 rows; set EGVS_MAX_RO"
     ):
         list(group_frames(tables, FrameWindow(1, 1000), 1, "here"))
 
@@ -247,7 +250,7 @@ def test_a_parquet_file_of_more_rows_than_it_can_hold_is_refused(tmp_path):
     pq.write_table(pa.table(columns), tmp_path / "f.parquet", compression="zstd")
     (tmp_path / "f.parquet.gz").write_bytes(gzip.compress((tmp_path / "f.parquet").read_bytes()))
     for name in ("f.parquet", "f.parquet.gz"):
-        with pytest.raises(InputError, match=rf"{name}: says that it holds 3,000,000 rows in [0-9,]+ bytes; a whole"):
+        with pytest.raises(InputError, match=rf"{name}: declares 3,000,000 rows in [0-9,]+ bytes"):
             read_all(tmp_path / name)
 
 

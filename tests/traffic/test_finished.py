@@ -117,7 +117,7 @@ def test_too_few_frames_for_the_blocks_are_told(mini: Path, tmp_path: Path, run_
 def test_a_warm_up_longer_than_the_file_is_told(mini: Path, tmp_path: Path, run_egvs) -> None:
     code, _, said = run_egvs("run", unsaid(mini), "--set", "traffic.warmup_s=20", "--out", tmp_path)
     assert code == 2
-    assert "traffic.warmup_s = 20: fcd.csv lasts 19.5 s; a shorter warm-up" in said
+    assert "traffic.warmup_s = 20: the duration of fcd.csv is 19.5 s" in said
 
 
 def test_a_simulation_still_has_its_default_length() -> None:
@@ -169,7 +169,10 @@ def test_all_missing_kinds_are_asked_for_at_once(mini: Path, tmp_path: Path, run
     retyped(mini, "tram", "car", "lorry", "car")
     code, _, said = run_egvs("run", mini, "--out", tmp_path)
     assert code == 2
-    assert "traffic.kinds: vehicle types 'lorry', 'tram' of fcd.csv have no known size; a kind of each name" in said
+    assert (
+        "traffic.kinds: the sizes of vehicle types 'lorry', 'tram' of fcd.csv are unknown. Add a kind of each name"
+        in said
+    )
     assert "vtypes (known: car)" in said
     head, _, _ = fcd().rpartition(";car;")
     (mini / "fcd.csv").write_text(f"{head};tram;1.7\n")  # at 19.5 s, beyond the frames that are asked for below
@@ -180,15 +183,15 @@ def test_all_missing_kinds_are_asked_for_at_once(mini: Path, tmp_path: Path, run
 @pytest.mark.parametrize(
     ("files", "message"),
     [
-        (["<additional/>"], r"types0\.xml: has no <vType>; a SUMO file"),
-        (["<additional><vType/></additional>"], "a <vType> without id; each <vType> once, with an id"),
+        (["<additional/>"], r"types0\.xml: the file has no <vType>"),
+        (["<additional><vType/></additional>"], "a <vType> has no id"),
         ([f"<a>{LORRY}{LORRY}</a>"], "a second <vType> 'lorry'"),
         ([f"<a>{LORRY}</a>"] * 2, r"types1\.xml: a second <vType> 'lorry'"),
-        (["<a><vType id='x' vClass='lorry'/></a>"], "vType x: vClass: 'lorry'; a vClass of SUMO"),
-        *(([f"<a><vType id='x' height='{height}'/></a>"], f"vType x: height: '{height}'; a length of at least 0.001 m")
+        (["<a><vType id='x' vClass='lorry'/></a>"], "vType x: vClass: unknown vClass 'lorry'"),
+        *(([f"<a><vType id='x' height='{height}'/></a>"], f"vType x: height: expected a length, got '{height}'")
           for height in ("tall", "0", "-1", "nan", "inf", "1e-300", "2001", "1_0", "٣")),
         (["<a><vType id='x'></a>"], "is not well-formed XML"),
-        (["<a><vType id='x y&gt;'/></a>"], r"types0\.xml: SUMO does not take its types: sumo ended with exit code 1:"),
+        (["<a><vType id='x y&gt;'/></a>"], r"types0\.xml: SUMO rejects the vehicle types: sumo ended with exit code 1:"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_with_a_file_of_vtypes_is_said(
@@ -210,8 +213,8 @@ def test_vtypes_act_on_a_finished_file_alone(mini: Path) -> None:
     ("override", "message"),
     [
         ("traffic.frames=400", r"frames = 400: fcd\.csv has 40 frames 0\.5 s apart"),
-        ("traffic.frame_period_s=0.75", r"frame_period_s = 0\.75: fcd\.csv's time steps are 0\.5 s apart"),
-        ("traffic.warmup_s=20", r"warmup_s = 20: fcd\.csv lasts 19\.5 s"),
+        ("traffic.frame_period_s=0.75", r"frame_period_s = 0\.75: the time steps of fcd\.csv are 0\.5 s apart"),
+        ("traffic.warmup_s=20", r"warmup_s = 20: the duration of fcd\.csv is 19\.5 s"),
     ],
 )
 def test_what_a_file_does_not_hold_is_told_by_the_check(mini: Path, run_egvs, override: str, message: str) -> None:
@@ -224,7 +227,7 @@ def test_sizes_are_missed_by_the_check(mini: Path, run_egvs) -> None:
     retyped(mini, "tram", "car", "lorry", "DEFAULT_VEHTYPE")
     code, said, _ = run_egvs("check", mini)
     assert code == 2
-    assert "vehicle types 'lorry', 'tram' of fcd.csv have no known size" in said
+    assert "vehicle types 'lorry', 'tram' of fcd.csv are unknown" in said
 
 
 # ---- on which roads

@@ -26,19 +26,19 @@ BAD = {
         nothing,
         {"network": "net.xml", "frame_period_s": 0.3},
         InputError,
-        r"traffic\.frame_period_s = 0\.3: is no whole number of steps of 0\.25 s; for example 0\.25 or 0\.5",
+        r"traffic\.frame_period_s = 0\.3: expected a multiple of the step of 0\.25 s. Use 0\.25 or 0\.5",
     ),
     "warm-up between steps": (
         nothing,
         {"network": "net.xml", "warmup_s": 10.1},
         InputError,
-        r"warmup_s = 10\.1: is no whole",
+        r"warmup_s = 10\.1: expected a multiple",
     ),
     "step below a millisecond": (
         nothing,
         {"network": "net.xml", "step_s": 0.0004},
         InputError,
-        r"step_s = 0\.0004: is no whole number of milliseconds",
+        r"step_s = 0\.0004: expected a whole number of milliseconds",
     ),
     "no network": (
         nothing,
@@ -95,7 +95,7 @@ BAD = {
         write("c.sumocfg", "<configuration/>"),
         {"sumocfg": "c.sumocfg"},
         InputError,
-        r"c\.sumocfg: names no net-file",
+        r"c\.sumocfg: has no net-file",
     ),
     "configuration names a missing file": (
         write("c.sumocfg", '<configuration><net-file value="gone.xml"/></configuration>'),
@@ -103,19 +103,19 @@ BAD = {
         InputError,
         r"c\.sumocfg: net-file = 'gone\.xml': no such file",
     ),
-    "configuration lets vehicles jump": (
+    "configuration makes vehicles jump": (
         write(
             "c.sumocfg", '<configuration><net-file value="net.xml"/><no-internal-links value="true"/></configuration>'
         ),
         {"sumocfg": "c.sumocfg"},
         InputError,
-        r"no-internal-links = 'true': lets vehicles jump",
+        r"no-internal-links = 'true': makes vehicles jump",
     ),
     "unknown type in a finished file": (
         write("f.csv", f"{FCD}\n0;v;1;2;3;tram\n1;v;1;2;3;tram\n"),
         {"fcd": "f.csv", "frames": 1, "warmup_s": 0, "frame_period_s": 1},
         InputError,
-        r"vehicle type 'tram' of f.csv has no known size",
+        r"the size of vehicle type 'tram' of f.csv is unknown",
     ),
     "too few frames in a finished file": (
         write("f.csv", f"{FCD}\n0;v;1;2;3;car\n1;v;1;2;3;car\n"),
@@ -145,7 +145,7 @@ def test_a_file_in_the_folder_that_is_made_anew_is_kept(town, tmp_path):
     own = tmp_path / "sumo" / "net.xml"
     own.parent.mkdir()
     shutil.copy(town / "net.xml", own)
-    with pytest.raises(InputError, match=r"sumo/net\.xml: lies in the folder that is made anew for SUMO; another"):
+    with pytest.raises(InputError, match=r"sumo/net\.xml: an input file is in the folder that is emptied for SUMO"):
         run_stage(traffic, scenario(tmp_path, network="sumo/net.xml"), tmp_path)
     assert own.is_file()
 

@@ -226,8 +226,8 @@ class Traffic(Effect[P], TrafficHook):
         return None if on else reason
 
     def refusal(self, scene: Scene) -> InputError | None:
-        """Return the error of ``refuses``."""
-        return self.refuses(scene.scenario)
+        """Return the error of ``scenario_error``."""
+        return self.scenario_error(scene.scenario)
 
     def config_key(self, scenario: Scenario) -> str:
         """Return the file and key that messages point to."""

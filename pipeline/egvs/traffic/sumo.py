@@ -259,7 +259,7 @@ def program_error(name: str, code: int, text: str) -> RunError:
         return MissingBackendError(f"{name} cannot be started: {reason}")
 
     errors = [line for line in lines if not line.startswith(("Warning", "Quitting", "pj_obj_create"))] or lines[-1:]
-    kind = SumoInputError
+    kind: type[RunError] = SumoInputError
     problem = f"ended with exit code {code}"
     if -code in _CRASHES:
         problem = f"crashed with signal {-code}"

@@ -44,7 +44,7 @@ def test_every_option_is_taken_over_left_out_or_an_error(options, tmp_path):
         try:
             read(tmp_path, f'<{name} value="0"/>')
         except InputError as error:
-            assert "is no option of SUMO that is taken over: remove it" in str(error) or "; remove it" in str(error)
+            assert error.hint.startswith("Remove it")
             refused.add(name)
     assert refused == {
         "load-state", "load-state.offset", "load-state.remove-vehicles", "astar.all-distances",
@@ -58,7 +58,7 @@ def test_every_option_is_taken_over_left_out_or_an_error(options, tmp_path):
 
 
 def test_what_is_no_option_of_sumo_is_an_error(tmp_path):
-    with pytest.raises(InputError, match=r"c\.sumocfg: colour = 'red': is no option of SUMO that is taken over"):
+    with pytest.raises(InputError, match=r"c\.sumocfg: colour = 'red': option of SUMO not supported"):
         read(tmp_path, '<colour value="red"/>')
 
 
@@ -69,7 +69,5 @@ def test_options_of_the_traffic_are_taken_over(tmp_path):
 
 @pytest.mark.parametrize("value", ["nan", "-inf", "1e308", "-1", "seven"])
 def test_a_beginning_that_is_no_time_is_refused(value, tmp_path):
-    with pytest.raises(
-        InputError, match=f"begin = '{value}': is no number of seconds; 0 to 1e\\+09, for example 25200"
-    ):
+    with pytest.raises(InputError, match=f"begin = '{value}': expected 0 to 1e\\+09 seconds"):
         read(tmp_path, f'<begin value="{value}"/>')

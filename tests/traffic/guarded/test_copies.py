@@ -40,7 +40,7 @@ def test_a_rewritten_file_says_the_same_but_for_its_outputs(tmp_path):
     )
     (tmp_path / "a.xml").write_text(text)
     assert user_files.copy_checked(tmp_path / "a.xml", tmp_path / "copy.xml") == [
-        "a.xml: SUMO's outputs that it asks for are not written: 1 of <b>, 1 of <param>"
+        "a.xml: outputs of SUMO are disabled: 1 of <b>, 1 of <param>"
     ]
     assert told(tmp_path / "copy.xml") == [
         ("a", {"x": "1&\n2"}, [{"file": "NUL"}, {}]),
@@ -66,7 +66,7 @@ FURTHER = {
 @pytest.mark.parametrize("text", FURTHER.values(), ids=FURTHER.keys())
 def test_what_would_have_sumo_read_a_further_file_is_refused(tmp_path, text):
     (tmp_path / "a.xml").write_text(f"<additional>{text}</additional>")
-    with pytest.raises(InputError, match=r"has SUMO read a further file; its content in this file itself"):
+    with pytest.raises(InputError, match=r"makes SUMO read a further file"):
         user_files.copy_checked(tmp_path / "a.xml", tmp_path / "copy.xml")
     assert not (tmp_path / "copy.xml").exists()
     (tmp_path / "a.xml").write_text(
@@ -83,5 +83,5 @@ def test_what_was_checked_is_not_parsed_again_unless_it_is_another(tmp_path, mon
         patch.setattr(user_files, "_checked_elements", None)
         assert user_files.copy_checked(path, tmp_path / "copy.xml") == []
     path.write_text('<routes><include href="f"/></routes>')
-    with pytest.raises(InputError, match="has SUMO read a further file"):
+    with pytest.raises(InputError, match="makes SUMO read a further file"):
         user_files.check_copyable(path)

@@ -57,7 +57,7 @@ def test_no_output_of_an_additional_file_is_written(place, town, tmp_path, writt
     assert not (out / "sumo" / "output").exists()
     (note,) = result["notes"]
     assert note == (
-        "own.add.xml: SUMO's outputs that it asks for are not written: 1 of <calibrator>, 1 of <e1Detector>, "
+        "own.add.xml: outputs of SUMO are disabled: 1 of <calibrator>, 1 of <e1Detector>, "
         "1 of <e2Detector>, 1 of <e3Detector>, 1 of <edgeData>, 1 of <inductionLoop>, 1 of <instantInductionLoop>, "
         "1 of <laneData>, 1 of <param>, 1 of <routeProbe>, 1 of <timedEvent>, 1 of <vTypeProbe>"
     )
@@ -114,17 +114,17 @@ def test_entities_of_a_map_never_reach_netconvert(place, tmp_path):
         ('<!DOCTYPE additional SYSTEM "more.dtd"><additional/>', "declares XML entities or a document type"),
         (
             '<additional><include href="/etc/passwd"/></additional>',
-            "<include href='/etc/passwd'> has SUMO read",
+            "<include href='/etc/passwd'> makes SUMO read",
         ),
         (
             '<additional><rerouter edges="e" file="x.xml"/></additional>',
-            r"<rerouter file='x\.xml'> has SUMO read",
+            r"<rerouter file='x\.xml'> makes SUMO read",
         ),
         (
             '<additional><edgeData id="d" edgesFile="x"/></additional>',
-            "<edgeData edgesFile='x'> has SUMO read",
+            "<edgeData edgesFile='x'> makes SUMO read",
         ),
-        ('<edgeData id="d" file="/x"/>', r"its root <edgeData file=\.\.\.> asks for an output"),
+        ('<edgeData id="d" file="/x"/>', r"its root <edgeData file=\.\.\.> has an output"),
         ('<a:additional xmlns:a="b"><a:edgeData file="/x"/></a:additional>', "<{b}additional> is in a namespace"),
         ("<additional><edgeData", "is not well-formed XML"),
     ],

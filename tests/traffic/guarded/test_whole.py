@@ -51,7 +51,7 @@ def test_a_file_that_is_cut_is_told(place, tmp_path, monkeypatch, name, damage):
     ("hold", "message"),
     [
         ("at_most", r"fcd\.csv: SUMO wrote an incomplete file"),
-        ("exactly", r"12 vehicles are in 1\d\d of 240 frames"),
+        ("exactly", r"expected 12 vehicles in every frame, got them in 1\d\d of 240 frames"),
     ],
 )
 def test_frames_that_are_missing_at_the_end_are_told(town, tmp_path, monkeypatch, hold, message):
