@@ -152,7 +152,7 @@ def test_candidate_routes_over_a_location_are_no_detours(town):
 
 
 def test_isolated_location_is_a_route_by_itself(tmp_path):
-    """A web of streets has no fringe; that no trip is to start there keeps no scenario_with_counts vehicle away."""
+    """A network without fringe, where an edge weight of 0 excludes no counted vehicle."""
     netgenerate(tmp_path, "--spider", "--spider.arm-number", "3", "--spider.circle-number", "1")
     roads = network.read_net_xml(tmp_path / "net.xml")
     ways, edge = RouteFinder(roads, "passenger"), roads.edges[0].id
@@ -181,7 +181,7 @@ def test_isolated_location_is_a_route_by_itself(tmp_path):
         ),
         (
             [{"edge": "a", "per_hour": 0}],
-            r"counts: no vehicle was scenario_with_counts anywhere; at least one per_hour above 0",
+            r"counts: no vehicle was counted anywhere; at least one per_hour above 0",
         ),
     ],
 )

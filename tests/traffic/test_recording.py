@@ -209,7 +209,7 @@ def test_rejects_missing_frames_at_the_end(town, tmp_path, monkeypatch, hold, me
 
 
 def damage_output(monkeypatch, name, damage):
-    """Have a file of SUMO's damage_output as soon as SUMO has ended."""
+    """Damage an output as soon as SUMO has ended."""
     run = sumo.run_program
 
     def cut(program, arguments, folder, *more):
