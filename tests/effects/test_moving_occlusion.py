@@ -170,9 +170,7 @@ def random_scene(seed: int) -> tuple[np.ndarray, voxel_crossings.Crossings, dict
 def replay_of(frames: dict[int, np.ndarray], count: int = 12) -> Replayed:
     """A replay from boxes in the grid's frame."""
     frame = np.repeat(list(frames), [len(b) for b in frames.values()]).astype(np.int64)
-    return Replayed(
-        moving_occlusion.Replay.from_boxes(count, frame, np.vstack([np.empty((0, 8)), *frames.values()]))
-    )
+    return Replayed(moving_occlusion.Replay.from_boxes(count, frame, np.vstack([np.empty((0, 8)), *frames.values()])))
 
 
 @pytest.fixture
@@ -269,8 +267,8 @@ def test_vehicle_around_the_sensor_is_ignored_and_counted() -> None:
     beams = listed((10, 0.25, 1), [[9, 0, 0], [0, 0, -0.9], [-9, 1, 0.1]])
     inside = replay({0: [car(10, 0.25)], 1: [car(10, 0.25), car(15, 0.25)]}, 2)
     where = np.array([10, 0.25, 1]) - GRID.origin_m
-    assert inside.boxes.holding(where) == 2
-    assert inside.boxes.holding(where + np.array([0, 0, 0.5])) == 0  # on the roof
+    assert inside.boxes.count_boxes_around(where) == 2
+    assert inside.boxes.count_boxes_around(where + np.array([0, 0, 0.5])) == 0  # on the roof
     share = inside.share(beams)
     assert share[: beams.first[1]].tolist() == [1.0] * 7 + [0.5] * 11
     assert (share[beams.first[1] :] == 1).all()
@@ -335,7 +333,7 @@ def test_hits_of_weighted_beams_agree_with_listed_crossings(
     walked = visibility.borrowed_hits(beams).copy()
     monkeypatch.setattr(moving_occlusion, "_BUFFER_SIZE", 1)  # a few beams at a time
     assert walked.tolist() == visibility.borrowed_hits(beams).tolist()
-    monkeypatch.setattr(moving_occlusion.MovingOcclusion, "falls", lambda *_: None)
+    monkeypatch.setattr(moving_occlusion.MovingOcclusion, "transmittance_steps", lambda *_: None)
     assert walked.tolist() == visibility.borrowed_hits(beams).tolist()
     plain = HitCounter(
         egvs.build_scene(egvs.load(folder, ["effects.dropout.share=1e-9"])),

@@ -249,9 +249,7 @@ def _query_sizes(vtypes: Collection[Element]) -> dict[str, VehicleSize]:
     with temporary_folder() as folder:
         (folder / "minimal.net.xml").write_text(_NETWORK, encoding="utf-8")
         (folder / "types.add.xml").write_bytes(tostring(document, encoding="utf-8"))
-        arguments = ["-n", "minimal.net.xml", "-a", "types.add.xml", "--route-steps", "0"]
-        with sumo.serve_traci(arguments, folder) as connection:
-            return {name: sumo.query_size(connection, name) for name in connection.vehicletype.getIDList()}
+        return sumo.query_sizes(["-n", "minimal.net.xml", "-a", "types.add.xml"], folder)
 
 
 @dataclass(frozen=True)

@@ -28,30 +28,18 @@ from egvs.scenario.model import Scenario
 from egvs.traffic import demand, fcd, finished_fcd, network, sumo, sumo_folder
 from egvs.traffic.demand import CountFit
 from egvs.traffic.fcd import FrameWindow
-from egvs.traffic.sumo_folder import (
-    COLLISIONS_FILE,
-    CONFIG_FILE,
-    DRIVEN_ROUTES_FILE,
-    FCD_DIGITS,
-    FCD_FILE,
-    LOG_FILE,
-    PERSONS_FILE,
-    STATISTICS_FILE,
-    STOPS_FILE,
-    SimulationFolder,
-    Timing,
-)
+from egvs.traffic.sumo_folder import SimulationFolder, Timing
 from egvs.traffic.vehicle_boxes import TrafficHook, VehicleSize
 
 _MIN_STANDING_LIMIT_S = 180.0
 _MAX_WAITING_SHARE = 0.02
 _MAX_LOCATIONS = 3
-_TABLES = (FCD_FILE, PERSONS_FILE)
+_TABLES = (sumo_folder.FCD_FILE, sumo_folder.PERSONS_FILE)
 _XML_ROOTS = {
-    COLLISIONS_FILE: "collisions",
-    STOPS_FILE: "stops",
-    STATISTICS_FILE: "statistics",
-    DRIVEN_ROUTES_FILE: "routes",
+    sumo_folder.COLLISIONS_FILE: "collisions",
+    sumo_folder.STOPS_FILE: "stops",
+    sumo_folder.STATISTICS_FILE: "statistics",
+    sumo_folder.DRIVEN_ROUTES_FILE: "routes",
 }
 
 
@@ -183,7 +171,7 @@ def _record_simulated(
         if prepared.is_generated:
             sizes = finished_fcd.kind_sizes(scenario.traffic.kinds)
         else:
-            sizes = _query_type_sizes(prepared)
+            sizes = sumo.query_sizes(["-c", sumo_folder.CONFIG_FILE], folder)
         for extension in extensions:
             sizes |= extension.sizes()
         duration_s = round(simulate(prepared, progress), 3)
@@ -200,9 +188,9 @@ def _record_simulated(
         )
         persons = None
         if prepared.has_extra_traffic:
-            persons = _read_rows(folder / PERSONS_FILE, "person")
+            persons = _read_rows(folder / sumo_folder.PERSONS_FILE, "person")
         yield Recording(
-            _read_rows(folder / FCD_FILE, "vehicle"),
+            _read_rows(folder / sumo_folder.FCD_FILE, "vehicle"),
             prepared.timing.window(),
             sizes,
             where,
@@ -214,7 +202,12 @@ def _record_simulated(
             f"{where} ({sources})",
         )
     finally:
-        for name in (FCD_FILE, PERSONS_FILE, DRIVEN_ROUTES_FILE, STATISTICS_FILE):
+        for name in (
+            sumo_folder.FCD_FILE,
+            sumo_folder.PERSONS_FILE,
+            sumo_folder.DRIVEN_ROUTES_FILE,
+            sumo_folder.STATISTICS_FILE,
+        ):
             (folder / name).unlink(missing_ok=True)
 
 
@@ -386,7 +379,7 @@ class _Subscriptions:
         if vtype not in self._sizes:
             self._sizes[vtype] = sumo.query_size(self._connection, vtype)
         numbers = (*values[self._position], values[self._angle], values[self._slope], values[self._speed])
-        return _FcdRow(name, vtype, [float(f"{number:.{FCD_DIGITS}f}") for number in numbers])
+        return _FcdRow(name, vtype, [float(f"{number:.{sumo_folder.FCD_DIGITS}f}") for number in numbers])
 
 
 def _rows_to_table(time_ms: int, rows: list[_FcdRow]) -> pa.Table:
@@ -418,14 +411,14 @@ def simulate(prepared: SimulationFolder, progress: ProgressCallback) -> float:
     timing = prepared.timing
 
     def watch() -> None:
-        now_ms = _last_time_ms(prepared.folder / FCD_FILE)
+        now_ms = _last_time_ms(prepared.folder / sumo_folder.FCD_FILE)
         if now_ms is not None:
             frames = (now_ms - timing.first_ms) // timing.period_ms
             progress("frames simulated", min(timing.frames, max(0, frames)), timing.frames)
 
     start = perf_counter()
-    flags = ["-c", CONFIG_FILE, *sumo_folder.as_flags(prepared.outputs)]
-    sumo.run_program("sumo", flags, prepared.folder, prepared.folder / LOG_FILE, watch)
+    flags = ["-c", sumo_folder.CONFIG_FILE, *sumo_folder.as_flags(prepared.outputs)]
+    sumo.run_program("sumo", flags, prepared.folder, prepared.folder / sumo_folder.LOG_FILE, watch)
     check_complete(prepared)
     return perf_counter() - start
 
@@ -440,10 +433,10 @@ def check_complete(prepared: SimulationFolder) -> None:
     for name, root in _XML_ROOTS.items():
         if name in outputs:
             sumo.check_xml_complete(folder / name, root)
-    if STATISTICS_FILE in outputs and _vehicle_counts(prepared)["running"]:
-        last_ms = _last_time_ms(folder / FCD_FILE) or 0
+    if sumo_folder.STATISTICS_FILE in outputs and _vehicle_counts(prepared)["running"]:
+        last_ms = _last_time_ms(folder / sumo_folder.FCD_FILE) or 0
         if last_ms < prepared.timing.end_ms - prepared.timing.step_ms:
-            raise sumo.incomplete_file_error(folder / FCD_FILE)
+            raise sumo.incomplete_file_error(folder / sumo_folder.FCD_FILE)
 
 
 def _last_time_ms(path: Path) -> int | None:
@@ -455,12 +448,6 @@ def _last_time_ms(path: Path) -> int | None:
         return round(float(lines[-2].split(b";")[0]) * 1000)
     except ValueError:
         return None
-
-
-def _query_type_sizes(prepared: SimulationFolder) -> dict[str, VehicleSize]:
-    """Query the sizes of all vehicle types from SUMO, since its defaults depend on the vClass."""
-    with sumo.serve_traci(["-c", CONFIG_FILE, "--route-steps", "0"], prepared.folder) as connection:
-        return {name: sumo.query_size(connection, name) for name in connection.vehicletype.getIDList()}
 
 
 @dataclass(frozen=True)
@@ -481,7 +468,7 @@ class Collision:
 def _read_collisions(prepared: SimulationFolder) -> dict[tuple[str, str], Collision]:
     """Read the first collision of each pair of vehicles in the recorded time."""
     collisions: dict[tuple[str, str], Collision] = {}
-    for element in xml.iter_elements(prepared.folder / COLLISIONS_FILE, "collisions"):
+    for element in xml.iter_elements(prepared.folder / sumo_folder.COLLISIONS_FILE, "collisions"):
         if float(element.get("time", "0")) * 1000.0 >= prepared.timing.first_ms:
             x_m, y_m = [float(value) for value in element.get("colliderFront", "nan,nan").split(",")[:2]]
             at_m = (x_m, y_m) if math.isfinite(x_m + y_m) else None
@@ -534,7 +521,7 @@ def _insertion_warning(prepared: SimulationFolder, scenario: Scenario) -> list[D
 
 def _vehicle_counts(prepared: SimulationFolder) -> dict[str, int]:
     """Return the numbers of vehicles that were loaded, are running at the end, and wait to start."""
-    elements = xml.iter_elements(prepared.folder / STATISTICS_FILE, "statistics")
+    elements = xml.iter_elements(prepared.folder / sumo_folder.STATISTICS_FILE, "statistics")
     (vehicles,) = (element for element in elements if element.tag == "vehicles")
     return {key: int(vehicles.get(key, "0")) for key in ("loaded", "running", "waiting")}
 
@@ -544,7 +531,7 @@ def _compare_counts(scenario: Scenario, prepared: SimulationFolder) -> tuple[lis
     if not prepared.has_counts:
         return [], []
     first_s, end_s = prepared.timing.first_ms / 1000.0, prepared.timing.end_ms / 1000.0
-    fits = demand.count_fits(scenario.traffic, prepared.folder / DRIVEN_ROUTES_FILE, first_s, end_s)
+    fits = demand.count_fits(scenario.traffic, prepared.folder / sumo_folder.DRIVEN_ROUTES_FILE, first_s, end_s)
     return fits, demand.count_warnings(fits, (end_s - first_s) / 3600.0, sumo_folder.traffic_key(scenario))
 
 
@@ -552,4 +539,4 @@ def _planned_stops(prepared: SimulationFolder) -> set[str]:
     """Return the vehicles of a user's demand that have a ``<stop>``."""
     if prepared.is_generated:
         return set()
-    return {stop.get("id", "") for stop in xml.iter_elements(prepared.folder / STOPS_FILE, "stops")}
+    return {stop.get("id", "") for stop in xml.iter_elements(prepared.folder / sumo_folder.STOPS_FILE, "stops")}

@@ -410,6 +410,12 @@ def query_size(connection: Any, name: str) -> VehicleSize:
     return VehicleSize(types.getLength(name), types.getWidth(name), types.getHeight(name), types.getVehicleClass(name))
 
 
+def query_sizes(arguments: Sequence[str], folder: Path) -> dict[str, VehicleSize]:
+    """Start SUMO with some arguments, and query the sizes of all vehicle types: defaults depend on the vClass."""
+    with serve_traci([*arguments, "--route-steps", "0"], folder) as connection:
+        return {name: query_size(connection, name) for name in connection.vehicletype.getIDList()}
+
+
 def check_table_complete(path: Path) -> None:
     """Raise a RunError when the last line of a table is not complete."""
     if not read_tail(path).endswith(b"\n"):
