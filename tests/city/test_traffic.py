@@ -185,7 +185,7 @@ def test_the_files_are_what_sumo_writes(city: City) -> None:
          "city.toml: traffic.periods.0.name: 'a/b'"),
         ("city.toml", "seed = 7", "seed = 7\n[effects.rain]\nrate_mm_h = 20.0\n",
          "city.toml: effects.rain: adds no traffic; in junctions/scenario.toml"),
-        ("city.toml", 'name = "bus"', 'name = "coach"', "the size of vehicle type 'bus' of fcd.csv is unknown"),
+        ("city.toml", 'name = "bus"', 'name = "coach"', "the size of vehicle types of fcd.csv is unknown: 'bus'"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_told_in_one_message(city: City, file: str, old: str, new: str, told: str) -> None:

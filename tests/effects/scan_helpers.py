@@ -81,9 +81,9 @@ def scan_hits(folder: Path, out: Path, *sets: str) -> dict[str, np.ndarray]:
     return {scan.site.name: scorer.hits(scan.beams) for scan in empty_scans(work)}
 
 
-def hits_along_only_beam(found: dict[str, np.ndarray]) -> np.ndarray:
+def hits_along_only_beam(hits_by_site: dict[str, np.ndarray]) -> np.ndarray:
     """Hits along the only beam of :func:`one_beam`, by the number of the voxel: x from 0 in steps of 0.5 m."""
-    return found["only"][:, 20, 4]
+    return hits_by_site["only"][:, 20, 4]
 
 
 def _world(*polygons: tuple[list[tuple[float, float]], float, float]) -> World:

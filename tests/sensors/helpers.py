@@ -15,9 +15,9 @@ def sites_from(mini: Path, rows: str = "", **sites_keys: str) -> tuple[sites.Sit
     return sites.candidate_sites(egvs.load(mini, [f"sites.{key}={value}" for key, value in sites_keys.items()]))
 
 
-def angles_of(found: tuple[sites.Site, ...]) -> list[tuple[str, float, float, float]]:
-    return [(site.name, site.pose.z_m, site.pose.yaw_deg, site.pose.pitch_deg) for site in found]
+def angles_of(candidates: tuple[sites.Site, ...]) -> list[tuple[str, float, float, float]]:
+    return [(site.name, site.pose.z_m, site.pose.yaw_deg, site.pose.pitch_deg) for site in candidates]
 
 
-def site_positions(found: tuple[sites.Site, ...]) -> list[tuple[str, float, float, float]]:
-    return [(site.name, *site.pose.position_m) for site in found]
+def site_positions(candidates: tuple[sites.Site, ...]) -> list[tuple[str, float, float, float]]:
+    return [(site.name, *site.pose.position_m) for site in candidates]

@@ -272,7 +272,7 @@ def test_rejects_heights_with_a_rule(mini: Path) -> None:
     rule = "heights_m = [3]\n[[sites.along]]\nline_m = [[0, 0], [1, 0]]\nspacing_m = 1\nheights_m = [3]\n"
     path.write_text(path.read_text().replace('file = "sites.csv"\n', "").replace(
         'sensor = "small"\n', f'sensor = "small"\n{rule}'))  # fmt: skip
-    with pytest.raises(InputError, match="heights_m is for site_positions in a file: along has heights_m of its own"):
+    with pytest.raises(InputError, match="heights_m is for places in a file: along has heights_m of its own"):
         egvs.load(mini)
 
 

@@ -125,7 +125,7 @@ BAD = {
         write("f.csv", f"{FCD}\n0;v;1;2;3;tram\n1;v;1;2;3;tram\n"),
         {"fcd": "f.csv", "frames": 1, "warmup_s": 0, "frame_period_s": 1},
         InputError,
-        r"the size of vehicle type 'tram' of f.csv is unknown",
+        r"the size of vehicle types of f.csv is unknown: 'tram'",
     ),
     "too few frames in a finished file": (
         write("f.csv", f"{FCD}\n0;v;1;2;3;car\n1;v;1;2;3;car\n"),
@@ -273,12 +273,12 @@ def test_converts_openstreetmap_map(tmp_path):
 
 
 def test_inputs_of_the_stage(town, tmp_path):
-    def about(folder, **keys):
+    def inputs(folder, **keys):
         return inputs_of(traffic, scenario(folder, network="net.xml", **keys), tmp_path)
 
     shutil.copytree(town, tmp_path / "elsewhere")
-    assert about(town, frames=10) == about(tmp_path / "elsewhere", frames=10)
-    assert about(town, frames=10) != about(town, frames=11)
+    assert inputs(town, frames=10) == inputs(tmp_path / "elsewhere", frames=10)
+    assert inputs(town, frames=10) != inputs(town, frames=11)
     with (tmp_path / "elsewhere" / "net.xml").open("a") as file:
         file.write("\n")
-    assert about(town, frames=10) != about(tmp_path / "elsewhere", frames=10)
+    assert inputs(town, frames=10) != inputs(tmp_path / "elsewhere", frames=10)

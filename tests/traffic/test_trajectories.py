@@ -140,11 +140,11 @@ def test_vehicles_on_and_below_a_bridge_do_not_overlap():
     )
 
 
-def footprint(found, i):
-    cos, sin = math.cos(found.yaw_rad[i]), math.sin(found.yaw_rad[i])
-    half_l, half_w = found.length_m[i] / 2 - 1e-3, found.width_m[i] / 2 - 1e-3
+def footprint(boxes, i):
+    cos, sin = math.cos(boxes.yaw_rad[i]), math.sin(boxes.yaw_rad[i])
+    half_l, half_w = boxes.length_m[i] / 2 - 1e-3, boxes.width_m[i] / 2 - 1e-3
     corners = [(a * half_l, b * half_w) for a, b in ((1, 1), (-1, 1), (-1, -1), (1, -1))]
-    return shapely.Polygon([(found.x_m[i] + cos * u - sin * v, found.y_m[i] + sin * u + cos * v) for u, v in corners])
+    return shapely.Polygon([(boxes.x_m[i] + cos * u - sin * v, boxes.y_m[i] + sin * u + cos * v) for u, v in corners])
 
 
 @pytest.mark.slow

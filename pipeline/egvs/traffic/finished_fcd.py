@@ -194,14 +194,12 @@ def check_types(scenario: Scenario, types: Collection[str], declared: Mapping[st
     missing = sorted(set(types) - known - _DEFAULT_TYPES)
     if missing:
         names = ", ".join(map(repr, missing))
-        title = f"the size of vehicle type {names} of {scenario.traffic.fcd} is unknown"
-        if len(missing) > 1:
-            title = f"the sizes of vehicle types {names} of {scenario.traffic.fcd} are unknown"
+        problem = f"the size of vehicle types of {scenario.traffic.fcd} is unknown: {names}"
         hint = (
             "Add a kind of each name with length_m, width_m and height_m, or the SUMO file with their <vType> to vtypes"
             f" (known: {', '.join(sorted(known))})."
         )
-        raise InputError(f"{sumo_folder.traffic_key(scenario)}.kinds", title, hint)
+        raise InputError(f"{sumo_folder.traffic_key(scenario)}.kinds", problem, hint)
     return vtypes
 
 

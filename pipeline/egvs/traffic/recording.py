@@ -202,12 +202,7 @@ def _record_simulated(
             f"{where} ({sources})",
         )
     finally:
-        for name in (
-            sumo_folder.FCD_FILE,
-            sumo_folder.PERSONS_FILE,
-            sumo_folder.DRIVEN_ROUTES_FILE,
-            sumo_folder.STATISTICS_FILE,
-        ):
+        for name in (*_TABLES, sumo_folder.DRIVEN_ROUTES_FILE, sumo_folder.STATISTICS_FILE):
             (folder / name).unlink(missing_ok=True)
 
 
