@@ -21,7 +21,7 @@ from egvs.stages.site_scoring import empty_scans
 from tests.conftest import BUILDING, collection, fcd, feature
 from tests.stages import run_stage
 
-# What switches each effect on so that it acts.
+# Settings that activate each effect.
 ACTIVE = {
     "range_limit": ["effects.range_limit.rated_range_m=30"],
     "rain": ["effects.rain.rate_mm_h=50"],

@@ -62,7 +62,7 @@ from tests.effects.scan_helpers import (
 )
 from tests.stages import inputs_of, run_stage
 
-# What leaves each effect nothing to do.
+# Settings with which an effect changes nothing.
 NEUTRAL = {
     "hard limit beyond reach": ["effects.range_limit={rated_range_m = 30, reflectivity = 1e4, softness = 0}"],
     "soft limit far away": ["effects.range_limit={rated_range_m = 30, reflectivity = 1e9}"],
@@ -124,7 +124,7 @@ def test_worse_conditions_never_raise_a_score(score_run: tuple[Path, Path], seri
 
 
 def test_detect_effects_multiply(one_beam_run: tuple[Path, Path]) -> None:
-    """In the voxel at 20.25 m: 3/4 is not dropped, one half is noticed at the limit, rain and fog thin what is left."""
+    """In the voxel at 20.25 m: 3/4 are not dropped, half are detected; rain and fog attenuate the rest."""
     half = "effects.range_limit={rated_range_m = 20.25, rated_reflectivity = 0.1}"
     dropout, rain, fog = "effects.dropout.share=0.25", "effects.rain.rate_mm_h=30", "effects.fog.visibility_m=200"
     assert hits_along_beam(one_beam_run, half, dropout)[20] == 0.375
@@ -136,7 +136,7 @@ def test_detect_effects_multiply(one_beam_run: tuple[Path, Path]) -> None:
 
 @pytest.mark.parametrize("name", ACTIVE)
 def test_hits_are_multiplied_by_the_probability_at_the_voxel_centre(score_run: tuple[Path, Path], name: str) -> None:
-    """Every voxel's plain hits, times the effect asked at that voxel; to 2**-33 of each, and what rounding adds."""
+    """Plain hits of each voxel times the probability there, up to 2**-33 of each and rounding."""
     scene = make_scene(score_run, *ACTIVE[name])
     (only,), sensor = registry.scenario_effects(scene.scenario, "score"), scene.sensor(scene.sites[0].sensor)
     assert isinstance(only, Detect)

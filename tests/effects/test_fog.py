@@ -40,7 +40,7 @@ def test_thicker_fog_never_raises_detection(
 
 
 def test_fog_equals_hand_computed_hits(one_beam_run: tuple[Path, Path]) -> None:
-    """100 m: no wavelength in Kim's model; what a black target keeps over 100 m is 2 %, so 20.5 m keep 0.02^0.205 =
+    """At 100 m, Kim's model ignores the wavelength; the contrast after 100 m is 2 %, so after 20.5 m it is 0.02^0.205 =
     0.4484."""
     assert hits_along_beam(one_beam_run, "effects.fog.visibility_m=100")[0] == pytest.approx(0.02**0.205, abs=1e-9)
     assert hits_along_beam(one_beam_run, "effects.fog.visibility_m=100")[0] == pytest.approx(0.4484, abs=5e-5)
@@ -86,7 +86,7 @@ def test_fog_attenuates_17_db_over_the_visibility_at_550_nm() -> None:
 
 
 def test_visibility_at_either_contrast_gives_the_same_fog() -> None:
-    """Who sees 2 % at 391 m sees 5 % at 300 m; near 700 m the exponent depends on it, too."""
+    """A contrast of 2 % at 391 m is one of 5 % at 300 m; near 700 m the exponent depends on it, too."""
     for at_2_percent in (391.2, 700.0):
         at_5_percent = at_2_percent * math.log(0.05) / math.log(0.02)
         one, other = (

@@ -1,4 +1,4 @@
-"""Do vehicles hide what is behind them, as often as a brute-force count says?
+"""Moving occlusion, compared with a brute-force count.
 
 The twin below shares no code with the effect: half-spaces from rotation matrices instead of slabs, every voxel of the
 grid instead of a march, every box for every beam. It must find the same whole numbers."""
@@ -39,7 +39,7 @@ WIDE = Grid.over(Roi((0.0, 0.0, 0.0), (80.0, 80.0, 80.0)), 1.0)
 SHRINK, CHORD = 1e-4 + 1e-9, 1e-6
 
 
-# The twin
+# Reference implementation
 
 
 def reference_ranges(o: np.ndarray, d: np.ndarray, boxes: np.ndarray) -> np.ndarray:
@@ -66,7 +66,7 @@ def reference_ranges(o: np.ndarray, d: np.ndarray, boxes: np.ndarray) -> np.ndar
 
 
 def reference_crossings(o: np.ndarray, end: np.ndarray, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Flat voxels that a segment crosses and the ranges of entry, sorted by range: every voxel of the grid is asked."""
+    """Flat voxels that a segment crosses and the ranges of entry, sorted by range; tests every voxel of the grid."""
     length = math.sqrt((end**2).sum())
     corner = (
         np.stack(np.meshgrid(*(np.arange(n) for n in grid.shape), indexing="ij"), axis=-1).reshape(-1, 3) * grid.voxel_m
@@ -109,7 +109,7 @@ def occlusion(out: Path, **parameters: Any) -> moving_occlusion.MovingOcclusion:
 
 
 class Replayed:
-    """A replay, asked about crossings of any sensor."""
+    """A replay with the shares of crossings of any sensor."""
 
     def __init__(self, boxes: moving_occlusion.Replay) -> None:
         self.boxes = boxes
@@ -187,7 +187,7 @@ def scores(folder: Path, out: Path, *overrides: str, jobs: int | None = None) ->
 
 
 def with_trajectories(out: Path, table: pa.Table, groups: int = 1) -> None:
-    """Put other boxes in the place of those recorded, in ``groups`` row groups of whole frames."""
+    """Replace the recorded boxes, in ``groups`` row groups."""
     metadata = parquet.read_metadata(out / "trajectories.parquet", "trajectories")
     cuts = np.searchsorted(table.column("frame").to_numpy(), np.linspace(0, metadata["frames"], groups + 1))
     with parquet.artefact_writer(out / "trajectories.parquet", "trajectories") as file:
@@ -274,7 +274,7 @@ def test_vehicle_around_the_sensor_is_ignored_and_counted() -> None:
     assert (share[beams.first[1] :] == 1).all()
 
 
-# Against the twin
+# Comparison with the reference
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -543,7 +543,7 @@ def test_scores_are_the_same_without_stored_scans(ran: tuple[Path, Path]) -> Non
     assert scores(folder, out, ON, "scan.keep=false") == remaining
 
 
-# What the stage says, and what it refuses
+# Messages of the stage
 
 
 def test_scores_depend_on_the_trajectories_only_when_they_are_replayed(ran: tuple[Path, Path]) -> None:

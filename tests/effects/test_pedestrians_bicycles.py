@@ -180,7 +180,7 @@ def test_same_seed_gives_the_same_people_also_over_traci(hill_road, hill_run, tm
 
 
 def write_user_demand(flat_road, folder):
-    """A user's route file with vehicles and one person who walks from the road's west end."""
+    """Write a route file with vehicles and one pedestrian."""
     shutil.copy(flat_road / "road.net.xml", folder)
     trips = "".join(f'<trip id="{i}" depart="{2 * i}" from="ab" to="cd"/>' for i in range(80))
     person = '<person id="own" depart="0"><walk from="ab" to="cd"/></person>'

@@ -143,7 +143,7 @@ def test_rejects_plugin_that_is_not_an_effect_of_that_name(site: Path, source: s
 
 @pytest.mark.system
 def test_rejects_two_effects_with_one_name(mini, tmp_path):
-    """Their parameters would overwrite each other in the key of the stage: a changed one would change nothing."""
+    """Their parameters would overwrite each other in the cache key of the stage."""
     for name in ("aa", "bb"):
         install(tmp_path / "site", f"p{name}", f"{name} = plug_{name}:Half", {f"plug_{name}": EFFECT}, "egvs.effects")
     both = ("--set", "effects.aa.share=0.1", "--set", "effects.bb.share=0.2")

@@ -141,7 +141,7 @@ def test_footprints_are_on_the_hill_and_sites_below_it_rejected(hill_road, tmp_p
 
 
 def test_boxes_on_a_bridge_keep_the_slope_of_sumo(hill_run, hill_road):
-    """A box well above the surface stands on something else."""
+    """A box well above the surface is on a bridge."""
     table = fcd.FCD_SCHEMA.empty_table().from_pylist(
         [{"time_ms": 0, "id": "v", "type": "car", "x": 300, "y": 2, "z": 20, "angle": 90, "slope": 1.0, "speed": 1}],
         schema=fcd.FCD_SCHEMA,

@@ -57,7 +57,7 @@ def test_pose_of_a_site_gives_its_scan(scene):
 
 @pytest.mark.parametrize("settings", [[], EFFECTS], ids=["plain", "weighted"])
 def test_any_pose_gives_the_scan_of_a_site_there(mini, settings):
-    """The tree of triangles is cut for the sites; another pose must not miss what was left out for them."""
+    """The triangles are culled for the sites; another pose must not miss any."""
     pose = Pose(25.0, 30.0, 4.0, yaw_deg=200.0, pitch_deg=-8.0)
     scene = egvs.build_scene(egvs.load(mini, settings))
     moved = replace(scene, sites=(replace(scene.sites[0], pose=pose),))
@@ -140,7 +140,7 @@ def test_directions_of_mounts_are_cached_with_a_limit(scene):
     assert len(scanner._directions) <= 32
 
 
-# --- what nobody can see
+# --- culling
 def test_culling_unreachable_geometry_does_not_change_scans(
     mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -304,7 +304,7 @@ def test_azimuth_window_includes_both_ends() -> None:
 
 
 def test_azimuth_window_is_part_of_the_turn() -> None:
-    """The same beams, to the last bit, as those of the whole turn that lie in it; turned by yaw as well."""
+    """The same beams, bit for bit, as those of the full turn within the window, with any yaw."""
     complete = resolve_sensor("w", {"w": make_config(elevations_deg=[-10, 5], azimuth_step_deg=0.1)}, "here")
     part = sensor_with_window(-30, 45, 0.1, -10, 5)
     for yaw in (0.0, 90.0, 12.3):

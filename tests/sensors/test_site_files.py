@@ -124,7 +124,7 @@ def test_rejects_misspelt_height_of_a_footprint(mini: Path, tmp_path: Path, run_
 
 
 def test_geojson_rows_may_have_their_own_aim(mini: Path) -> None:
-    """A row's own yaw or aim goes before that of [sites], as everything of its own does."""
+    """Yaw or aim of a row override those of [sites]."""
     (mini / "sites.geojson").write_text(
         collection(
             feature({"type": "Point", "coordinates": [0, 0, 6]}, name="aimed", aim_x_m=0, aim_y_m=6, aim_z_m=0),

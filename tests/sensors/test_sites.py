@@ -58,7 +58,7 @@ def test_aiming_angles_equal_hand_computed_ones(target: list[float], yaw_deg: fl
 def test_middle_ray_meets_the_target(
     to_m: tuple[float, float, float], elevation: float, azimuth: float, roll_deg: float
 ) -> None:
-    """Held against the matrix that turns beams: whatever the middle ray and the roll, it meets the point."""
+    """Compared with the rotation matrix, for any middle ray and roll."""
     at_m = 3.0, -2.0, 5.0
     ray = np.array([
         math.cos(math.radians(elevation)) * math.cos(math.radians(azimuth)),
@@ -141,7 +141,7 @@ def test_rules_accept_pitches_and_aims(mini: Path) -> None:
 
 
 def test_recorded_scenario_gives_the_same_candidates(mini: Path) -> None:
-    """As `verify` reads it: every key is there, those that nobody gave as well."""
+    """As `verify` reads it: with all keys, including defaults."""
     (mini / "sites.csv").write_text("site,x_m,y_m\nc01,10,12\nc02,30.5,-12\n")
     scenario = egvs.load(mini, ["sites.heights_m=[3, 4.5]", 'sites.pitch_deg=["aim", 0]', "sites.aim_m=[1, 2]"])
     recorded = json.loads(json.dumps(scenario.model_dump(mode="json")))
@@ -183,7 +183,7 @@ def test_study_uses_the_first_candidate(mini: Path) -> None:
     assert alone.pose == first.pose
 
 
-# --- what is refused --------------------------------------------------------------------------------------------------
+# --- errors
 PLACE = "site,x_m,y_m\np,0,0\n"
 
 

@@ -45,7 +45,7 @@ def retry_connecting(monkeypatch):
 
 @pytest.fixture
 def demand_folder(town, tmp_path) -> Path:
-    """A folder with the town and a car's route; a file beside it that is not SUMO's."""
+    """A folder with the town and the route of a car; next to it, a file that SUMO must not change."""
     folder = tmp_path / "in"
     folder.mkdir()
     shutil.copy(town / "net.xml", folder)

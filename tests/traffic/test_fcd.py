@@ -273,7 +273,7 @@ def test_rejects_row_group_above_limit(tmp_path, monkeypatch):
 
 
 def test_rejects_header_that_is_not_text(tmp_path):
-    """The name of a column that is not needed is damaged: who knows what else is."""
+    """Even if only the name of an unused column is damaged."""
     path = tmp_path / "fcd.csv"
     head = b"timestep_time;vehicle_id;vehicle_x;vehicle_y;vehicle_angle;vehicle_type;vehic\xff\xffpeed\n"
     path.write_bytes(head + b"0.00;east;1.0;-2.0;90.0;car;2.0\n")

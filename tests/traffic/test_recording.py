@@ -160,7 +160,7 @@ def test_warns_about_vehicles_that_could_not_start(town, tmp_path):
 
 @pytest.mark.parametrize("blocks", [0, 8])
 def test_reports_full_disk(town, tmp_path, monkeypatch, blocks):
-    """A limit on the size of files stands in for a full disk: SUMO ends with 0 on both."""
+    """A limit on file size has the effect of a full disk: SUMO ends with exit code 0."""
     limited = tmp_path / "sumo-limited"
     limited.write_text(f"#!/bin/sh\ntrap '' XFSZ\nulimit -f {blocks}\n{sumo.sumo_binary('sumo')} \"$@\"\nexit 0\n")
     limited.chmod(0o755)
@@ -224,7 +224,7 @@ TRAM = VehicleSize(30.0, 2.4, 3.5, "tram")
 
 
 class Raised:
-    """Lifts every box, and says how many there were."""
+    """Lifts every box, and counts them."""
 
     def __init__(self, sizes):
         self.sizes, self.boxes = sizes, 0

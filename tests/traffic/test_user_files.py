@@ -17,7 +17,7 @@ SCHEMA = "{http://www.w3.org/2001/XMLSchema}"
 
 @pytest.fixture(scope="module")
 def options(tmp_path_factory):
-    """Every option of SUMO with its type, as SUMO itself says."""
+    """Every option of SUMO and its type, from SUMO's schema."""
     folder = tmp_path_factory.mktemp("schema")
     sumo.run_program("sumo", ["--save-schema", "sumo.xsd"], folder)
     result = {e.get("name"): e.get("type", "") for e in parse(folder / "sumo.xsd").iter(f"{SCHEMA}element")}
