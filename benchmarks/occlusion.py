@@ -91,7 +91,9 @@ def scored(scenario: Scenario, out: Path, parameters: dict[str, Any] | None) -> 
     ignored = [0] * len(found)
     if occlusion is not None and occlusion.method == "frames":
         replay = read_replay(trajectories, tpog.grid, occlusion.frames)
-        ignored = [replay.holding(tpog.grid.to_grid_m(np.array(scan.site.pose.position_m))) for scan in found]
+        ignored = [
+            replay.count_boxes_around(tpog.grid.to_grid_m(np.array(scan.site.pose.position_m))) for scan in found
+        ]
     return Setting([scan.site.name for scan in found], np.array(egvs), took, ignored)
 
 

@@ -60,7 +60,9 @@ gamma = 4
 SITES = "site,x_m,y_m,z_m\npole_a,10,12,3\npole_b,30.5,-12,3\n"
 
 SYSTEM = (
-    "tests/effects/test_traffic_effects",
+    "tests/effects/test_articulated",
+    "tests/effects/test_pedestrians_bicycles",
+    "tests/effects/test_slope",
     "tests/importers/",
     "tests/runs/",
     "tests/studies/",

@@ -186,7 +186,7 @@ def test_files_are_fcd_as_sumo_writes_it(city: City) -> None:
          "city.toml: traffic.periods.0.name: 'a/b'"),
         ("city.toml", "seed = 7", "seed = 7\n[effects.rain]\nrate_mm_h = 20.0\n",
          "city.toml: effects.rain: adds no traffic. Move it to junctions/scenario.toml"),
-        ("city.toml", 'name = "bus"', 'name = "coach"', "vehicle type 'bus' of fcd.csv has no known size"),
+        ("city.toml", 'name = "bus"', 'name = "coach"', "the size of vehicle types of fcd.csv is unknown: 'bus'"),
     ],
 )  # fmt: skip
 def test_rejects_wrong_input(city: City, file: str, old: str, new: str, message: str) -> None:
@@ -290,10 +290,10 @@ def test_rejects_second_process(city: City) -> None:
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"frames": 0}, "its metadata says frames = 0"),
+        ({"frames": 0}, "invalid metadata: frames = 0"),
         ({"types": {"car": {"length_m": -1, "width_m": 1, "height_m": 1, "vclass": "bus"}}}, "types.car.length_m = -1"),
-        ({"more": 1}, "its metadata says more = 1"),
-        (b"{", "its metadata is no JSON"),
+        ({"more": 1}, "invalid metadata: more = 1"),
+        (b"{", "its metadata is not valid JSON"),
     ],
 )
 def test_rejects_file_with_wrong_metadata(city: City, changed: dict | bytes, message: str) -> None:

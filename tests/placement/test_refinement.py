@@ -25,8 +25,8 @@ from egvs.scenario.score_config import RefinementConfig
 from egvs.sensors.sites import Pose, Site
 from egvs.sensors.sites import candidate_sites as sites_of
 from egvs.traffic import network, sumo_folder
-from tests.stages.conftest import net_xml
 from tests.conftest import BUILDING
+from tests.stages.conftest import net_xml
 
 HALVES = 'traffic.periods=[{name="a", length_s=12, weight=3}, {name="b", begin_s=12, length_s=8}]'
 FEW = "placement.refine.evaluations=60"

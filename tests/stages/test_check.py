@@ -393,7 +393,7 @@ def test_rejects_map_that_netconvert_rejects(street: Path, monkeypatch: pytest.M
     assert (code, err) == (2, "")
     code, _, err = run_egvs("run", street.name, "--set", 'traffic.network="map.osm"', "--out", "out")
     assert code == 2
-    assert err.startswith(f"egvs: {street.name}/map.osm: is no map that streets can be made of: netconvert ended with")
+    assert err.startswith(f"egvs: {street.name}/map.osm: no network can be made of this map: netconvert ended with")
     assert not list((street.parent / "out").glob("*.p*"))
     (street / "map.osm").write_text("<osm><node")
     code, _, err = run_egvs("run", street.name, "--set", 'traffic.network="map.osm"', "--out", "out")

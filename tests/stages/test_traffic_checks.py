@@ -58,7 +58,7 @@ def test_rejects_configuration_without_vehicles(street: Path, routes: str, addit
         (
             "<routes/>",
             '<additional><include href="more.xml"/></additional>',
-            "more.add.xml: <include href='more.xml'> has SUMO read a further file",
+            "more.add.xml: <include href='more.xml'> makes SUMO read a further file",
         ),
         ("<routes", "", "own.rou.xml: is not well-formed XML: unclosed token: line 1, column 0"),
         (

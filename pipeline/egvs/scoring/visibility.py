@@ -222,12 +222,12 @@ class HitCounter:
             return
 
         effects = [effect.for_sensor(segments.origin * voxel_m, self._grid) for effect in self._transmit]
-        falls = None
+        steps = None
         if len(effects) == 1:
-            falls = effects[0].falls(beams.ends_m)
-        if falls is not None:
-            for part in falls:
-                share = _checked_shares(effects[0], part.share, len(part.range_m), "falls")
+            steps = effects[0].transmittance_steps(beams.ends_m)
+        if steps is not None:
+            for part in steps:
+                share = _checked_shares(effects[0], part.share, len(part.range_m), "transmittance_steps")
                 hit_kernels.add_stepwise_shares(
                     *segments, voxel_m, part.rows, part.first, part.range_m, share, weights, UNIT, hits
                 )

@@ -322,7 +322,7 @@ def _unnamed_effect_status(kind: type[Effect[Any]], scene: Scene, trials: Effect
     if trials is not None:
         small, change = _try_effect(effect, trials)
     elif isinstance(effect, Detect):
-        small = 1.0 - min(effect.noticed_shares(scene)) < SMALL_CHANGE
+        small = 1.0 - min(effect.detection_shares(scene)) < SMALL_CHANGE
     if kind.DECIDED_BY:
         values = ", ".join(f"{key} = {value:g}" for key, value in kind.TRIAL.items())
         tried = f"; tried with {values}" if trials is not None and not isinstance(effect, Traffic) else ""

@@ -1,4 +1,4 @@
-"""Does SUMO write in its own folder alone, and end with the process that started it?"""
+"""Programs write to their folder only, and end with the process that started them."""
 
 import ctypes
 import os
@@ -11,6 +11,7 @@ import pytest
 
 from egvs.core.errors import RunError
 from egvs.traffic import sandbox, sumo
+from tests.traffic.helpers import fake_sumo
 
 LINUX = sys.platform.startswith("linux")
 
@@ -19,29 +20,22 @@ def has_landlock():
     return LINUX and ctypes.CDLL(None).syscall(444, None, ctypes.c_size_t(0), ctypes.c_uint32(1)) >= 1
 
 
-def fake_sumo(folder, monkeypatch, script):
-    path = folder / "sumo"
-    path.write_text(f"#!/bin/sh\n{script}\n")
-    path.chmod(0o755)
-    monkeypatch.setenv("SUMO_BINARY", str(path))
-
-
 @pytest.mark.skipif(not has_landlock(), reason="this kernel has no Landlock")
 def test_sumo_cannot_write_outside_its_folder(tmp_path, monkeypatch):
-    own, foreign = tmp_path / "own", tmp_path / "foreign"
-    own.mkdir()
+    user_file, foreign = tmp_path / "own", tmp_path / "foreign"
+    user_file.mkdir()
     foreign.write_text("kept")
     monkeypatch.setattr(sumo, "sumo_environment", lambda: dict(os.environ))
     for attempt in (f"echo x > {foreign}", "echo x > ../new", f"rm {foreign}", f"mv {foreign} here", "mkdir ../new"):
         fake_sumo(tmp_path, monkeypatch, f"echo mine > mine && echo gone > /dev/null || exit 3\n{attempt} || exit 9")
         with pytest.raises(RunError, match=r"sumo ended with exit code [29]"):
-            sumo.run_program("sumo", [], own)
-        assert ((own / "mine").read_text(), foreign.read_text()) == ("mine\n", "kept")
+            sumo.run_program("sumo", [], user_file)
+        assert ((user_file / "mine").read_text(), foreign.read_text()) == ("mine\n", "kept")
         assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.skipif(not has_landlock(), reason="this kernel has no Landlock")
-def test_a_tool_of_sumos_cannot_write_outside_its_folder_either(tmp_path, monkeypatch):
+def test_sumo_tool_cannot_write_outside_its_folder(tmp_path, monkeypatch):
     (tmp_path / "tools").mkdir()
     (tmp_path / "own").mkdir()
     text = "import pathlib, sys\npathlib.Path('mine').write_text('x')\npathlib.Path(sys.argv[1]).write_text('x')\n"
@@ -79,7 +73,7 @@ sys.exit(sandbox.run_watched(sys.argv[1:]))
 """
 
 
-def test_a_watched_program_ends_with_the_pipe():
+def test_watched_program_ends_when_the_pipe_is_closed():
     command = [sys.executable, "-c", WATCHED, "/bin/sh", "-c", "echo runs; while :; do :; done"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as launcher:
         assert launcher.stdin is not None and launcher.stdout is not None
@@ -89,11 +83,11 @@ def test_a_watched_program_ends_with_the_pipe():
     assert launcher.returncode != 0
 
 
-def test_a_watched_programs_exit_code_is_told():
+def test_watched_program_returns_its_exit_code():
     command = [sys.executable, "-c", WATCHED, "/bin/sh", "-c", "exit 5"]
     with subprocess.Popen(command, stdin=subprocess.PIPE) as launcher:
         assert launcher.wait() == 5
 
 
-def test_the_launcher_needs_nothing_of_the_program():
+def test_sandbox_imports_no_module_of_the_package():
     assert "egvs" not in Path(sandbox.__file__).read_text().split('"""', 2)[2]

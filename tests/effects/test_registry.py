@@ -1,8 +1,9 @@
-"""An effect of somebody else's package is found, checked, run and known by its source like this program's own."""
+"""Effects by name: plug-ins of other packages, imports, effects that change nothing."""
 
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from subprocess import CompletedProcess
 
@@ -17,6 +18,8 @@ from egvs.scenario.effects_config import EffectParameters
 from egvs.scoring import visibility
 from tests import processes
 from tests.core.test_plugins import install, site  # noqa: F401  the fixture
+from tests.effects.detect_helpers import ACTIVE
+from tests.effects.road_helpers import SMALL, road_scenario
 
 EFFECT = '''
 """Every second return is lost (an example)."""
@@ -59,11 +62,11 @@ def run_egvs(package: Path | None, *arguments: object) -> CompletedProcess[str]:
 
 @pytest.mark.slow
 @pytest.mark.system
-def test_it_is_run_like_any_other(mini, package, tmp_path):
+def test_plugin_effect_runs_like_a_built_in_one(mini, package, tmp_path):
     plain, halved, dropped = (tmp_path / name for name in ("plain", "halved", "dropped"))
     assert run_egvs(None, "run", mini, "--out", plain).returncode == 0
-    done = run_egvs(package, "run", mini, "--out", halved, "--set", "effects.half.share=0.25")
-    assert done.returncode == 0, done.stderr
+    process = run_egvs(package, "run", mini, "--out", halved, "--set", "effects.half.share=0.25")
+    assert process.returncode == 0, process.stderr
     assert run_egvs(None, "run", mini, "--out", dropped, "--set", "effects.dropout.share=0.25").returncode == 0
     egvs_of = {f: egvs.read_scores(f / "scores.parquet")["egvs"].to_pylist() for f in (plain, halved, dropped)}
     assert egvs_of[halved] == egvs_of[dropped] != egvs_of[plain]
@@ -75,7 +78,7 @@ def test_it_is_run_like_any_other(mini, package, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.system
-def test_a_changed_line_of_it_makes_the_score_stage_run_again(mini, package, tmp_path):
+def test_changed_plugin_source_runs_the_score_stage_again(mini, package, tmp_path):
     call = ("run", mini, "--out", tmp_path / "run", "--set", "effects.half.share=0.25")
     assert run_egvs(package, *call).returncode == 0
     (package / "half_returns.py").write_text(EFFECT.replace("1.0 - self.parameters.share", "0.5"))
@@ -93,23 +96,23 @@ def test_a_changed_line_of_it_makes_the_score_stage_run_again(mini, package, tmp
         ("effects.halve.share=0.25", "effects.halve: unknown effect; did you mean half?"),
     ],
 )
-def test_its_parameters_are_checked_like_any_other_s(mini, package, tmp_path, setting, message):
-    done = run_egvs(package, "run", mini, "--out", tmp_path / "run", "--set", setting)
-    assert (done.returncode, message in done.stderr) == (2, True), done.stderr
+def test_rejects_bad_parameters_of_plugin_effect(mini, package, tmp_path, setting, message):
+    process = run_egvs(package, "run", mini, "--out", tmp_path / "run", "--set", setting)
+    assert (process.returncode, message in process.stderr) == (2, True), process.stderr
 
 
 @pytest.mark.system
-def test_it_is_in_the_list_and_without_the_package_it_is_unknown(mini, package, tmp_path):
+def test_plugin_effect_is_listed_only_if_installed(mini, package, tmp_path):
     assert "half" in run_egvs(package, "effects").stdout.split()
-    done = run_egvs(None, "run", mini, "--out", tmp_path / "run", "--set", "effects.half.share=0.25")
-    assert done.returncode == 2 and "effects.half: unknown effect" in done.stderr
+    process = run_egvs(None, "run", mini, "--out", tmp_path / "run", "--set", "effects.half.share=0.25")
+    assert process.returncode == 2 and "effects.half: unknown effect" in process.stderr
 
 
 @pytest.mark.system
-def test_one_that_cannot_be_imported_is_named_with_its_package(mini, package, tmp_path):
+def test_names_package_of_plugin_that_cannot_be_imported(mini, package, tmp_path):
     (package / "half_returns.py").write_text("import no_such_library\n")
-    done = run_egvs(package, "run", mini, "--out", tmp_path / "run", "--set", "effects.half.share=0.25")
-    assert done.returncode == 1 and "half_returns:Half" in done.stderr and "Traceback" not in done.stderr
+    process = run_egvs(package, "run", mini, "--out", tmp_path / "run", "--set", "effects.half.share=0.25")
+    assert process.returncode == 1 and "half_returns:Half" in process.stderr and "Traceback" not in process.stderr
 
 
 NO_EFFECT = """
@@ -131,22 +134,22 @@ class Thing:
         ),
     ],
 )
-def test_what_is_no_effect_of_that_name_is_refused(site: Path, source: str, problem: str) -> None:  # noqa: F811
+def test_rejects_plugin_that_is_not_an_effect_of_that_name(site: Path, source: str, problem: str) -> None:  # noqa: F811
     install(site, "somebody-elses", "zz = plug_z:Half", {"plug_z": source}, "egvs.effects")
-    place = r"\(entry point 'plug_z:Half' of the package somebody-elses\)"
-    with pytest.raises(MissingBackendError, match=f"^'zz' of egvs.effects cannot be loaded: {problem}.*{place}"):
+    where = r"\(entry point 'plug_z:Half' of the package somebody-elses\)"
+    with pytest.raises(MissingBackendError, match=f"^'zz' of egvs.effects cannot be loaded: {problem}.*{where}"):
         registry.find_effect_class("zz")
 
 
 @pytest.mark.system
-def test_two_effects_that_say_they_are_one_are_refused(mini, tmp_path):
-    """Their parameters would overwrite each other in the key of the stage: a changed one would change nothing."""
+def test_rejects_two_effects_with_one_name(mini, tmp_path):
+    """Their parameters would overwrite each other in the cache key of the stage."""
     for name in ("aa", "bb"):
         install(tmp_path / "site", f"p{name}", f"{name} = plug_{name}:Half", {f"plug_{name}": EFFECT}, "egvs.effects")
     both = ("--set", "effects.aa.share=0.1", "--set", "effects.bb.share=0.2")
-    done = run_egvs(tmp_path / "site", "run", mini, "--out", tmp_path / "run", *both)
-    assert done.returncode == 1 and "Traceback" not in done.stderr
-    assert "expected NAME = 'aa'" in done.stderr and "of the package paa" in done.stderr
+    process = run_egvs(tmp_path / "site", "run", mini, "--out", tmp_path / "run", *both)
+    assert process.returncode == 1 and "Traceback" not in process.stderr
+    assert "expected NAME = 'aa'" in process.stderr and "of the package paa" in process.stderr
 
 
 BROKEN = {
@@ -160,13 +163,13 @@ BROKEN = {
 
 @pytest.mark.slow
 @pytest.mark.system
-def test_broken_ones_that_nobody_named_are_listed_as_broken(mini, tmp_path):
+def test_lists_broken_plugins(mini, tmp_path):
     for name, source in BROKEN.items():
         install(tmp_path / "site", f"p_{name}", f"{name} = plug_{name}:Half", {f"plug_{name}": source}, "egvs.effects")
     for arguments in ((), (mini,)):
-        done = run_egvs(tmp_path / "site", "effects", *arguments)
-        assert done.returncode == 0, done.stderr
-        words = done.stdout.split()
+        process = run_egvs(tmp_path / "site", "effects", *arguments)
+        assert process.returncode == 0, process.stderr
+        words = process.stdout.split()
         assert words.count("broken") == len(BROKEN) and {*BROKEN, "range_limit"} <= set(words)
     for name in ("raises", "exits", "other_name"):
         named = run_egvs(tmp_path / "site", "effects", mini, "--set", f"effects.{name}.share=0.25")
@@ -174,7 +177,7 @@ def test_broken_ones_that_nobody_named_are_listed_as_broken(mini, tmp_path):
 
 
 @pytest.mark.system
-def test_the_list_says_which_package_brings_an_effect(mini, package):
+def test_list_names_the_package_of_each_effect(mini, package):
     for arguments in ((), (mini,)):
         words = " ".join(run_egvs(package, "effects", *arguments).stdout.split())
         assert "half-returns" in words and "package egvs" not in words
@@ -185,7 +188,7 @@ class Given(Detect[EffectParameters]):
 
 
 @pytest.mark.parametrize(
-    ("given", "found"),
+    ("given", "result"),
     [
         (np.array([0.5, np.nan]), "values from nan to nan"),
         (np.array([0.5, 1.5]), "values from 0.5 to 1.5"),
@@ -197,12 +200,12 @@ class Given(Detect[EffectParameters]):
         (0.5, "float"),
     ],
 )
-def test_what_is_no_share_is_refused(given: object, found: str) -> None:
-    with pytest.raises(RunError, match=rf"^effects\.given: expected one share from 0 to 1 .*, got {found}$"):
+def test_rejects_invalid_shares(given: object, result: str) -> None:
+    with pytest.raises(RunError, match=rf"^effects\.given: expected one share from 0 to 1 .*, got {result}$"):
         visibility._checked_shares(Given(EffectParameters()), given, 2, "crossings")
 
 
-def test_shares_of_no_crossing_and_of_bits_are_shares() -> None:
+def test_accepts_empty_and_boolean_shares() -> None:
     effect = Given(EffectParameters())
     assert visibility._checked_shares(effect, np.ones(0), 0, "ranges").size == 0
     assert visibility._checked_shares(effect, np.array([True, False]), 2, "ranges").tolist() == [True, False]
@@ -211,11 +214,73 @@ def test_shares_of_no_crossing_and_of_bits_are_shares() -> None:
 @pytest.mark.slow
 @pytest.mark.system
 @pytest.mark.parametrize("value", ["np.nan", "2.0"])
-def test_a_run_with_an_effect_that_gives_no_shares_ends_with_its_name(mini, package, tmp_path, value):
+def test_names_plugin_that_returns_invalid_shares(mini, package, tmp_path, value):
     (package / "half_returns.py").write_text(EFFECT.replace("1.0 - self.parameters.share", value))
-    done = run_egvs(package, "run", mini, "--out", tmp_path / "run", "--set", "effects.half.share=0.25")
-    assert done.returncode == 1 and "Traceback" not in done.stderr
+    process = run_egvs(package, "run", mini, "--out", tmp_path / "run", "--set", "effects.half.share=0.25")
+    assert process.returncode == 1 and "Traceback" not in process.stderr
     assert (
-        "effects.half: expected one share from 0 to 1" in done.stderr
+        "effects.half: expected one share from 0 to 1" in process.stderr
         and not (tmp_path / "run" / "scores.parquet").exists()
     )
+
+
+MODULES = tuple(f"egvs.effects.{name}" for name in (
+    "divergence", "foliage", "mount_sway", "dropout", "fog", "moving_occlusion", "rain", "range_limit", "articulated",
+    "pedestrians_bicycles", "slope",
+))  # fmt: skip
+
+
+IMPORTED = """
+import sys
+import warnings
+warnings.simplefilter("error")
+import egvs
+from egvs.stages import score
+from tests.stage_runner import run_stage
+egvs.load({folder!r}, {settings!r})
+run_stage(score, egvs.load({folder!r}, {settings!r}), __import__("pathlib").Path({out!r}), jobs=1)
+print(sorted(name for name in sys.modules if name.startswith({MODULES})))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.system
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [([], []), (ACTIVE["rain"], ["egvs.effects.rain"])],
+    ids=["plain", "rain"],
+)
+def test_imports_only_named_effects(
+    score_run: tuple[Path, Path], tmp_path: Path, settings: list[str], expected: list[str]
+) -> None:
+    out = shutil.copytree(score_run[1], tmp_path / "out")
+    program = IMPORTED.format(MODULES=MODULES, folder=str(score_run[0]), settings=settings, out=str(out))
+    run = processes.python(program)
+    assert (run.returncode, run.stderr) == (0, "")
+    assert run.stdout.strip() == repr(expected)
+
+
+@pytest.mark.slow
+@pytest.mark.system
+def test_plain_run_imports_no_effect(mini: Path, tmp_path: Path) -> None:
+    program = f"""
+import sys
+import egvs
+egvs.run(egvs.load({str(mini)!r}), {str(tmp_path / "out")!r}, jobs=1)
+print([name for name in sys.modules if name.startswith({MODULES})])
+"""
+    run = processes.python(program)
+    assert (run.returncode, run.stdout.strip()) == (0, "[]"), run.stderr
+
+
+@pytest.mark.system
+def test_flat_network_imports_no_traffic_effect(flat_road, tmp_path):
+    values = road_scenario(flat_road, **(SMALL | {"frames": 8})).model_dump(mode="json")
+    code = f"""
+import sys; from pathlib import Path; from egvs.stages import statics, traffic; from tests.stage_runner import run_stage
+from egvs.scenario.loading import scenario_from_dict
+scene = scenario_from_dict({values!r}, Path({str(flat_road)!r}), "place")
+run_stage(traffic, scene, Path({str(tmp_path)!r})); run_stage(statics, scene, Path({str(tmp_path)!r}))
+print([m for m in sys.modules if m in ("egvs.effects.slope", "egvs.effects.articulated")])"""
+    process = processes.python(code)
+    assert (process.returncode, process.stdout.strip()) == (0, "[]"), process.stderr
