@@ -23,7 +23,7 @@ from egvs.artefacts.tpog import read_tpog
 from egvs.artefacts.traffic_frames import read_trajectories
 from egvs.effects import registry
 from egvs.effects.registry import SELF_ACTIVATING
-from egvs.report.basemap import network_file, outlines_of, roads_within
+from egvs.report.basemap import network_file, roads_within, world_outlines
 from egvs.report.maps import Backdrop, SiteViewFigure, site_view
 from egvs.report.ranking import RankedSite
 from egvs.report.svg_figures import extent, standalone
@@ -90,11 +90,11 @@ def before_and_after(name: str, folder: Path) -> Iterator[tuple[str, str]]:
         run.run(scenario, out)
         found.append((word, *seen(scenario, out, site)))
     tpog = read_tpog(out / "tpog.parquet")
-    scored = RankedSite.all_of(read_scores(out / "scores.parquet"))
+    scored = RankedSite.from_table(read_scores(out / "scores.parquet"))
     place = next(s for s in scored if s.site == (site or scored[0].site))
     box = extent(tpog.grid, [place])
     roads = roads_within(network_file(out), box)
-    backdrop = Backdrop(outlines_of(read_ply(out / "statics.ply")[0], box), roads)
+    backdrop = Backdrop(world_outlines(read_ply(out / "statics.ply")[0], box), roads)
     peak = max(float(field.max()) for _, field, _ in found)
     for word, field, crossed in found:
         view = SiteViewFigure(place, crossed, backdrop, box)

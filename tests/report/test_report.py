@@ -25,7 +25,7 @@ from egvs.core.grid import Grid
 from egvs.report import colours, figures, maps, svg_figures
 from egvs.report import page as report
 from egvs.report import page as report_page
-from egvs.report.basemap import Roads, outlines_of
+from egvs.report.basemap import Roads, world_outlines
 from egvs.report.figures import Figures
 from egvs.report.maps import Backdrop
 from egvs.report.ranking import Ranking
@@ -553,7 +553,7 @@ def test_sites_at_one_place_are_rings_and_the_best_is_inside():
 
 
 def test_outlines_have_no_inner_edges():
-    outlines = {group.look: group for group in outlines_of(world(), (0.0, 0.0, 12.0, 8.0))}
+    outlines = {group.look: group for group in world_outlines(world(), (0.0, 0.0, 12.0, 8.0))}
     assert {look: group.kinds for look, group in outlines.items()} == {
         "large": ("building",), "small": ("pole",), "green": ("tree crown",),
     }  # fmt: skip
@@ -561,10 +561,10 @@ def test_outlines_have_no_inner_edges():
 
 
 def test_outlines_are_cut_to_what_is_shown():
-    (buildings,) = outlines_of(world(), (9.0, 5.0, 10.0, 8.0))
+    (buildings,) = world_outlines(world(), (9.0, 5.0, 10.0, 8.0))
     assert buildings.rings[0][:, 0].min() >= 8.0 and buildings.rings[0][:, 0].max() <= 11.0
     empty = World(np.empty((0, 3)), np.empty((0, 3), dtype=np.int32), np.empty(0, dtype=np.int32), ())
-    assert outlines_of(empty, (0.0, 0.0, 1.0, 1.0)) == ()
+    assert world_outlines(empty, (0.0, 0.0, 1.0, 1.0)) == ()
 
 
 @pytest.mark.parametrize(

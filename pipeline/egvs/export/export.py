@@ -228,3 +228,9 @@ def _write_rasters(
 def safe_file_name(name: str) -> str:
     """A name that every disk takes."""
     return re.sub(r'[\s\x00-\x1f\x7f/\\:*?"<>|.]+', "_", name)[:80] or "_"
+
+
+def unknown_site(name: str, known: Sequence[str]) -> InputError:
+    """Return an error for a site that a run does not have."""
+    listed = ", ".join(known[:10]) + (", ..." if len(known) > 10 else "")
+    return InputError("--site", f"this run has no site {name!r}", f"Choose one of {listed}")
