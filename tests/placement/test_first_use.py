@@ -121,7 +121,7 @@ def test_bars_of_the_worst_period_are_shares_already(few: Path, tmp_path: Path, 
     assert [step.share for step in steps] == [row["value"] for row in curve.to_pylist()]
     assert 0.1 < steps[0].share < steps[1].share <= 1.0
     page = (out / "report.html").read_text()
-    assert "by what was asked for (the period that is seen worst), as a share" in page
+    assert ", by the score in the period with the lowest share, as a share" in page
 
 
 def test_a_folder_in_the_place_of_a_file_costs_no_plan(few: Path, tmp_path: Path, run_egvs) -> None:

@@ -1,17 +1,48 @@
-"""Roads under the maps: which lanes, how wide, whose, and where a street's name is written."""
+"""Background of the maps: outlines of solids, lanes, and where street names are written."""
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
+import pytest
+import shapely
 
-from egvs.core.grid import Grid
-from egvs.report import maps
-from egvs.report.basemap import Roads, network_file, roads_within
-from egvs.report.maps import Backdrop
-from egvs.report.svg_figures import MapSite
+from egvs.report import basemap
+from egvs.report.basemap import Roads, network_file, roads_within, world_outlines
+from egvs.world.mesh import World
+from tests.report.small_runs import make_world
+
+
+def test_outlines_have_no_inner_edges():
+    outlines = {group.look: group for group in world_outlines(make_world(), (0.0, 0.0, 12.0, 8.0))}
+    assert {look: group.kinds for look, group in outlines.items()} == {
+        "large": ("building",), "small": ("pole",), "green": ("tree crown",),
+    }  # fmt: skip
+    assert [len(ring) for ring in outlines["large"].rings] == [5], "a rectangle: its triangles are united"
+
+
+def test_outlines_are_cut_at_the_edge_of_the_map():
+    (buildings,) = world_outlines(make_world(), (9.0, 5.0, 10.0, 8.0))
+    assert buildings.rings[0][:, 0].min() >= 8.0 and buildings.rings[0][:, 0].max() <= 11.0
+    empty = World(np.empty((0, 3)), np.empty((0, 3), dtype=np.int32), np.empty(0, dtype=np.int32), ())
+    assert world_outlines(empty, (0.0, 0.0, 1.0, 1.0)) == ()
+
+
+def test_squares_cover_small_triangles_and_keep_large_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(3)
+    small = rng.uniform(1, 9, (200, 1, 2)) + rng.uniform(0, 0.4, (200, 3, 2))
+    triangles = np.concatenate([small, [[[20.0, 1.0], [29.0, 1.0], [20.0, 9.0]]]])
+    box = (0.0, 0.0, 30.0, 10.0)
+    exact = basemap.union_of_triangles(triangles, box)
+    assert exact.equals(shapely.union_all(shapely.polygons(triangles)))
+    monkeypatch.setattr(basemap, "_MAX_SMALL_TRIANGLES", 199)
+    drawn = basemap.union_of_triangles(triangles, box)
+    assert drawn.buffer(1e-9).covers(exact)
+    assert exact.buffer(2 * 0.25 * 2**0.5 + 0.4).covers(drawn)
+    right = shapely.box(15, 0, 30, 10)
+    assert shapely.intersection(drawn, right).equals(shapely.intersection(exact, right))
+
 
 NETWORK = """<net version="1.20">
     <edge id=":b_0" function="internal"><lane id=":b_0_0" index="0" length="8" shape="46,-1.6 54,-1.6"/></edge>
@@ -44,7 +75,7 @@ def roads(folder: Path, box: tuple[float, float, float, float]) -> Roads:
     return roads_within(path, box)
 
 
-def test_lanes_are_cut_at_the_map_and_sorted_by_who_uses_them(tmp_path: Path) -> None:
+def test_lanes_are_cut_at_the_map_and_sorted_by_users(tmp_path: Path) -> None:
     shown = roads(tmp_path, (10.0, -20.0, 60.0, 20.0))
     lanes = [(lane.look, lane.width_m, lane.line.tolist()) for lane in shown.lanes]
     assert lanes == [
@@ -58,41 +89,15 @@ def test_lanes_are_cut_at_the_map_and_sorted_by_who_uses_them(tmp_path: Path) ->
     assert [outline.tolist() for outline in shown.junctions] == [[[46, -6], [54, -6], [54, 6], [46, 6]]]
 
 
-def test_a_name_is_written_once_from_west_to_east_along_the_longest_straight_piece(tmp_path: Path) -> None:
+def test_street_name_is_once_on_the_longest_straight_line_from_west_to_east(tmp_path: Path) -> None:
     (name,) = roads(tmp_path, (-10.0, -20.0, 60.0, 20.0)).names
     assert (name.text, name.start_m, name.end_m, name.length_m) == ("High Street", (0.0, -1.6), (46.0, -1.6), 46.0)
 
 
-def test_what_lies_elsewhere_is_not_shown(tmp_path: Path) -> None:
+def test_roads_outside_the_map_are_not_shown(tmp_path: Path) -> None:
     assert roads(tmp_path, (200.0, 200.0, 300.0, 300.0)) == Roads()
 
 
-def test_without_a_network_there_are_no_roads(tmp_path: Path) -> None:
+def test_no_roads_without_a_network(tmp_path: Path) -> None:
     assert network_file(tmp_path) is None
     assert roads_within(None, (0.0, 0.0, 1.0, 1.0)) == Roads()
-
-
-def drawn(folder: Path, sites: list[MapSite]) -> str:
-    grid = Grid((0.0, -10.0, 0.0), 0.5, (100, 40, 4))
-    backdrop = Backdrop((), roads(folder, (-10.0, -20.0, 60.0, 20.0)))
-    return maps.site_map(grid, np.zeros((100, 40)), backdrop, sites, "")
-
-
-def test_lanes_are_drawn_as_wide_as_they_are(tmp_path: Path) -> None:
-    figure = drawn(tmp_path, [MapSite("a", 5.0, 8.0, 3.0, 1.0, 1)])
-    widths = dict(re.findall(r'class="lane (\w+)" style="stroke-width:([\d.]+)px"', figure))
-    scale = float(re.search(r'class="edge" style="stroke-width:([\d.]+)px"', figure).group(1)) / 4.0  # the crossing's
-    assert float(widths["drive"]) == round(3.2 * scale - 1.0, 2)
-    assert not re.search(r"M[Mz\"]", figure), "an empty path ends the drawing of all that follow"
-
-
-def test_a_street_name_makes_way_for_sites(tmp_path: Path) -> None:
-    def places(folder: Path, x_m: float) -> list[str]:
-        folder.mkdir()
-        return re.findall(r'class="street" transform="translate\(([\d.]+) ', drawn(folder, [site_at(x_m)]))
-
-    def site_at(x_m: float) -> MapSite:
-        return MapSite("a", x_m, -1.6, 3.0, 1.0, 1)
-
-    (free,), (moved,) = places(tmp_path / "beside", 49.0), places(tmp_path / "on", 23.0)
-    assert free != moved
