@@ -40,8 +40,8 @@ def test_squares_cover_small_triangles_and_keep_large_ones(monkeypatch: pytest.M
     drawn = basemap.union_of_triangles(triangles, box)
     assert drawn.buffer(1e-9).covers(exact)
     assert exact.buffer(2 * 0.25 * 2**0.5 + 0.4).covers(drawn)
-    right = shapely.box(15, 0, 30, 10)
-    assert shapely.intersection(drawn, right).equals(shapely.intersection(exact, right))
+    east_part = shapely.box(15, 0, 30, 10)
+    assert shapely.intersection(drawn, east_part).equals(shapely.intersection(exact, east_part))
 
 
 NETWORK = """<net version="1.20">
@@ -76,8 +76,8 @@ def roads(folder: Path, box: tuple[float, float, float, float]) -> Roads:
 
 
 def test_lanes_are_cut_at_the_map_and_sorted_by_users(tmp_path: Path) -> None:
-    shown = roads(tmp_path, (10.0, -20.0, 60.0, 20.0))
-    lanes = [(lane.look, lane.width_m, lane.line.tolist()) for lane in shown.lanes]
+    visible = roads(tmp_path, (10.0, -20.0, 60.0, 20.0))
+    lanes = [(lane.look, lane.width_m, lane.line.tolist()) for lane in visible.lanes]
     assert lanes == [
         ("walk", 4.0, [[45.0, -4.0], [45.0, 4.0]]),
         ("walk", 2.0, [[10.0, -5.0], [46.0, -5.0]]),
@@ -86,7 +86,7 @@ def test_lanes_are_cut_at_the_map_and_sorted_by_users(tmp_path: Path) -> None:
         ("drive", 3.2, [[46.0, 1.6], [20.0, 1.6], [10.0, 1.6]]),
         ("rail", 3.2, [[54.0, 0.0], [60.0, 0.0]]),
     ]
-    assert [outline.tolist() for outline in shown.junctions] == [[[46, -6], [54, -6], [54, 6], [46, 6]]]
+    assert [outline.tolist() for outline in visible.junctions] == [[[46, -6], [54, -6], [54, 6], [46, 6]]]
 
 
 def test_street_name_is_once_on_the_longest_straight_line_from_west_to_east(tmp_path: Path) -> None:

@@ -36,8 +36,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     scenario, out = run_to_scores(tmp_path_factory.mktemp("choosing"), sites=SITES)
     report, text = out / "report.html", render_report(scenario, out)
     data = json.loads(re.search(r'id="site-data">(.*?)</script>', text, re.DOTALL).group(1))
-    told = data["sites"]["south"]["vehicles"]  # the run has no network: as if two of its lanes were told of
-    told |= {"worst": WORST, "numbers": [[100.5, 200.0], [50, 60], None, None, None], "note": "<b>all"}
+    vehicles = data["sites"]["south"]["vehicles"]  # the run has no network: pretend that it has two bad lanes
+    vehicles |= {"worst": WORST, "numbers": [[100.5, 200.0], [50, 60], None, None, None], "note": "<b>all"}
     changed = json.dumps(data).replace("<", "\\u003c")
     report.write_text(
         re.sub(r'(?s)(id="site-data">).*?(?=</script>)', lambda m: m[1] + changed, text), encoding="utf-8"
@@ -61,7 +61,7 @@ def browser_page(run: Path, request: pytest.FixtureRequest) -> Iterator[Any]:
         assert errors == []
 
 
-def shown(opened: Any, kind: str) -> list[int]:
+def displayed_image(opened: Any, kind: str) -> list[int]:
     """Palette indices of the image that the first panel shows, read from the bytes that the page has joined."""
     uri = opened.evaluate(
         """async kind => {
@@ -75,7 +75,7 @@ def shown(opened: Any, kind: str) -> list[int]:
     return decode_png(uri).ravel().tolist()
 
 
-def expected(run: Path, site: str, kind: str) -> list[int]:
+def expected_image(run: Path, site: str, kind: str) -> list[int]:
     """Those of the image that the page holds for a site."""
     text = (run / "report.html").read_text(encoding="utf-8")
     data = json.loads(re.search(r'id="site-data">(.*?)</script>', text, re.DOTALL).group(1))
@@ -93,23 +93,23 @@ def test_every_site_can_be_chosen(browser_page: Any, run: Path) -> None:
     images = {}
     for name in names:
         browser_page.locator('[data-panel="1"] select').select_option(name)
-        images[name] = {kind: shown(browser_page, kind) for kind in ("seen", "missed", "scan", "vehicles")}
-        assert images[name] == {kind: expected(run, name, kind) for kind in images[name]}
+        images[name] = {kind: displayed_image(browser_page, kind) for kind in ("seen", "missed", "scan", "vehicles")}
+        assert images[name] == {kind: expected_image(run, name, kind) for kind in images[name]}
         assert browser_page.locator('[data-panel="1"] figcaption').inner_text().startswith(f"{name}: rank ")
     assert len({str(image["seen"]) for image in images.values()}) == len(names)
 
 
 def test_lists_and_numbers_the_worst_locations_of_a_chosen_site(browser_page: Any) -> None:
     panel = browser_page.locator('[data-panel="1"]')
-    shown_marks = """all => all.filter(m => getComputedStyle(m).display !== "none")
+    visible_marks = """all => all.filter(m => getComputedStyle(m).display !== "none")
         .map(m => m.textContent + " " + m.getAttribute("transform"))"""
     marks = panel.locator("g.worst")
     panel.locator("select").select_option("south")
     assert panel.locator(".worst-places li").all_inner_texts() == ["\n".join(place) for place in WORST]
     assert panel.locator(".worst-note").inner_text() == "<b>all"
-    assert marks.evaluate_all(shown_marks) == ["1 translate(100.5 200)", "2 translate(50 60)"]
+    assert marks.evaluate_all(visible_marks) == ["1 translate(100.5 200)", "2 translate(50 60)"]
     panel.locator("select").select_option("north")
-    assert panel.locator(".worst-places li").count() == 0 and marks.evaluate_all(shown_marks) == []
+    assert panel.locator(".worst-places li").count() == 0 and marks.evaluate_all(visible_marks) == []
     assert "see the map" in panel.locator(".worst-note").inner_text()
 
 

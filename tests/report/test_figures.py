@@ -54,27 +54,27 @@ def site(places: Sequence[LocationVisibility], share: object = ((0.0, NAN), (0.2
 
 
 def test_lists_the_worst_locations_first_and_none_with_few_vehicles() -> None:
-    its = site([ALL, APPROACH, GOOD, FEW, CROSSING, TURN, LEFT])
-    assert its.worst == [LEFT, TURN, CROSSING]
-    assert figures.describe_worst_locations(its)[0] == (
+    blindspots = site([ALL, APPROACH, GOOD, FEW, CROSSING, TURN, LEFT])
+    assert blindspots.worst == [LEFT, TURN, CROSSING]
+    assert figures.describe_worst_locations(blindspots)[0] == (
         "eastbound left-turn lane: 41 % seen",
         "± 8 %, from 12 vehicles in 120 observations",
     )
-    assert figures.format_missed_share(its) == "12.5%"
-    assert figures.blindspot_note(its) == "Share seen by approach: eastbound approach: 63 %."
-    assert its.in_words() == (
+    assert figures.format_missed_share(blindspots) == "12.5%"
+    assert figures.blindspot_note(blindspots) == "Share seen by approach: eastbound approach: 63 %."
+    assert blindspots.in_words() == (
         "p1 misses 12.5% of the vehicles (fewer than 20 points); worst: eastbound left-turn lane, 41% seen; "
         "eastbound left turn in the junction, 50% seen"
     )
 
 
 def test_lists_at_most_five_locations() -> None:
-    its = site([ALL, *(place("lane", f"lane {i}", 100 + i, 20, 0.1) for i in range(9))])
-    assert [found.words for found in its.worst] == [f"lane {i}" for i in (8, 7, 6, 5, 4)]
+    blindspots = site([ALL, *(place("lane", f"lane {i}", 100 + i, 20, 0.1) for i in range(9))])
+    assert [location.words for location in blindspots.worst] == [f"lane {i}" for i in (8, 7, 6, 5, 4)]
 
 
 @pytest.mark.parametrize(
-    ("places", "said"),
+    ("places", "note"),
     [
         ([], "No vehicle in the region."),
         ([ALL], "The traffic does not come from one road network, so there are no lanes to list; see the map."),
@@ -83,8 +83,8 @@ def test_lists_at_most_five_locations() -> None:
         ([ALL, LEFT, place("no lane", "on no lane", 7, 2, 1.0)], "7 of 1,000 observed vehicles were not on a lane."),
     ],
 )
-def test_note_on_blind_spots(places: list[LocationVisibility], said: str) -> None:
-    assert figures.blindspot_note(site(places)) == said
+def test_note_on_blind_spots(places: list[LocationVisibility], note: str) -> None:
+    assert figures.blindspot_note(site(places)) == note
 
 
 def test_blind_spots_without_vehicles() -> None:
@@ -105,12 +105,14 @@ def test_page_has_the_blind_spots_of_each_site(tmp_path: Path) -> None:
     assert read.text.count("Where vehicles are missed:") == 2
     assert read.text.count("The traffic does not come from one road network") == 2 + 4  # panels, and data
     data = json.loads(re.search(r'id="site-data">(.*?)</script>', text, re.DOTALL)[1])  # type: ignore[index]
-    for name, its in data["sites"].items():
-        (found,) = readers.read_blindspots(out / "blindspots.parquet", {name})
-        assert found.overall is not None and found.overall.vehicle_frames == 40 + 33  # the second drives out
-        assert its["vehicles"]["missed"] == f"{1 - found.overall.share:.1%}"
-        assert its["vehicles"]["numbers"] == [None] * MAX_LOCATIONS
-    assert any(f"misses {its['vehicles']['missed']} of the vehicles" in text for its in data["sites"].values())
+    for name, blindspots in data["sites"].items():
+        (actual,) = readers.read_blindspots(out / "blindspots.parquet", {name})
+        assert actual.overall is not None and actual.overall.vehicle_frames == 40 + 33  # the second drives out
+        assert blindspots["vehicles"]["missed"] == f"{1 - actual.overall.share:.1%}"
+        assert blindspots["vehicles"]["numbers"] == [None] * MAX_LOCATIONS
+    assert any(
+        f"misses {blindspots['vehicles']['missed']} of the vehicles" in text for blindspots in data["sites"].values()
+    )
 
 
 def test_views_agree_with_the_scores(plain_run):
@@ -134,14 +136,14 @@ def test_every_site_can_be_chosen_with_larger_pixels_if_there_are_many(tmp_path,
     sites = [(f"g{n:03}", 0.3 * n, -1, 2) for n in range(count)]
     scenario, out = run_to_scores(tmp_path, sites=sites)
     text = render_report(scenario, out)
-    found = site_data(text)["sites"]
+    actual = site_data(text)["sites"]
     ranked = sorted(read_scores(out / "scores.parquet").to_pylist(), key=lambda row: row["rank"])
-    assert sorted(found) == [name for name, *_ in sites]
+    assert sorted(actual) == [name for name, *_ in sites]
     assert ("drawn with larger pixels" in text) == is_coarse
     assert ("6 more sites between these are not listed, but can be chosen below" in text) == is_coarse
 
     def width(site, kind):
-        return int.from_bytes(base64.b64decode(found[site]["images"][kind][0])[16:20], "big")
+        return int.from_bytes(base64.b64decode(actual[site]["images"][kind][0])[16:20], "big")
 
     best, second = ranked[0]["site"], ranked[1]["site"]
     assert width(best, "scan") == 300 and width(second, "scan") == (150 if is_coarse else 300)

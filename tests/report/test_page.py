@@ -99,7 +99,7 @@ def test_shows_costs_and_counts_them_as_inputs(plain_run, tmp_path):
     assert inputs_of(page, scenario, tmp_path / "out") != inputs_of(page, scenario, out)
 
 
-def test_everything_shown_is_an_input(plain_run, tmp_path):
+def test_everything_on_the_page_is_an_input(plain_run, tmp_path):
     scenario, out, _ = plain_run
     before = inputs_of(page, scenario, out)
     changed = make_record()
@@ -113,35 +113,39 @@ def test_everything_shown_is_an_input(plain_run, tmp_path):
     json.dumps(before.to_json(), allow_nan=False)
 
 
-def test_summaries_that_are_not_shown_are_no_input(plain_run, tmp_path):
+def test_summaries_that_are_not_on_the_page_are_no_input(plain_run, tmp_path):
     """A run that was audited says so in the summary of its scores; ``verify`` runs it again without."""
     scenario, out, _ = plain_run
     shutil.copytree(out, tmp_path / "out")
     audited = make_record()
     audited["stages"]["score"] = audited["stages"]["tpog"] | {"summary": {"audit": {"misplaced_chords": 0}}}
     (tmp_path / "out" / "run.json").write_text(json.dumps(add_checksum(audited)))
-    other, own = inputs_of(page, scenario, tmp_path / "out"), inputs_of(page, scenario, out)
+    other, original = inputs_of(page, scenario, tmp_path / "out"), inputs_of(page, scenario, out)
     assert other.more["costs"]["score"] == [1.25, 512.0]
-    assert (other.files, other.settings, other.more["summaries"]) == (own.files, own.settings, own.more["summaries"])
+    assert (other.files, other.settings, other.more["summaries"]) == (
+        original.files,
+        original.settings,
+        original.more["summaries"],
+    )
 
 
 def test_page_is_the_same_without_saved_scans(tmp_path):
-    kept, cast = (run_to_scores(tmp_path / str(keep), record=False, scan={"keep": keep}) for keep in (True, False))
-    assert not (cast[1] / "scans.parquet").exists()
-    assert render_report(*kept) == render_report(*cast)
+    saved, traced = (run_to_scores(tmp_path / str(keep), record=False, scan={"keep": keep}) for keep in (True, False))
+    assert not (traced[1] / "scans.parquet").exists()
+    assert render_report(*saved) == render_report(*traced)
 
 
 def test_ranking_has_every_site_and_equal_scores_share_a_rank(tmp_path):
     scenario, out = run_to_scores(tmp_path, sites=[*SITES, ("twin", 6, 9, 2)])
     read = PageReader(render_report(scenario, out))
     for row in read_scores(out / "scores.parquet").to_pylist():
-        shown = next(r for r in read.rows if f"|{row['site']}|" in r)
-        assert f"{row['egvs']:,.0f}|" in shown and f"{row['entropy_seen']:.1%}|" in shown
+        visible_row = next(r for r in read.rows if f"|{row['site']}|" in r)
+        assert f"{row['egvs']:,.0f}|" in visible_row and f"{row['entropy_seen']:.1%}|" in visible_row
         twins = row["site"] in ("north", "twin")
-        assert shown.strip("|").split("|")[0] == f"{row['rank']}{'=' if twins else ''}"
+        assert visible_row.strip("|").split("|")[0] == f"{row['rank']}{'=' if twins else ''}"
 
 
-def test_headline_names_the_best_site_and_its_lead(plain_run):
+def test_headline_names_the_best_site_and_the_lead(plain_run):
     rows = sorted(read_scores(plain_run[1] / "scores.parquet").to_pylist(), key=lambda row: row["rank"])
     text = PageReader(plain_run[2]).text
     assert f"{rows[0]['site']} is the best of 4 sites" in text
@@ -150,7 +154,7 @@ def test_headline_names_the_best_site_and_its_lead(plain_run):
 
 def test_shows_the_record_of_the_run(plain_run):
     text = PageReader(plain_run[2]).text
-    for shown in (
+    for visible_row in (
         "3 to 5",
         "1,234",
         "5 m/s (18 km/h)",
@@ -162,7 +166,7 @@ def test_shows_the_record_of_the_run(plain_run):
         "512 MB",
         "ab" * 32,
     ):
-        assert shown in text
+        assert visible_row in text
 
 
 def test_lists_effects_that_are_modelled_and_those_that_are_not(plain_run):
@@ -170,8 +174,8 @@ def test_lists_effects_that_are_modelled_and_those_that_are_not(plain_run):
     assert "Effects none" in PageReader(text).text and "fog" in text
     foggy = scenario.with_effects(EffectsConfig.of({"fog": {"visibility_m": 100}, "moving_occlusion": {}}))
     ranking, tpog = Ranking.read(out / "scores.parquet"), read_tpog(out / "tpog.parquet")
-    shown = page.render_page(PageContents(foggy, ranking, tpog, Figures("", "", None, EMPTY_BACKDROP), {}))
-    assert "This run models these effects: fog, moving occlusion. It does not model rain, " in PageReader(shown).text
+    html = page.render_page(PageContents(foggy, ranking, tpog, Figures("", "", None, EMPTY_BACKDROP), {}))
+    assert "This run models these effects: fog, moving occlusion. It does not model rain, " in PageReader(html).text
 
 
 def test_shows_user_columns_by_pole(tmp_path):
@@ -243,11 +247,11 @@ def test_page_of_five_hundred_sites(tmp_path):
     text = render_report(scenario, out)
     read = PageReader(text)
     rows = sorted(read_scores(out / "scores.parquet").to_pylist(), key=lambda row: row["rank"])
-    shown = [row for row in read.rows if re.search(r"\|g\d{3}\|", f"|{row}")]
-    assert len(shown) == 35 and "465 more sites" in read.text and "can be chosen below" not in read.text
+    listed = [row for row in read.rows if re.search(r"\|g\d{3}\|", f"|{row}")]
+    assert len(listed) == 35 and "465 more sites" in read.text and "can be chosen below" not in read.text
     assert list(site_data(text)["sites"]) == [row["site"] for row in rows[:195] + rows[-5:]]
     assert "any of the first 195 and the last 5 sites" in read.text
-    assert f"|{rows[-1]['site']}|" in shown[-1]
+    assert f"|{rows[-1]['site']}|" in listed[-1]
     assert len(text) < 2_000_000
     titles = [t for t in read.texts if "rank" in t and "EGVS" in t and "height" in t]
     assert len({name for title in titles for name in re.findall(r"g\d{3}", title)}) == 500, (

@@ -12,8 +12,8 @@ from egvs.report.ranking import RankedSite, Ranking, ScoreValue
 def ranking(*rows: tuple[str, float, int, float, float]) -> Ranking:
     """From (site, score, rank, entropy seen, chance to beat the next), best first."""
     sites = tuple(
-        RankedSite(site, 0.0, 0.0, 3.0, egvs, rank, site, 0.0, 0.0, 0.0, "s", 200.0, 1, 1, seen, 1.0, beats)
-        for site, egvs, rank, seen, beats in rows
+        RankedSite(site, 0.0, 0.0, 3.0, egvs, rank, site, 0.0, 0.0, 0.0, "s", 200.0, 1, 1, entropy_seen, 1.0, beats)
+        for site, egvs, rank, entropy_seen, beats in rows
     )
     return Ranking(sites, tuple(site for site in sites if site.rank == 1), ())
 
@@ -21,8 +21,8 @@ def ranking(*rows: tuple[str, float, int, float, float]) -> Ranking:
 def by_vehicles(*rows: tuple[str, float, float], rank_by: str = "expected_detections") -> Ranking:
     """From (site, EGVS, share of vehicles found), ranked by the latter, best first."""
     sites = tuple(
-        replace(site, rank_by=rank_by, others=(ScoreValue("expected_detections", found, 0.01),))
-        for site, (_, _, found) in zip(
+        replace(site, rank_by=rank_by, others=(ScoreValue("expected_detections", detected, 0.01),))
+        for site, (_, _, detected) in zip(
             ranking(*((name, egvs, i + 1, 0.5, 0.99) for i, (name, egvs, _) in enumerate(rows))).sites,
             rows,
             strict=True,
@@ -32,16 +32,17 @@ def by_vehicles(*rows: tuple[str, float, float], rank_by: str = "expected_detect
 
 
 def test_sentences_for_a_score_over_vehicles() -> None:
-    found = by_vehicles(("a", 50.0, 0.871), ("b", 90.0, 0.8), ("c", 20.0, 0.4))
+    detected = by_vehicles(("a", 50.0, 0.871), ("b", 90.0, 0.8), ("c", 20.0, 0.4))
     assert (
-        report_ranking.headline(found, has_traffic=True) == "a is the best of 3 sites: it should find 87% of vehicles"
+        report_ranking.headline(detected, has_traffic=True)
+        == "a is the best of 3 sites: it should find 87% of vehicles"
     )
-    assert report_ranking.lead(found) == "It leads the next site, b, by 8.2% of its score."
-    assert report_ranking.entropy_seen_note(found) == ""
-    assert report_ranking.site_caption(found.sites[0], 1, 2).startswith(
+    assert report_ranking.lead(detected) == "It leads the next site, b, by 8.2% of its score."
+    assert report_ranking.entropy_seen_note(detected) == ""
+    assert report_ranking.site_caption(detected.sites[0], 1, 2).startswith(
         "a: rank 1, the share of vehicles found 87.1%, at x"
     )
-    assert found.sites[0].score_se == 0.01 and found.companion_score is SCORE_LABELS["egvs"]
+    assert detected.sites[0].score_se == 0.01 and detected.companion_score is SCORE_LABELS["egvs"]
     assert (
         report_ranking.headline(by_vehicles(("a", 50.0, 0.871)), has_traffic=True)
         == "a, the only site, should find 87% of vehicles"

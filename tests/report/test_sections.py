@@ -87,14 +87,14 @@ def test_shows_the_validation_of_the_same_run(mini, tmp_path, run_egvs):
     assert not section()
     code, printed, error = run_egvs(*validate)
     assert code == 0, error
-    shown = html.unescape(section())
-    assert f"data:image/png;base64,{base64.b64encode((out / 'validation.png').read_bytes()).decode()}" in shown
-    assert "in 10 frames of traffic, at least 2 s apart, with 18 vehicles in the region" in shown
-    assert "to compare the two orders" in shown  # of two sites
-    assert "evaluated with the frames that the TPOG was computed from" in shown and str(mini) not in shown
+    text = html.unescape(section())
+    assert f"data:image/png;base64,{base64.b64encode((out / 'validation.png').read_bytes()).decode()}" in text
+    assert "in 10 frames of traffic, at least 2 s apart, with 18 vehicles in the region" in text
+    assert "to compare the two orders" in text  # of two sites
+    assert "evaluated with the frames that the TPOG was computed from" in text and str(mini) not in text
     for row in parquet.read_artefact(out / "detection.parquet", "detection")[0].to_pylist():
         if row["objects_of"] == "vehicles":
-            assert f"{100 * row['seen_20']:.1f} ± {100 * row['seen_20_se']:.1f}" in shown
+            assert f"{100 * row['seen_20']:.1f} ± {100 * row['seen_20_se']:.1f}" in text
     assert str(out / "report.html") in printed
     assert run_egvs("verify", out)[0] == 0
 
@@ -126,12 +126,12 @@ EGVS = egvs_setting(2.0, 0.25)
 
 def test_reports_scores_with_different_best_sites() -> None:
     rows = (("a", 50.0, 0.9), ("b", 90.0, 0.8), ("c", 20.0, 0.7), ("d", 80.0, 0.6))
-    told = ranking_disagreement(by_vehicles(*rows).sites, EGVS, {})
-    assert told == (
+    text = ranking_disagreement(by_vehicles(*rows).sites, EGVS, {})
+    assert text == (
         "The best sites by EGVS are b, d and a; by the share of vehicles found they are a, b and c. "
         "How well this setting of the EGVS predicts detection was not measured."
     )
-    assert ranking_disagreement(by_vehicles(*rows, rank_by="egvs").sites, EGVS, {}) == told  # whichever ranks
+    assert ranking_disagreement(by_vehicles(*rows, rank_by="egvs").sites, EGVS, {}) == text  # whichever ranks
     rho = {"expected_detections": {"cluster": 0.9, "pointpillars": 0.8}, EGVS: {"cluster": 0.7, "pointpillars": 0.6}}
     assert ranking_disagreement(by_vehicles(*rows).sites, EGVS, rho).endswith(
         " At the held-out junctions of the validation study, the share of vehicles found predicted detection better: "
@@ -152,13 +152,13 @@ def test_evidence_equals_the_tables_of_the_study() -> None:
     path = Path(__file__).parents[2] / "docs" / "data" / "validity" / "f-all-scores.csv"
     with path.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
-    told = {row["score"]: {name: round(float(row[name]), 2) for name in ("cluster", "pointpillars")} for row in rows}
-    own = {name: its for name, its in told.items() if name.startswith("egvs ")}
-    own["expected_detections"] = told["expected_detections (detectors cluster+pointpillars)"]
-    assert own == RHO and {egvs_setting(10.0, 0.25), egvs_setting(2.0, 0.5, moving_occlusion=True)} < set(RHO)
+    rho = {row["score"]: {name: round(float(row[name]), 2) for name in ("cluster", "pointpillars")} for row in rows}
+    expected = {name: row for name, row in rho.items() if name.startswith("egvs ")}
+    expected["expected_detections"] = rho["expected_detections (detectors cluster+pointpillars)"]
+    assert expected == RHO and {egvs_setting(10.0, 0.25), egvs_setting(2.0, 0.5, moving_occlusion=True)} < set(RHO)
 
 
-def test_says_nothing_about_scores_that_agree() -> None:
+def test_is_silent_if_scores_agree() -> None:
     same = (("a", 90.0, 0.9), ("b", 60.0, 0.8), ("c", 70.0, 0.7), ("d", 50.0, 0.6))  # the second and the third change
     assert ranking_disagreement(by_vehicles(*same).sites, EGVS, {}) == ""
     other_first = (("a", 60.0, 0.9), ("b", 90.0, 0.8), ("c", 70.0, 0.7), ("d", 50.0, 0.6))
@@ -178,22 +178,22 @@ def test_shows_the_accuracy_study_of_the_same_run(mini, tmp_path, run_egvs, monk
     monkeypatch.setattr(study_settings, "GAMMAS", (2.0,))
     monkeypatch.setattr(study_settings, "_others", lambda _: iter(()))
     monkeypatch.setattr(accuracy, "REPEATS", 1)
-    own = score_errors.mark_pareto_front
+    expected = score_errors.mark_pareto_front
 
     def thinned(rows, tolerance):
         """The clock decides which of two fast settings is the cheapest: here it is always the same."""
-        return own(
+        return expected(
             [replace(r, seconds=0.5 if r.setting == "every 2nd azimuth" else 1.0, judged=0.0) for r in rows], tolerance
         )
 
     monkeypatch.setattr(score_errors, "mark_pareto_front", thinned)
     out = tmp_path / "out"
 
-    def shown():
+    def is_shown():
         return "What accuracy costs" in (out / "report.html").read_text()
 
     assert run_egvs("run", mini, "--out", out)[0] == 0
-    assert not shown()
+    assert not is_shown()
     code, printed, error = run_egvs("accuracy", mini, "--out", out)
     assert code == 0, error
     assert printed.splitlines()[-1] == str(out / "report.html")
@@ -211,14 +211,14 @@ def test_shows_the_accuracy_study_of_the_same_run(mini, tmp_path, run_egvs, monk
     assert run_egvs("verify", out)[0] == 0
 
     assert run_egvs("accuracy", mini, "--out", out, "--set", "score.gamma=3.0")[0] == 0
-    assert not shown()  # that study is of another scenario than the run
+    assert not is_shown()  # that study is of another scenario than the run
     assert run_egvs("verify", out)[0] == 0
     assert run_egvs("run", mini, "--out", out, "--set", "score.gamma=3.0")[0] == 0
-    assert shown()
+    assert is_shown()
     assert run_egvs("verify", out)[0] == 0
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m\npole_a,10,12,3\n")
     assert run_egvs("run", mini, "--out", out, "--set", "score.gamma=3.0")[0] == 0
-    assert not shown()  # nor is it of other sites
+    assert not is_shown()  # nor is it of other sites
 
 
 @pytest.mark.slow

@@ -26,7 +26,7 @@ def test_ticks_are_round(low, high, texts):
     assert [text for _, text in svg_figures.round_values(low, high, 5)] == texts
 
 
-def test_figures_can_be_files_of_their_own(plain_run):
+def test_figures_can_be_written_as_files(plain_run):
     for figure in re.findall(r"<svg.*?</svg>", plain_run[2], re.DOTALL):
         root = ET.fromstring(svg_figures.standalone(figure))
         assert root.tag == "{http://www.w3.org/2000/svg}svg"

@@ -243,7 +243,7 @@ def test_the_report_tells_what_its_tables_leave_out(
         monkeypatch.setattr(f"egvs.report.page.{name}", count)
     egvs.run(egvs.load(split), tmp_path)
     html = (tmp_path / "report.html").read_text()
-    assert "2 more are not shown; scores_by_period.parquet holds them all" in html
+    assert "2 more are not shown; scores_by_period.parquet has all sites" in html
     assert "Choose any site here" in html
     assert re.search(r"Vehicles at a time</dt><dd>2<small>", html)
 
