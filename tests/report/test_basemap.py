@@ -15,8 +15,8 @@ from tests.report.small_runs import make_world
 
 
 def test_outlines_have_no_inner_edges():
-    outlines = {group.look: group for group in world_outlines(make_world(), (0.0, 0.0, 12.0, 8.0))}
-    assert {look: group.kinds for look, group in outlines.items()} == {
+    outlines = {group.css_class: group for group in world_outlines(make_world(), (0.0, 0.0, 12.0, 8.0))}
+    assert {css_class: group.kinds for css_class, group in outlines.items()} == {
         "large": ("building",), "small": ("pole",), "green": ("tree crown",),
     }  # fmt: skip
     assert [len(ring) for ring in outlines["large"].rings] == [5], "a rectangle: its triangles are united"
@@ -77,7 +77,7 @@ def roads(folder: Path, box: tuple[float, float, float, float]) -> Roads:
 
 def test_lanes_are_cut_at_the_map_and_sorted_by_users(tmp_path: Path) -> None:
     visible = roads(tmp_path, (10.0, -20.0, 60.0, 20.0))
-    lanes = [(lane.look, lane.width_m, lane.line.tolist()) for lane in visible.lanes]
+    lanes = [(lane.css_class, lane.width_m, lane.line.tolist()) for lane in visible.lanes]
     assert lanes == [
         ("walk", 4.0, [[45.0, -4.0], [45.0, 4.0]]),
         ("walk", 2.0, [[10.0, -5.0], [46.0, -5.0]]),

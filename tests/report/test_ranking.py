@@ -66,10 +66,14 @@ def test_lead_says_whether_the_best_is_certain() -> None:
 def test_note_on_the_site_that_sees_most_entropy() -> None:
     """Of two with the same score, one that sees more contradicts nothing."""
     tied = ranking(("a", 100.0, 1, 0.5, 0.5), ("b", 100.0, 1, 0.6, 0.99), ("c", 80.0, 3, 0.4, 1.0))
-    assert report_ranking.entropy_seen_note(tied) == "b also sees most of the traffic’s uncertainty, 60.0%."
+    assert (
+        report_ranking.entropy_seen_note(tied) == "b also sees the largest share of the traffic’s uncertainty, 60.0%."
+    )
     other = ranking(("a", 100.0, 1, 0.5, 0.99), ("c", 80.0, 2, 0.7, 1.0))
     assert report_ranking.entropy_seen_note(other).startswith(
         "c, rank 2, sees more of the traffic’s uncertainty (70.0% against 50.0%), but with fewer beams. One beam"
     )
     agree = ranking(("a", 100.0, 1, 0.7, 0.99), ("c", 80.0, 2, 0.5, 1.0))
-    assert report_ranking.entropy_seen_note(agree) == "It also sees most of the traffic’s uncertainty, 70.0%."
+    assert (
+        report_ranking.entropy_seen_note(agree) == "It also sees the largest share of the traffic’s uncertainty, 70.0%."
+    )

@@ -28,7 +28,7 @@ def test_ticks_are_round(low, high, texts):
 
 def test_figures_can_be_written_as_files(plain_run):
     for figure in re.findall(r"<svg.*?</svg>", plain_run[2], re.DOTALL):
-        root = ET.fromstring(svg_figures.standalone(figure))
+        root = ET.fromstring(svg_figures.standalone_svg(figure))
         assert root.tag == "{http://www.w3.org/2000/svg}svg"
 
 

@@ -136,7 +136,7 @@ def export_run(
         _move_all(written, paths)
     if out is None and not file_format.is_one_file:
         _remove_stale_layers(target, paths)
-    return ExportResult(tuple(paths), reference.words, tuple(notes))
+    return ExportResult(tuple(paths), reference.description, tuple(notes))
 
 
 def _check_request(to: str, crs: str | None, sites: Collection[str]) -> Format:

@@ -130,7 +130,7 @@ class ExportCrs:
     ----------
     crs
         Name for PROJ and GDAL, e.g. ``"EPSG:32632"``, or WKT.
-    words
+    description
         Description for users.
     frame
         Position of the world frame; None for local metres.
@@ -139,7 +139,7 @@ class ExportCrs:
     """
 
     crs: str
-    words: str
+    description: str
     frame: WorldFrame | None
     is_degrees: bool
 
@@ -170,8 +170,8 @@ class ExportCrs:
                 raise InputError(where, problem, hint)
             return cls("EPSG:4326", "longitude and latitude (WGS 84)", frame, is_degrees=True)
         if frame is None:
-            words = "local metres of the world frame, because the scenario has no reference system"
-            return cls(georeference.LOCAL_METRES, words, None, is_degrees=False)
+            description = "local metres of the world frame, because the scenario has no reference system"
+            return cls(georeference.LOCAL_METRES, description, None, is_degrees=False)
         crs = georeference.crs_name(frame, center_m)
         return cls(crs, georeference.parse_crs(crs, where).name, frame, is_degrees=False)
 

@@ -41,7 +41,7 @@ class Raster:
     ----------
     name
         File name without suffix.
-    words, unit
+    description, unit
         Description of a value, and its unit.
     values
         Shape (nx, ny), from the south-western corner; NaN for no data.
@@ -52,7 +52,7 @@ class Raster:
     """
 
     name: str
-    words: str
+    description: str
     unit: str
     values: CellValues
     origin_m: tuple[float, float]
@@ -66,8 +66,8 @@ def run_rasters(run: FinishedRun, sites: Collection[str]) -> Iterator[Raster]:
     x, y, _ = tpog.grid.origin_m
     origin_m, voxel_m = (x, y), tpog.grid.voxel_m
     occupancy = np.where(tpog.counts.any(axis=2), tpog.counts.sum(axis=2) / tpog.frames, np.nan)
-    words = "Occupied voxels in the column on average"
-    yield Raster("tpog", words, "voxel", occupancy, origin_m, voxel_m, _max_value(occupancy))
+    description = "Occupied voxels in the column on average"
+    yield Raster("tpog", description, "voxel", occupancy, origin_m, voxel_m, _max_value(occupancy))
 
     scorer = run.scorer(tpog)
     field = scorer.field
@@ -78,13 +78,13 @@ def run_rasters(run: FinishedRun, sites: Collection[str]) -> Iterator[Raster]:
         crossed = (scorer.hits(scan.beams) > 0).ravel()[field.cells]
         for name, verb, which in (("seen", "sees", crossed), ("missed", "misses", ~crossed)):
             entropy = np.where(has_entropy, column_entropy(field, which), np.nan)
-            words = f"Entropy in the column that {site} {verb}"
-            yield Raster(f"{name}_{site}", words, "bit", entropy, origin_m, voxel_m, peak)
+            description = f"Entropy in the column that {site} {verb}"
+            yield Raster(f"{name}_{site}", description, "bit", entropy, origin_m, voxel_m, peak)
 
     if run.scenario.score.blindspots:
         for spots in readers.read_blindspots(run.artefact(RunFolder.blindspots.name), set(sites)):
-            name, words = f"vehicles_missed_{spots.site}", f"Share of the vehicles that {spots.site} misses"
-            yield Raster(name, words, "1", spots.share_missed, spots.origin_m, spots.cell_m, 1.0)
+            name, description = f"vehicles_missed_{spots.site}", f"Share of the vehicles that {spots.site} misses"
+            yield Raster(name, description, "1", spots.share_missed, spots.origin_m, spots.cell_m, 1.0)
 
 
 def _max_value(values: CellValues) -> float:
@@ -165,9 +165,9 @@ def write_geotiff(folder: Path, raster: Raster, reference: ExportCrs, name: str)
     """Write the files of a raster, whose names begin with ``name``, into a folder; yield their paths."""
     geo_raster = georeference(raster, reference)
     has_data = np.isfinite(geo_raster.values)
-    words = f"{raster.words} ({raster.unit})"
+    description = f"{raster.description} ({raster.unit})"
     values = np.where(has_data, geo_raster.values, NODATA).astype(np.float32)
-    yield _write_tiff(folder / f"{name}.tif", values, NODATA, geo_raster, reference, words)
+    yield _write_tiff(folder / f"{name}.tif", values, NODATA, geo_raster, reference, description)
 
     style = folder / f"{name}.qml"
     stops = [(raster.peak * step / colours.STEPS, colour) for step, colour in enumerate(colours.ON_LIGHT)]
@@ -176,10 +176,10 @@ def write_geotiff(folder: Path, raster: Raster, reference: ExportCrs, name: str)
 
     share = np.clip(np.nan_to_num(geo_raster.values) / raster.peak, 0.0, 1.0)
     steps = np.where(has_data, 1 + np.round(share * (_N_COLOURS - 1)), 0).astype(np.uint8)
-    words += (
+    description += (
         f": (step - 1) * {raster.peak / (_N_COLOURS - 1):.9g}, steps of 1 to {_N_COLOURS}; 0 where there is no data"
     )
-    yield _write_tiff(folder / f"{name}_colours.tif", steps, 0, geo_raster, reference, words, _colour_table())
+    yield _write_tiff(folder / f"{name}_colours.tif", steps, 0, geo_raster, reference, description, _colour_table())
 
 
 def _colour_table() -> dict[int, tuple[int, int, int, int]]:
@@ -196,7 +196,7 @@ def _write_tiff(
     nodata: float,
     geo_raster: GeoRaster,
     reference: ExportCrs,
-    words: str,
+    description: str,
     colour_table: Mapping[int, tuple[int, int, int, int]] | None = None,
 ) -> Path:
     import rasterio
@@ -209,7 +209,7 @@ def _write_tiff(
         path, "w", driver="GTiff", width=columns, height=rows, count=1, dtype=values.dtype.name, nodata=nodata,
         crs=CRS.from_user_input(reference.crs), transform=transform, **_TILE,
     ) as file:  # fmt: skip
-        file.update_tags(TIFFTAG_IMAGEDESCRIPTION=words, AREA_OR_POINT="Area")
+        file.update_tags(TIFFTAG_IMAGEDESCRIPTION=description, AREA_OR_POINT="Area")
         if colour_table is not None:  # before the values, or it is not in the header
             file.write_colormap(1, dict(colour_table))
         file.write(values, 1)

@@ -38,7 +38,7 @@ class Outlines:
 
     Attributes
     ----------
-    look
+    css_class
         Class of the style sheet: ``large``, ``green`` or ``small``.
     kinds
         Kinds of solids, for the legend.
@@ -46,7 +46,7 @@ class Outlines:
         Closed rings, shape (n, 2), world frame, metres; holes follow the even-odd rule.
     """
 
-    look: str
+    css_class: str
     kinds: tuple[str, ...]
     rings: tuple[NDArray[np.float64], ...]
 
@@ -57,23 +57,25 @@ def world_outlines(world: World, box: Box) -> tuple[Outlines, ...]:
     low, high = world.bounds_xy_m
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area_m2 = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2
-    shown = (area_m2 > 1e-6) & (high > box[:2]).all(axis=1) & (low < box[2:]).all(axis=1)
+    is_visible = (area_m2 > 1e-6) & (high > box[:2]).all(axis=1) & (low < box[2:]).all(axis=1)
     kinds = np.empty(0, dtype=str)
     if len(world.faces):
         kinds = np.array([kind for _, kind in world.solids])[world.solid_of_face]
-    by_look: dict[str, tuple[list[str], list[Any]]] = {look: ([], []) for look in ("large", "small", "green")}
-    for kind in sorted(set(kinds[shown].tolist()) - {"ground"}):
-        of_kind = shown & (kinds == kind)
+    by_class: dict[str, tuple[list[str], list[Any]]] = {
+        css_class: ([], []) for css_class in ("large", "small", "green")
+    }
+    for kind in sorted(set(kinds[is_visible].tolist()) - {"ground"}):
+        of_kind = is_visible & (kinds == kind)
         shape = union_of_triangles(corners[of_kind], box)
-        names, shapes = by_look[_solid_style(kind, shape.area / len(np.unique(world.solid_of_face[of_kind])))]
+        names, shapes = by_class[_solid_style(kind, shape.area / len(np.unique(world.solid_of_face[of_kind])))]
         names.append(kind.replace("_", " "))
         shapes.append(shape)
     frame = shapely.box(box[0] - 1.0, box[1] - 1.0, box[2] + 1.0, box[3] + 1.0)
     outlines = []
-    for look, (names, shapes) in by_look.items():
+    for css_class, (names, shapes) in by_class.items():
         if names:
             shape = shapely.intersection(shapely.union_all(shapes), frame)
-            outlines.append(Outlines(look, tuple(names), tuple(_shape_rings(shape))))
+            outlines.append(Outlines(css_class, tuple(names), tuple(_shape_rings(shape))))
     return tuple(outlines)
 
 
@@ -131,9 +133,9 @@ _WALKWAY_STYLE = "walk"
 
 @dataclass(frozen=True)
 class LanePiece:
-    """A piece of a lane's centre line on the map; ``look`` is the class of the style sheet, by the lane's users."""
+    """A piece of a lane's centre line on the map; ``css_class`` depends on who uses the lane."""
 
-    look: str
+    css_class: str
     line: Line
     width_m: float
 
@@ -175,7 +177,7 @@ def roads_within(path: Path | None, box: Box) -> Roads:
         return Roads()
     roads = network.read_net_xml(path)
     frame = shapely.box(*box)
-    lanes = sorted(_lane_pieces(roads, frame), key=lambda piece: piece.look != _WALKWAY_STYLE)
+    lanes = sorted(_lane_pieces(roads, frame), key=lambda piece: piece.css_class != _WALKWAY_STYLE)
     junctions = []
     for junction in roads.junctions:
         outline = junction.shape_m[:, :2]
@@ -189,16 +191,16 @@ def _lane_pieces(roads: Network, frame: shapely.Polygon) -> Iterator[LanePiece]:
         if edge.function not in ("", "crossing"):
             continue  # the inside of a junction, or a walking area, whose shape is an outline
         for lane in edge.lanes:
-            look = _WALKWAY_STYLE if edge.function else _lane_style(lane)
+            css_class = _WALKWAY_STYLE if edge.function else _lane_style(lane)
             width_m = network.LANE_WIDTH_M if lane.width_m is None else lane.width_m
             for line in _pieces(lane.shape_m[:, :2], frame):
-                yield LanePiece(look, line, width_m)
+                yield LanePiece(css_class, line, width_m)
 
 
 def _lane_style(lane: Lane) -> str:
-    for look, vehicle_classes in _LANE_STYLES:
+    for css_class, vehicle_classes in _LANE_STYLES:
         if any(lane.permission.admits(vehicle_class) for vehicle_class in vehicle_classes):
-            return look
+            return css_class
     return _WALKWAY_STYLE
 
 

@@ -234,7 +234,7 @@ def missed_view(
 
 def label_positions(plan: MapFrame, blindspots: SiteBlindspots) -> list[tuple[float, float] | None]:
     """Return the positions of the numbers of the worst locations on a figure; None for unused numbers."""
-    worst = [(round(plan.x(place.x_m), 1), round(plan.y(place.y_m), 1)) for place in blindspots.worst]
+    worst = [(round(plan.x(location.x_m), 1), round(plan.y(location.y_m), 1)) for location in blindspots.worst]
     return [*worst, *[None] * (MAX_LOCATIONS - len(worst))]
 
 
@@ -263,15 +263,15 @@ def _road_paths(plan: MapFrame, roads: Roads) -> str:
     """Junctions, and lanes with a fine line between them: each lane is drawn twice, the second time narrower."""
     paths_of: dict[tuple[str, float], list[str]] = {}
     for piece in roads.lanes:
-        paths_of.setdefault((piece.look, piece.width_m), []).append(_open_path(plan, piece.line))
+        paths_of.setdefault((piece.css_class, piece.width_m), []).append(_open_path(plan, piece.line))
     if not paths_of:
         return ""
     edges, lanes = [], []
-    for (look, width_m), paths in paths_of.items():
+    for (css_class, width_m), paths in paths_of.items():
         width, d = width_m * plan.scale, "".join(paths)
         narrow = max(width - 1.0, 0.6 * width)
         edges.append(f'<path {plan.style.shape("edge")} style="stroke-width:{width:.2f}px" d="{d}"/>')
-        lanes.append(f'<path {plan.style.shape("lane", look)} style="stroke-width:{narrow:.2f}px" d="{d}"/>')
+        lanes.append(f'<path {plan.style.shape("lane", css_class)} style="stroke-width:{narrow:.2f}px" d="{d}"/>')
     outlines = "".join(_closed_path(plan, outline) for outline in roads.junctions)
     junctions = f'<path {plan.style.shape("junction")} d="{outlines}"/>' if outlines else ""
     return f"<g {plan.style.shape('roads')}>{''.join(edges)}{junctions}{''.join(lanes)}</g>"
@@ -311,7 +311,7 @@ def _outline_paths(plan: MapFrame, outlines: Sequence[Outlines]) -> str:
     paths = []
     for group in outlines:
         d = "".join(_closed_path(plan, ring[:-1]) for ring in group.rings)
-        paths.append(f'<path {plan.style.shape(group.look)} fill-rule="evenodd" d="{d}"/>')
+        paths.append(f'<path {plan.style.shape(group.css_class)} fill-rule="evenodd" d="{d}"/>')
     return "".join(paths)
 
 
@@ -329,9 +329,9 @@ def _site_rings(plan: MapFrame, stack: StackedSites, low: float, high: float, ra
     """Concentric rings, the best site innermost, with its rank unless the map is crowded."""
     best = stack[0]
     x, y = plan.x(best.x_m), plan.y(best.y_m)
-    shown = [*stack[:3], stack[-1]] if len(stack) > 4 else stack
+    displayed = [*stack[:3], stack[-1]] if len(stack) > 4 else stack
     shapes = []
-    for i, site in reversed(list(enumerate(shown))):
+    for i, site in reversed(list(enumerate(displayed))):
         colour = plan.style.shape(f"q{colours.colour_class(site.score, low, high)}")
         shapes.append(f'<circle {colour} cx="{x:.1f}" cy="{y:.1f}" r="{radius + 3.5 * i:.1f}"/>')
     if not crowded:
@@ -449,8 +449,8 @@ def _share_before(direction: float) -> float:
 
 
 def _within(box: Box, plan: MapFrame) -> bool:
-    right, base = plan.left + plan.frame_width, plan.top + plan.frame_height
-    return plan.left + 3 <= box[0] and box[2] <= right - 3 and plan.top + 2 <= box[1] and box[3] <= base - 2
+    edge, base = plan.left + plan.frame_width, plan.top + plan.frame_height
+    return plan.left + 3 <= box[0] and box[2] <= edge - 3 and plan.top + 2 <= box[1] and box[3] <= base - 2
 
 
 def _overlap(a: Box, b: Box) -> float:

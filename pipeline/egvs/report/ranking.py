@@ -274,7 +274,7 @@ class Ranking:
         """Ranks of several sites."""
         return {rank for rank, count in Counter(site.rank for site in self.sites).items() if count > 1}
 
-    def of_best(self, site: RankedSite) -> float:
+    def share_of_best(self, site: RankedSite) -> float:
         """Return the score of a site as a share of the best score; 0 if that is 0."""
         best_score = self.best[0].score
         return site.score / best_score if best_score > 0 else 0.0
@@ -314,7 +314,7 @@ def lead(ranking: Ranking) -> str:
     if ranking.is_tie or not ranking.best[0].score > 0:
         return ""
     second = ranking.sites[len(ranking.best)]
-    gap = 1 - ranking.of_best(second)
+    gap = 1 - ranking.share_of_best(second)
     gap_text = f"{gap:.1%}" if gap >= _MIN_LEAD else "less than 0.1%"
     if len(ranking.best) == 1:
         text = f"It leads the next site, {second.site}, by {gap_text} of its score."
@@ -338,7 +338,9 @@ def entropy_seen_note(ranking: Ranking) -> str:
         return ""
     if most.entropy_seen - top.entropy_seen < _MIN_LEAD:
         subject = "It" if len(ranking.best) == 1 else top.site
-        return f"{subject} also sees most of the traffic’s uncertainty, {format_percent(top.entropy_seen)}."
+        return (
+            f"{subject} also sees the largest share of the traffic’s uncertainty, {format_percent(top.entropy_seen)}."
+        )
     return (
         f"{most.site}, rank {most.rank}, sees more of the traffic’s uncertainty "
         f"({format_percent(most.entropy_seen)} against {format_percent(top.entropy_seen)}), but with fewer beams. "

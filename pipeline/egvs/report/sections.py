@@ -447,7 +447,7 @@ def _describe_proof(plan: Mapping[str, Any], sensors: int) -> str:
         if plan["is_best"]:
             return "it is proved that no plan within the rules is better"
         percent = math.floor(1e4 * plan["certificate"]) / 1e2
-        return f"it is proved to reach at least {percent:.2f} % of the best possible score"
+        return f"the plan is proved to reach at least {percent:.2f} % of the best possible score"
     if sensors == 1:
         return "one sensor is enough"
     fewer = "1 sensor is" if sensors == 2 else f"{sensors - 1} sensors are"

@@ -124,7 +124,7 @@ def shared_scale(peak: float, label: str) -> str:
     return f"{start}{bar.svg('scale', 16.0, 4.0, 428.0)}</svg>"
 
 
-def standalone(figure: str) -> str:
+def standalone_svg(figure: str) -> str:
     """Return a figure of a page as the content of a file, with its style sheet."""
     head, _, rest = figure.partition(">")
     return f'{head} xmlns="{_NAMESPACE}"><style>{STYLE_SHEET}</style>{rest}\n'
@@ -169,11 +169,11 @@ class MapFrame:
         self._y_tick_width = 7.0 * max(len(tick.text) for tick in self._y_ticks)
         self.left = 34.0 + self._y_tick_width
         self.top = 12.0
-        right = 40.0 if north else 16.0
-        self.scale = min((width - self.left - right) / (box[2] - box[0]), tallest / (box[3] - box[1]))
+        right_margin = 40.0 if north else 16.0
+        self.scale = min((width - self.left - right_margin) / (box[2] - box[0]), tallest / (box[3] - box[1]))
         self.frame_width = (box[2] - box[0]) * self.scale
         self.frame_height = (box[3] - box[1]) * self.scale
-        self.left += (width - self.left - right - self.frame_width) / 2
+        self.left += (width - self.left - right_margin - self.frame_width) / 2
 
     def x(self, x_m: Metres) -> Metres:
         """Return x in the figure's units, to the right."""
@@ -392,7 +392,7 @@ class Bar:
     name: str
     value: float
     se: float | None
-    words: str
+    description: str
 
 
 def bar_chart(bars: Sequence[Bar], label: str, alt: str, factor: float = 1.0, style: FigureStyle = PAGE_STYLE) -> str:
@@ -426,7 +426,9 @@ def bar_chart(bars: Sequence[Bar], label: str, alt: str, factor: float = 1.0, st
         y, length = _BARS_TOP + _BAR_SPACING * row, width * bar.value / most
         colour = style.shape(f"q{colours.colour_class(bar.value, low, high)}")
         position = f'x="{left:.1f}" y="{y + 3:.1f}" width="{length:.1f}" height="{_BAR_SPACING - 6:.1f}"'
-        parts.append(f'<g class="bar"><title>{escape(f"{bar.name}: {bar.words}")}</title><rect {colour} {position}/>')
+        parts.append(
+            f'<g class="bar"><title>{escape(f"{bar.name}: {bar.description}")}</title><rect {colour} {position}/>'
+        )
         parts.append(f"{_error_bar(bar, left, y, width / most, style)}</g>")
         parts.append(_text(left - 7, y + 13, name, "end"))
     parts.append(f'<path {style.shape("axis")} d="M{left:.1f} {_BARS_TOP:.1f}V{base:.1f}H{left + width:.1f}"/>')
