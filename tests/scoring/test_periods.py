@@ -120,8 +120,8 @@ def test_a_run_with_periods_is_the_same_again_and_shows_them(split: Path, tmp_pa
     page = (tmp_path / "out" / "report.html").read_text()
     assert "By period" in page
     assert "night<br>(28.6%)" in page
-    assert ">40 frames<small>one each 0.5 s, 20 s in all, in 2 periods" in page
-    assert "<dt>day</dt><dd>24 frames; 2 vehicles at a time, 2 different;" in page
+    assert ">40 frames<small>one every 0.5 s, 20 s in total, in 2 periods" in page
+    assert "<dt>day</dt><dd>24 frames; 2 vehicles at a time, 2 in total;" in page
     assert page.index("<h2>By period") < page.index("<h2>Where the sites stand")
     ranking = PeriodRanking.read(tmp_path / "out")
     assert ranking is not None

@@ -189,7 +189,7 @@ def test_a_run_ranks_them_and_groups_them_by_pole(mini: Path, tmp_path: Path, ru
     best = {pole: max((r for r in scores if r["pole"] == pole), key=lambda r: r["egvs"]) for pole in ("c01", "c02")}
     table = out[out.index("best candidate of each pole") :]
     html = (tmp_path / "run" / "report.html").read_text()
-    section = html[html.index("The best at each pole") :]
+    section = html[html.index("The best site on each pole") :]
     for pole, row in best.items():
         assert f"{pole}  " in table
         assert row["site"] in table.split("\n\n")[0]
@@ -199,7 +199,7 @@ def test_a_run_ranks_them_and_groups_them_by_pole(mini: Path, tmp_path: Path, ru
 def test_single_candidates_need_no_table_of_poles(mini: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
     _, out, _ = run_egvs("run", mini, "--out", tmp_path / "run")
     assert "best candidate of each pole" not in out
-    assert "The best at each pole" not in (tmp_path / "run" / "report.html").read_text()
+    assert "The best site on each pole" not in (tmp_path / "run" / "report.html").read_text()
 
 
 def test_a_study_tries_the_first_candidate_alone(mini: Path) -> None:
