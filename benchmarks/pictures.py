@@ -23,10 +23,10 @@ from egvs.artefacts.tpog import read_tpog
 from egvs.artefacts.traffic_frames import read_trajectories
 from egvs.effects import registry
 from egvs.effects.registry import SELF_ACTIVATING
-from egvs.report.basemap import network_file, outlines_of, roads_within
+from egvs.report.basemap import network_file, roads_within, world_outlines
 from egvs.report.maps import Backdrop, SiteViewFigure, site_view
 from egvs.report.ranking import RankedSite
-from egvs.report.svg_figures import extent, standalone
+from egvs.report.svg_figures import extent, standalone_svg
 from egvs.runs import run
 from egvs.scenario.effects_config import EffectsConfig
 from egvs.scenario.model import Scenario
@@ -57,7 +57,7 @@ SHOWN: dict[str, tuple[str, dict[str, Any], str]] = {
 def figure(page: str, label: str) -> str:
     """The figure of a report whose accessible label begins with ``label``, as a file of its own."""
     found = next(svg for svg in re.findall(r"<svg.*?</svg>", page, re.DOTALL) if f'aria-label="{label}' in svg)
-    return standalone(found)
+    return standalone_svg(found)
 
 
 def seen(scenario: Scenario, out: Path, site: str) -> tuple[np.ndarray, np.ndarray]:
@@ -90,18 +90,18 @@ def before_and_after(name: str, folder: Path) -> Iterator[tuple[str, str]]:
         run.run(scenario, out)
         found.append((word, *seen(scenario, out, site)))
     tpog = read_tpog(out / "tpog.parquet")
-    scored = RankedSite.all_of(read_scores(out / "scores.parquet"))
+    scored = RankedSite.from_table(read_scores(out / "scores.parquet"))
     place = next(s for s in scored if s.site == (site or scored[0].site))
     box = extent(tpog.grid, [place])
     roads = roads_within(network_file(out), box)
-    backdrop = Backdrop(outlines_of(read_ply(out / "statics.ply")[0], box), roads)
+    backdrop = Backdrop(world_outlines(read_ply(out / "statics.ply")[0], box), roads)
     peak = max(float(field.max()) for _, field, _ in found)
     for word, field, crossed in found:
         view = SiteViewFigure(place, crossed, backdrop, box)
         what = f"score of site {site} by column" if site else "mean occupied voxels by column"
         alt = f"{name}, {word}: {what}, from above, 0 to {peak:.3g}"
         drawn = site_view(tpog.grid, field, peak, view, f"{name}-{word}", alt)
-        yield f"{name}-{word}.svg", standalone(drawn)
+        yield f"{name}-{word}.svg", standalone_svg(drawn)
 
 
 def side_view(out: Path, pitched: bool) -> str:

@@ -36,16 +36,14 @@ def test_exports_city_run(city: City, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_leaves_out_old_plan_and_rejects_geotiff(city: City, tmp_path: Path) -> None:
     out = city_run.run_city(city, tmp_path / "out").out
-    with pytest.raises(InputError, match=r"--to geotiff: .* is a city's run; a junction's"):
+    with pytest.raises(InputError, match=r"--to geotiff: .* is the folder of a city. Export a junction"):
         export_run(out, "geotiff")
     city_run.place_city(city, out, count=1)
     ran = city_run.run_city(city, out, CityRunOptions(overrides=["roi.voxel_m=1"]))
     assert "plan.parquet" not in {path.name for path in ran.files}
     done = export_run(out, "geojson")
     assert [path.stem for path in done.paths] == ["junctions", "sites"]
-    assert done.notes == (
-        "the plan is left out: it was made of other junctions or settings; egvs city place makes it anew",
-    )
+    assert done.notes == ("the plan is left out: it is for other junctions or settings. Run egvs city place again",)
     (out / "junctions" / "west" / "scores.parquet").unlink()
     with pytest.raises(InputError, match=r"scores\.parquet"):
         export_run(out, "geojson")

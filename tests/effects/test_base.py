@@ -60,7 +60,7 @@ from tests.effects.scan_helpers import (
     scan_hits,
     write_scene,
 )
-from tests.stages import inputs_of, run_stage
+from tests.stage_runner import inputs_of, run_stage
 
 # Settings with which an effect changes nothing.
 NEUTRAL = {

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from egvs.artefacts.traffic_frames import PITCHED_BOX_COLUMNS, FrameBoxes
+from egvs.artefacts.frame_boxes import PITCHED_BOX_COLUMNS, FrameBoxes
 from egvs.core.grid import Grid, Roi
 from egvs.effects import pedestrians_bicycles
 from egvs.scoring import occupancy

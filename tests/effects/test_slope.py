@@ -21,7 +21,7 @@ from egvs.traffic.vehicle_boxes import VehicleSize
 from egvs.world import terrain
 from egvs.world.mesh import read_ply
 from tests.effects.road_helpers import GRADE, HILL, SMALL, height_m, road_scenario
-from tests.stages import inputs_of, run_stage
+from tests.stage_runner import inputs_of, run_stage
 
 
 def test_flat_network_has_flat_ground(flat_road, tmp_path):

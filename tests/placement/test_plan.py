@@ -489,7 +489,7 @@ def test_bars_of_worst_period_are_shares(three_candidates: Path, tmp_path: Path,
     assert [step.share for step in steps] == [row["value"] for row in curve.to_pylist()]
     assert 0.1 < steps[0].share < steps[1].share <= 1.0
     page = (out / "report.html").read_text()
-    assert "by what was asked for (the period that is seen worst), as a share" in page
+    assert ", by the score in the period with the lowest share, as a share" in page
 
 
 def test_folder_instead_of_file_keeps_old_plan(three_candidates: Path, tmp_path: Path, run_egvs) -> None:

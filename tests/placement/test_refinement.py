@@ -211,9 +211,7 @@ def test_command_reports_refinement(mini: Path, run_egvs) -> None:
     assert run_egvs("run", mini, "--out", out)[0] == 0
     code, printed, _ = run_egvs("place", mini, "--count", 2, "--refine", "--out", out, "--set", FEW)
     assert code == 0
-    moved = (
-        "Its sensors have moved from where the candidates hang (<code>--refine</code>): as candidates they have 2,650"
-    )
+    moved = "moved from the positions of the candidates (<code>--refine</code>), where their joint score is 2,650"
     assert moved in (out / "report.html").read_text()
     assert "refined: egvs 2650.3 before, " in printed
     assert "the proof applies to the candidates at their original poses" in printed

@@ -75,7 +75,7 @@ def test_a_run_is_that_with_the_number_and_tells_it(auto: Path, tmp_path: Path, 
     code, _, told = run_egvs("run", auto, "--out", tmp_path / "auto")
     assert code == 0
     assert "gamma auto 4.5" in told
-    assert "4.5 beams<small>in a voxel; more add nothing; set by the size of the voxels (auto)" in (
+    assert "4.5 beams<small>per voxel; further beams add nothing; chosen for the voxel size (auto)" in (
         tmp_path / "auto" / "report.html"
     ).read_text(encoding="utf-8")
     assert run_egvs("run", auto, "--out", tmp_path / "number", "--set", "score.gamma=4.5")[0] == 0

@@ -121,8 +121,8 @@ def test_run_with_periods_is_reproducible_and_reported(split: Path, tmp_path: Pa
     page = (tmp_path / "out" / "report.html").read_text()
     assert "By period" in page
     assert "night<br>(28.6%)" in page
-    assert ">40 frames<small>one each 0.5 s, 20 s in all, in 2 periods" in page
-    assert "<dt>day</dt><dd>24 frames; 2 vehicles at a time, 2 different;" in page
+    assert ">40 frames<small>one every 0.5 s, 20 s in total, in 2 periods" in page
+    assert "<dt>day</dt><dd>24 frames; 2 vehicles at a time, 2 in total;" in page
     assert page.index("<h2>By period") < page.index("<h2>Where the sites stand")
     ranking = PeriodRanking.read(tmp_path / "out")
     assert ranking is not None
@@ -266,7 +266,7 @@ def test_report_counts_rows_that_are_not_shown(split: Path, tmp_path: Path, monk
         monkeypatch.setattr(f"egvs.report.page.{name}", count)
     egvs.run(egvs.load(split), tmp_path)
     html = (tmp_path / "report.html").read_text()
-    assert "2 more are not shown; scores_by_period.parquet holds them all" in html
+    assert "2 more are not shown; scores_by_period.parquet has all sites" in html
     assert "Choose any site here" in html
     assert re.search(r"Vehicles at a time</dt><dd>2<small>", html)
 

@@ -263,7 +263,7 @@ def test_without_errors_the_scores_are_the_same(mini: Path, tmp_path: Path, chan
         "expected_detections_se",
     }
     assert table.select(plain.column_names) == plain
-    assert ranking_table(RankedSite.all_of(plain)).caption is None
+    assert ranking_table(RankedSite.from_table(plain)).caption is None
 
 
 def test_the_ranking_marks_neighbours_that_are_not_separable(mini: Path, tmp_path: Path, run_egvs) -> None:

@@ -102,7 +102,7 @@ def test_weights_are_reported(mini: Path, tmp_path: Path, run_egvs) -> None:  # 
     assert "weights passenger 2, zone west 4" in told
     assert "(weighted by class)" in printed
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert "They are weighted: passenger 2, zone west 4; what is not named counts 1." in page
+    assert "Vehicles are weighted: passenger 2, zone west 4; all others count 1." in page
     about = parquet.read_metadata(tmp_path / "scores.parquet", "scores")
     assert about["weights"]["kinds"] == {"passenger": 2.0}
 

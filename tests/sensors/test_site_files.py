@@ -11,7 +11,7 @@ import pyarrow as pa
 import pytest
 
 import egvs
-from egvs.artefacts.parquet import extra_columns
+from egvs.artefacts.extra_columns import extra_columns
 from egvs.core.errors import InputError, find_misspelling
 from egvs.sensors import sites
 from tests.conftest import collection, feature

@@ -163,7 +163,7 @@ def test_run_ranks_candidates_and_groups_them_by_pole(mini: Path, tmp_path: Path
     best = {pole: max((r for r in scores if r["pole"] == pole), key=lambda r: r["egvs"]) for pole in ("c01", "c02")}
     table = out[out.index("best candidate of each pole") :]
     html = (tmp_path / "run" / "report.html").read_text()
-    section = html[html.index("The best at each pole") :]
+    section = html[html.index("The best site on each pole") :]
     for pole, row in best.items():
         assert f"{pole}  " in table
         assert row["site"] in table.split("\n\n")[0]
@@ -173,7 +173,7 @@ def test_run_ranks_candidates_and_groups_them_by_pole(mini: Path, tmp_path: Path
 def test_no_table_of_poles_with_one_candidate_each(mini: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
     _, out, _ = run_egvs("run", mini, "--out", tmp_path / "run")
     assert "best candidate of each pole" not in out
-    assert "The best at each pole" not in (tmp_path / "run" / "report.html").read_text()
+    assert "The best site on each pole" not in (tmp_path / "run" / "report.html").read_text()
 
 
 def test_study_uses_the_first_candidate(mini: Path) -> None:

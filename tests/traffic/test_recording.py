@@ -19,7 +19,7 @@ from egvs.stages import traffic
 from egvs.traffic import network, recording, sumo, sumo_folder, trajectories
 from egvs.traffic.vehicle_boxes import ExtraTraffic, VehicleSize
 from egvs.world import geolocation
-from tests.stages import inputs_of, run_stage
+from tests.stage_runner import inputs_of, run_stage
 from tests.traffic.helpers import (
     SMALL,
     routes_for,

@@ -10,7 +10,7 @@ from egvs.core.errors import InputError
 from egvs.scenario.loading import load
 from egvs.stages import traffic
 from egvs.traffic import demand, network
-from tests.stages import inputs_of, run_stage
+from tests.stage_runner import inputs_of, run_stage
 from tests.traffic.helpers import SMALL, car, drawn, scenario, scenario_with_config
 
 
