@@ -424,7 +424,7 @@ def test_a_junction_whose_walking_areas_are_no_sound_outlines_sorts_out_places()
 
 
 def test_a_file_keeps_all_its_sites(street: Path) -> None:
-    with pytest.raises(InputError, match="only_free acts on grid and along"):
+    with pytest.raises(InputError, match="only_free has no effect with file"):
         egvs.load(street, ["sites.only_free=false"])
 
 

@@ -53,7 +53,7 @@ def test_a_table_that_is_written_is_read_again(tmp_path: Path) -> None:
     [
         ([], "junctions.csv: holds no junction; at least one"),
         ([ROW, ROW.replace("j1", "J1")], "junction J1: stands there twice"),
-        ([ROW.replace("j1", "a/b")], "junction a/b: junction: 'a/b'; a name without spaces"),
+        ([ROW.replace("j1", "a/b")], "junction a/b: junction: 'a/b'. Use a name"),
         ([ROW.replace("10.5", "nan")], "junction j1: x_m: 'nan'; a number from -1e+08 to 1e+08"),
         ([ROW.replace("50.1", "91")], "junction j1: lat_deg: '91'; a number from -90 to 90"),
         ([ROW.replace("9.2", "east")], "junction j1: lon_deg: 'east'; a number from -180 to 180"),
@@ -71,11 +71,14 @@ def test_a_wrong_row_is_named(tmp_path: Path, rows: list[str], told: str) -> Non
 @pytest.mark.parametrize(
     ("toml", "told"),
     [
-        ("seed = -1\n[traffic]\nnetwork = 'n'\n", "city.toml: seed: -1; input should be greater than or equal to 0"),
-        ("sed = 1\n[traffic]\nnetwork = 'n'\n", "city.toml: sed: unknown key; did you mean seed?"),
-        ("seed = 1\n", "city.toml: traffic: missing; this key is needed"),
-        ("[traffic]\nfcd = 'a'\nnetwork = 'n'\n", "exactly one of network, sumocfg and fcd is needed"),
-        ("[traffic]\nfcd = 'a'\nvehicles = 3\n", "city.toml: traffic: vehicles would act on nothing beside fcd"),
+        (
+            "seed = -1\n[traffic]\nnetwork = 'n'\n",
+            "city.toml: seed: expected a value greater than or equal to 0, got -1",
+        ),
+        ("sed = 1\n[traffic]\nnetwork = 'n'\n", "city.toml: sed: unknown key. Did you mean seed?"),
+        ("seed = 1\n", "city.toml: traffic: this key is required"),
+        ("[traffic]\nfcd = 'a'\nnetwork = 'n'\n", "exactly one of network, sumocfg and fcd"),
+        ("[traffic]\nfcd = 'a'\nvehicles = 3\n", "city.toml: traffic: vehicles has no effect with fcd"),
         ("[traffic\n", "city.toml: is not valid TOML"),
     ],
 )

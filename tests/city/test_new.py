@@ -197,7 +197,7 @@ def test_a_circle_bounds_streets_and_junctions(extract: Path, tmp_path: Path) ->
         ("tower,50.0,10.05", "junction tower: no junction of three streets or more is there (the nearest is"),
         ("tower,50.0,10.0\nother,50.0,10.00001", "junction other: is the same junction as tower"),
         ("tower,50.0,10.0\nTower,50.0,10.00001", "junction Tower: stands there twice"),
-        ("a/b,50.0,10.0", "junction a/b: junction: 'a/b'; a name without"),
+        ("a/b,50.0,10.0", "junction a/b: junction: 'a/b'. Use a name"),
         ("", "wanted.csv: names no junction; a row for each"),
         ("tower,95,10.0", "junction tower: lat_deg: '95'; a number from -90 to 90"),
     ],

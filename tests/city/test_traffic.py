@@ -176,7 +176,7 @@ def test_the_files_are_what_sumo_writes(city: City) -> None:
         ("junctions/west/scenario.toml", "../../traffic/west.parquet", "mine.parquet",
          'fcd = "../../traffic/west.parquet"'),
         ("junctions/west/scenario.toml", "frame_period_s = 0.5", "periods = 3",
-         "scenario.toml: traffic.periods: 3; input should be a valid array"),
+         "scenario.toml: traffic.periods: expected a list, got 3"),
         ("junctions/west/scenario.toml", "frame_period_s = 0.5", "frame_period_s = 0.75",
          "traffic.frame_period_s: 0.75 s, but"),
         ("junctions/east/scenario.toml", "gamma = 4", "gamma = -4", "score.gamma"),

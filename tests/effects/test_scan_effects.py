@@ -590,7 +590,7 @@ BAD = {
     f"{DIVERGENCE}5": "effects.divergence.sub_beams: 5",
     "effects.divergence.divergence_mrad=[-1, 2]": "effects.divergence.divergence_mrad.0: -1",
     "effects.divergence.divergence_mrad=[1]": "effects.divergence.divergence_mrad",
-    "effects.divergence.subbeams=7": "did you mean sub_beams",
+    "effects.divergence.subbeams=7": "Did you mean sub_beams",
     f"{SWAY}-1": "effects.mount_sway.tilt_deg: -1",
     f"{SWAY}nan": "effects.mount_sway.tilt_deg",
     "effects.mount_sway.samples=9": "effects.mount_sway.tilt_deg: missing",

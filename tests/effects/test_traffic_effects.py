@@ -681,7 +681,7 @@ WRONG = {
         "effects.articulated.kinds.car={parts_m=[2,2],hinges_m=[2,3]}",
         r"hinges_m has 2 values for 2 parts, 1",
     ),
-    "a wrong word": ("effects.articulated.kind=1", r"articulated\.kind: unknown key; did you mean kinds\?"),
+    "a wrong word": ("effects.articulated.kind=1", r"articulated\.kind: unknown key. Did you mean kinds\?"),
     "people beside a finished file": (
         "effects.pedestrians_bicycles.bicycles_per_h=9",
         r"cannot be added to a finished FCD file",

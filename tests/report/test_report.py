@@ -367,7 +367,7 @@ def test_the_record_is_shown(made):
 def test_effects_are_named_and_no_longer_left_out(made):
     about, out, text = made
     assert "Effects none" in Reader(text).text and "fog" in text
-    foggy = about.with_effects(EffectsConfig.of({"fog": {"visibility_m": 100}, "moving_occlusion": {}}))
+    foggy = about.with_effects(EffectsConfig.from_dict({"fog": {"visibility_m": 100}, "moving_occlusion": {}}))
     ranking, tpog = Ranking.read(out / "scores.parquet"), read_tpog(out / "tpog.parquet")
     shown = report_page.render_page(foggy, ranking, tpog, Figures("", "", None, Backdrop((), Roads())), {}, None)
     assert "this run models fog, moving occlusion. Left out are rain, " in Reader(shown).text

@@ -91,9 +91,9 @@ def test_an_override_takes_the_place_of_a_source_too(tmp_path: Path) -> None:
 
 
 def test_two_sources_in_one_place_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="exactly one of network, sumocfg and fcd is needed, found network and fcd"):
+    with pytest.raises(InputError, match="expected exactly one of network, sumocfg and fcd, got network and fcd"):
         extended(tmp_path, '[traffic]\nfcd = "x.csv"\nnetwork = "b.net.xml"\n')
-    with pytest.raises(InputError, match="vehicles would act on nothing beside fcd"):
+    with pytest.raises(InputError, match="vehicles has no effect with fcd"):
         extended(tmp_path, '[traffic]\nfcd = "x.csv"\nvehicles = 5\n')
 
 

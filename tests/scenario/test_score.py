@@ -56,7 +56,7 @@ def test_of_a_scenario(auto: Path) -> None:
 def test_other_effects_keep_the_number(auto: Path) -> None:
     """What an effect changes is seen with one gamma."""
     scenario = egvs.load(auto)
-    assert scenario.with_effects(EffectsConfig.of({"moving_occlusion": {}})).gamma == 4.5
+    assert scenario.with_effects(EffectsConfig.from_dict({"moving_occlusion": {}})).gamma == 4.5
     hidden = egvs.load(auto, [OCCLUSION])
     assert hidden.with_effects(hidden.effects.only()).gamma == 2.2
 
@@ -91,8 +91,8 @@ def test_a_run_is_that_with_the_number_and_tells_it(auto: Path, tmp_path: Path, 
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        ('"Auto"', "score.gamma: 'Auto'; input should be a valid number or 'auto'"),
-        ("-1", "score.gamma: -1; input should be greater than or equal to 0 or 'auto'"),
+        ('"Auto"', "score.gamma: expected a valid number or 'auto', got 'Auto'"),
+        ("-1", "score.gamma: expected a value greater than or equal to 0 or 'auto', got -1"),
     ],
 )
 def test_what_is_no_gamma(mini: Path, run_egvs, value: str, message: str) -> None:  # type: ignore[no-untyped-def]

@@ -258,12 +258,12 @@ def test_what_is_wrong_with_an_aim_is_said(mini: Path, rows: str, keys: dict[str
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ({"aim": "junction"}, r"sites\.aim: 'junction'.*'roi'"),
+        ({"aim": "junction"}, r"sites\.aim: expected 'roi', got 'junction'"),
         ({"aim_m": "[1]"}, r"sites\.aim_m"),
         ({"pitch_deg": "[]"}, r"pitch_deg = \[\] leaves no candidate"),
-        ({"pitch_deg": "[0, 0]"}, "names a value twice"),
+        ({"pitch_deg": "[0, 0]"}, "has a value twice"),
         ({"pitch_deg": "[-91]"}, r"sites\.pitch_deg"),
-        ({"heights_m": "[3, 3]"}, "names a value twice"),
+        ({"heights_m": "[3, 3]"}, "has a value twice"),
         ({"heights_m": "[-3]"}, r"sites\.heights_m"),
     ],
 )
@@ -276,7 +276,7 @@ def test_senseless_keys_are_refused(mini: Path, keys: dict[str, str], message: s
 def test_two_directions_at_once_are_refused(mini: Path, other: str, found: str) -> None:
     path = mini / "scenario.toml"
     path.write_text(path.read_text().replace('sensor = "small"\n', f'sensor = "small"\naim = "roi"\n{other}\n'))
-    with pytest.raises(InputError, match=f"at most one of aim, aim_m and yaw_deg can hold, found {found}"):
+    with pytest.raises(InputError, match=f"expected at most one of aim, aim_m and yaw_deg, got {found}"):
         egvs.load(mini)
 
 
@@ -299,7 +299,7 @@ def test_heights_beside_a_rule_are_refused(mini: Path) -> None:
     rule = "heights_m = [3]\n[[sites.along]]\nline_m = [[0, 0], [1, 0]]\nspacing_m = 1\nheights_m = [3]\n"
     path.write_text(path.read_text().replace('file = "sites.csv"\n', "").replace(
         'sensor = "small"\n', f'sensor = "small"\n{rule}'))  # fmt: skip
-    with pytest.raises(InputError, match="heights_m is for places in a file: along has heights_m of its own"):
+    with pytest.raises(InputError, match="heights_m has no effect with along. Set along.heights_m"):
         egvs.load(mini)
 
 

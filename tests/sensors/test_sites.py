@@ -211,7 +211,7 @@ def test_senseless_lines_are_refused(mini: Path, rule: dict[str, Any], message: 
 def test_a_line_beside_a_file_is_refused(mini: Path) -> None:
     path = mini / "scenario.toml"
     path.write_text(path.read_text() + "[[sites.along]]\nline_m = [[0, 0], [1, 0]]\nspacing_m = 1\nheights_m = [3]\n")
-    with pytest.raises(InputError, match="exactly one of file, grid and along is needed, found file and along"):
+    with pytest.raises(InputError, match="expected exactly one of file, grid and along, got file and along"):
         egvs.load(mini)
 
 

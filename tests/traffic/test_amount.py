@@ -85,8 +85,8 @@ def test_lanes_that_the_fleet_may_not_use_do_not_count(tmp_path):
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ('routes = ["r.xml"]\nvehicles_per_lane_km = 3', r"vehicles_per_lane_km would act on nothing beside routes"),
-        ("vehicles = 5\nvehicles_per_lane_km = 3", r"vehicles_per_lane_km would act on nothing beside vehicles"),
+        ('routes = ["r.xml"]\nvehicles_per_lane_km = 3', r"vehicles_per_lane_km has no effect with routes"),
+        ("vehicles = 5\nvehicles_per_lane_km = 3", r"vehicles_per_lane_km has no effect with vehicles"),
     ],
 )
 def test_a_density_that_acts_on_nothing_is_refused(tmp_path, keys, message):

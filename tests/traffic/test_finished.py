@@ -121,7 +121,7 @@ def test_a_warm_up_longer_than_the_file_is_told(mini: Path, tmp_path: Path, run_
 
 
 def test_a_simulation_still_has_its_default_length() -> None:
-    traffic = TrafficConfig.of({"network": "n.net.xml"})
+    traffic = TrafficConfig.from_dict({"network": "n.net.xml"})
     assert (traffic.frames, traffic.warmup_s) == (5000, 300.0)
 
 
@@ -199,7 +199,7 @@ def test_what_is_wrong_with_a_file_of_vtypes_is_said(
 
 
 def test_vtypes_act_on_a_finished_file_alone(mini: Path) -> None:
-    with pytest.raises(InputError, match=r"vtypes.* would act on nothing beside network"):
+    with pytest.raises(InputError, match=r"vtypes.* have no effect with network"):
         egvs.load(mini, ["traffic.network=n.net.xml", 'traffic.vtypes=["x.xml"]'])
 
 
@@ -254,7 +254,7 @@ def test_roads_beside_a_file_are_the_networks(mini: Path, tmp_path: Path, run_eg
     [
         (["traffic.roads='no.net.xml'"], "traffic.roads = 'no.net.xml': no such file"),
         (["traffic.roads='fcd.csv'"], "fcd.csv: is not well-formed XML"),
-        (["traffic.network='net.net.xml'", "traffic.roads='net.net.xml'"], "roads would act on nothing beside network"),
+        (["traffic.network='net.net.xml'", "traffic.roads='net.net.xml'"], "roads has no effect with network"),
     ],
 )
 def test_wrong_roads_are_told(mini: Path, tmp_path: Path, run_egvs, settings: list[str], told: str) -> None:

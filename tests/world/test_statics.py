@@ -538,7 +538,7 @@ def test_a_mesh_that_lies_elsewhere_is_refused(tmp_path):
         InputError, match=r"m.ply: .*would lie beside it as eastings and northings of EPSG:32632; offset_m"
     ):
         located(tmp_path, meshes=[{"file": "m.ply"}])
-    with pytest.raises(InputError, match="epsg and origin_deg: a mesh is in one system"):
+    with pytest.raises(InputError, match="expected epsg or origin_deg, got both"):
         located(tmp_path, meshes=[{"file": "m.ply", "epsg": 25832, "origin_deg": [9, 51]}])
 
 

@@ -148,7 +148,7 @@ def test_a_network_that_draws_lengths_too_long_is_refused(tmp_path: Path) -> Non
 
 
 def test_an_offset_needs_its_projection(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="crs: offset_m without epsg"):
+    with pytest.raises(InputError, match="crs: offset_m needs epsg"):
         load(tmp_path, {"fcd": "f.csv"}, crs={"offset_m": [1, 2]})
     assert load(tmp_path, {"fcd": "f.csv"}, crs={"zero_height_m": 210.0}).crs.zero_height_m == 210.0
 

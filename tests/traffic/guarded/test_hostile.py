@@ -87,7 +87,7 @@ def test_a_networks_outputs_are_not_written(place, tmp_path):
 def test_the_name_of_a_kinds_attribute_writes_no_element(place, tmp_path):
     foreign = tmp_path / "foreign.txt"
     attributes = {f'x="1"/><edgeData id="d" file="{foreign}" y': 1}
-    with pytest.raises(InputError, match=r"attributes.*is no attribute's name: letters and digits"):
+    with pytest.raises(InputError, match=r"attributes.*expected a name of letters and digits"):
         scenario(place, network="net.xml", kinds=[{**car().model_dump(), "attributes": attributes}], **SHORT)
     assert foreign.read_text() == KEPT
 

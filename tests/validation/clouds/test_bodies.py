@@ -133,7 +133,7 @@ def test_what_is_no_body_is_refused(mini, name, write, message):
 
 
 def test_an_unknown_kind_of_body_is_refused(mini):
-    with pytest.raises(InputError, match=r"validation\.bodies\.lorry: 'lorry'; input should be 'sedan', 'kei'"):
+    with pytest.raises(InputError, match=r"validation\.bodies\.lorry: expected 'sedan', 'kei'"):
         load(mini, ['validation.bodies.lorry="own.ply"'])
 
 
