@@ -147,7 +147,7 @@ def unused_keys(source: str) -> frozenset[str]:
     simulated = frozenset({"vehicles", "hold", "step_s", "lateral_resolution_m", "max_depart_delay_s"})
     if source == "fcd":
         return simulated | drawn - {"kinds"} | {"routes"}
-    return {"sumocfg": drawn | {"routes"}, "routes": drawn}.get(source, frozenset()) | {"vtypes", "roads"}
+    return {"sumocfg": drawn | {"routes"}, "routes": drawn}.get(source, frozenset()) | {"vtypes", "roads", "fcd_geo"}
 
 
 class TrafficConfig(StrictModel):
@@ -171,6 +171,9 @@ class TrafficConfig(StrictModel):
     fcd: str | None = Field(
         default_factory=lambda given: _of_first_period(given, "fcd"),
         description="A finished FCD file (XML, CSV or Parquet, may be gzipped); nothing is simulated",
+    )
+    fcd_geo: bool = Field(
+        False, description="Whether x and y of finished FCD files are longitude and latitude (SUMO's --fcd-output.geo)"
     )
     roads: str | None = Field(
         None,
