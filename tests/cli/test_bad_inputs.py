@@ -469,6 +469,6 @@ def test_altered_metadata_is_named(mini: Path, tmp_path: Path, run_egvs, change,
 
 
 def test_an_empty_set_of_features_is_a_world_of_ground_alone(mini: Path, tmp_path: Path, run_egvs) -> None:
-    (mini / "statics.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": []}))
+    (mini / "statics.geojson").write_text(json.dumps({"type": "FeatureCollection", "crs": None, "features": []}))
     code, _, error = run_egvs("statics", mini, "--out", tmp_path / "out")
     assert code == 0, error

@@ -192,8 +192,8 @@ def test_a_map_of_too_many_objects_is_refused(tmp_path: Path, monkeypatch: pytes
     pbf = pbf_of(SMALL, tmp_path / "a.osm.pbf")
     for path in (SMALL, pbf):
         told = (
-            rf"{path.name}: holds more than 10 objects; a part of the map\. The limit is 10 objects; set "
-            rf"EGVS_MAX_MAP_OBJECTS="
+            rf"{path.name}: has more than 10 objects\. Use a part of the map\. The limit is 10 objects; set "
+            rf"EGVS_MAX_MAP_OBJECTS"
         )
         with pytest.raises(InputError, match=told):
             osm.read_osm(path)

@@ -338,9 +338,7 @@ def test_laz_that_asks_for_more_memory_than_the_bound_is_refused(tmp_path: Path)
 def test_more_points_than_the_bound_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EGVS_MAX_POINTS", "299")
     for name in ("a.las", "a.laz"):
-        with pytest.raises(
-            InputError, match=rf"{name}: takes 300 points\. The limit is 299 points; set EGVS_MAX_POINTS=... raise"
-        ):
+        with pytest.raises(InputError, match=rf"{name}: 300 points\. The limit is 299 points; set EGVS_MAX_POINTS"):
             read_points(las(tmp_path, name)[0], "")
 
 

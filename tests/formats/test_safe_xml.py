@@ -64,7 +64,7 @@ def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
 
 def hostile() -> Iterator[tuple[str, bytes, str]]:
     """(name, file, message) of files that would take more memory than they are worth."""
-    told = r"has an element, or a text, of more than 1 MB\. The limit is 1 MB; set EGVS_MAX_ELEMENT_MB=... raises that"
+    told = r"has an element, or a text, of more than 1 MB\. The limit is 1 MB; set EGVS_MAX_ELEMENT_MB to raise it"
     yield "text of the root", b"<net>" + ONE_MB * 3 + b"</net>", told
     yield "text between children", b"<net><e/>" + ONE_MB * 3 + b"<e/></net>", told
     yield "rows in one step", b"<net><e>" + b"<v a='1'/>" * 150_000 + b"</e></net>", told
@@ -113,5 +113,5 @@ def test_values_of_an_attribute_are_found_wherever_the_file_is_cut_for_reading(t
 def test_a_value_without_end_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EGVS_MAX_ELEMENT_MB", "1")
     (tmp_path / "n.net.xml").write_bytes(b"<net><e shape='" + b"1,2 " * 1_000_000)
-    with pytest.raises(InputError, match=r"n.net.xml: has a value without end; at most 1 MB"):
+    with pytest.raises(InputError, match=r"n.net.xml: has a value without end. The limit is 1 MB"):
         list(xml.scan_attribute_values(tmp_path / "n.net.xml", "shape"))

@@ -299,7 +299,7 @@ def test_heights_beside_a_rule_are_refused(mini: Path) -> None:
     rule = "heights_m = [3]\n[[sites.along]]\nline_m = [[0, 0], [1, 0]]\nspacing_m = 1\nheights_m = [3]\n"
     path.write_text(path.read_text().replace('file = "sites.csv"\n', "").replace(
         'sensor = "small"\n', f'sensor = "small"\n{rule}'))  # fmt: skip
-    with pytest.raises(InputError, match="heights_m has no effect with along. Set along.heights_m"):
+    with pytest.raises(InputError, match=r"heights_m has no effect with along\. Set along\.heights_m"):
         egvs.load(mini)
 
 

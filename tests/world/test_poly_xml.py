@@ -399,7 +399,7 @@ def test_a_shape_in_degrees_is_brought_into_the_world(tmp_path: Path) -> None:
     assert [f.polygon.wkb for f in geo.footprints] == [f.polygon.wkb for f in metres.footprints]
     assert len(geo.footprints) == 4
     with pytest.raises(
-        InputError, match=r"s.poly.xml: poly x: is in longitude and latitude, and nothing says where the scen"
+        InputError, match=r"s.poly.xml: poly x: the shape is in longitude and latitude, but the position of the world"
     ):
         read(tmp_path, poly("building", as_geo(SQUARE), geo="1"))
 
@@ -413,9 +413,9 @@ def test_a_files_own_location_counts(tmp_path: Path) -> None:
     same = f'<location netOffset="-550700.00,-5635200.00" projParameter="{UTM}"/>'
     assert read(tmp_path, same, poly("building"), world=here).footprints[0].polygon.bounds == (0, 0, 4, 4)
     far = f'<location netOffset="-500000.00,-5635200.00" projParameter="{UTM}"/>'
-    with pytest.raises(InputError, match=r"s.poly.xml: .* \(51 km\) as metres of its own <location>; .*polyconvert"):
+    with pytest.raises(InputError, match=r"s.poly.xml: .* are 51 km .* as metres of its own <location>. .*polyconvert"):
         read(tmp_path, far, poly("building"), world=here)
-    with pytest.raises(InputError, match=r"lie far from the region of interest \(141 km\)"):
+    with pytest.raises(InputError, match=r"are 141 km from the region of interest"):
         read(tmp_path, poly("building", "100000,100000 100004,100000 100004,100004"))
 
 

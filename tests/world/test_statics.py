@@ -472,10 +472,10 @@ def test_features_in_degrees_are_counted_and_stand_where_metres_put_them(tmp_pat
     more = {"name": None, "kind": None, "base_m": None}
     degrees = (polygon(square, **more), feature({"type": "Point", "coordinates": lamp[0]}, height_m=5, radius_m=0.1))
     metres = (polygon(SQUARE), feature({"type": "Point", "coordinates": [9, 9]}, height_m=5, radius_m=0.1))
-    (tmp_path / "s.geojson").write_text(collection(*degrees))
+    (tmp_path / "s.geojson").write_text(collection(*degrees, crs="OGC:CRS84"))
     world, counts = located(tmp_path, footprints=["s.geojson"])
     assert np.array_equal(world.vertices_m, built(tmp_path, *metres)[0].vertices_m)
-    assert counts.repaired == {"features in degrees, brought into the world frame": 2}
+    assert counts.repaired == {"features in WGS 84 (CRS84), brought into the world frame": 2}
     assert world.solids[0] == ("s_0", "footprint")
 
 
@@ -491,14 +491,16 @@ def test_lines_that_rounding_has_left_beside_a_polygon_are_counted(tmp_path):
 def test_rings_that_rounded_degrees_make_cross_are_mended_and_others_are_not(tmp_path):
     """A notch of 1 cm is turned over by 6 digits of a degree; a bow-tie crosses whatever the digits."""
     notched = [[0, 0], [4, 0], [4, 4], [2.01, 4], [2.0, -0.02], [1.99, 4], [0, 4], [0, 0]]
-    (tmp_path / "s.geojson").write_text(collection(polygon(FRAME.to_degrees(np.array(notched)).tolist())))
+    (tmp_path / "s.geojson").write_text(
+        collection(polygon(FRAME.to_degrees(np.array(notched)).tolist()), crs="OGC:CRS84")
+    )
     world, counts = located(tmp_path, footprints=["s.geojson"])
     assert counts.repaired["rings that rounded degrees made cross"] == 1
     assert volumes(world).sum() == pytest.approx(80, rel=0.01)
     with pytest.raises(InputError, match="is not a sound polygon"):
         built(tmp_path, polygon(notched))
     tie = FRAME.to_degrees(np.array([[0, 0], [4, 4], [4, 0], [0, 4], [0, 0]], dtype=float)).tolist()
-    (tmp_path / "s.geojson").write_text(collection(polygon(tie)))
+    (tmp_path / "s.geojson").write_text(collection(polygon(tie), crs="OGC:CRS84"))
     with pytest.raises(InputError, match="is not a sound polygon"):
         located(tmp_path, footprints=["s.geojson"])
 
@@ -535,7 +537,7 @@ def test_a_mesh_that_lies_elsewhere_is_refused(tmp_path):
     box.apply_translation([550_720, 5_635_230, 4])
     box.export(tmp_path / "m.ply")
     with pytest.raises(
-        InputError, match=r"m.ply: .*would lie beside it as eastings and northings of EPSG:32632; offset_m"
+        InputError, match=r"m.ply: .*would be near it as eastings and northings of EPSG:32632. Set offset_m"
     ):
         located(tmp_path, meshes=[{"file": "m.ply"}])
     with pytest.raises(InputError, match="expected epsg or origin_deg, got both"):

@@ -119,9 +119,9 @@ def test_a_scenario_may_say_it_itself(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("crs", "message"),
     [
-        ({"epsg": 4326}, r"crs.epsg: EPSG:4326 \(WGS 84\) is no map projection; a projected system in metres"),
+        ({"epsg": 4326}, r"crs.epsg: EPSG:4326 \(WGS 84\) is not a map projection. Use a projection in metres"),
         ({"epsg": 2263}, r"crs.epsg: EPSG:2263 .* counts in US survey foot"),
-        ({"epsg": 1}, "crs.epsg: 'EPSG:1' is none that is known"),
+        ({"epsg": 1}, "crs.epsg: unknown coordinate reference system 'EPSG:1'"),
         ({"epsg": 3857, "offset_m": [-1081000, -6594000]},
          r"crs: epsg = 3857 draws lengths 1.58 times as long at the region of interest \(longitude 9.71\d*, latitude "
          r"50.8\d*\); a system that keeps lengths there, for example epsg = 32632, with its offset_m"),

@@ -51,11 +51,6 @@ class Limit:
         return int(text)
 
     @property
-    def expected(self) -> str:
-        """The limit as part of a sentence, for a message."""
-        return f"at most {self.maximum:,} {self.unit}; {self.name}=... raises that"
-
-    @property
     def hint(self) -> str:
         """The limit and how to raise it, as a sentence."""
         return f"The limit is {self.maximum:,} {self.unit}; set {self.name} to raise it."

@@ -92,7 +92,7 @@ def _unpack(path: Path, where: str, declared: int) -> NDArray[np.float64]:
         lines = complaint.read(100_000).decode("utf-8", "replace").strip().splitlines()
     if code < 0:
         found = f"{_CANNOT_READ} (what unpacks it ended, by signal {-code}: it asked for too much memory)"
-        raise InputError(where, found, f"{_EXPECTED}, of {limits.READER_MEMORY.expected}")
+        raise InputError(where, found, limits.READER_MEMORY.hint)
     if code or more:
         raise InputError(
             where, f"{_CANNOT_READ} ({lines[-1] if lines else 'more points than its header says'})", _EXPECTED

@@ -114,8 +114,9 @@ def read_osm(path: Path) -> OsmExtract:
         box = objects.header.box()
         for number, o in enumerate(objects):
             if number == most:
-                right = f"a part of the map; {limits.MAP_OBJECTS.expected}"
-                raise InputError(path, f"holds more than {most:,} objects", right)
+                raise InputError(
+                    path, f"has more than {most:,} objects", f"Use a part of the map. {limits.MAP_OBJECTS.hint}"
+                )
             if isinstance(o, osmium.osm.Changeset) or not o.visible or (o.type_str(), o.id) in deleted:
                 continue
             match o:

@@ -233,5 +233,5 @@ class _ElementMeter:
         self.since += len(chunk)
         if self.since > self._most * limits.MB + size:
             found = f"has an element, or a text, of more than {self._most:,} MB"
-            raise InputError(self._place, found, limits.ELEMENT.expected)
+            raise InputError(self._place, found, limits.ELEMENT.hint)
         return chunk

@@ -187,7 +187,7 @@ def keys_without_effect(source: str) -> frozenset[str]:
     simulation = frozenset({"vehicles", "hold", "step_s", "lateral_resolution_m", "max_depart_delay_s"})
     if source == "fcd":
         return simulation | demand - {"kinds"} | {"routes"}
-    unused = frozenset({"vtypes", "roads"})
+    unused = frozenset({"vtypes", "roads", "fcd_geo"})
     if source == "network":
         return unused
     return unused | demand | ({"routes"} if source == "sumocfg" else set())
@@ -220,6 +220,9 @@ class TrafficConfig(StrictModel):
     fcd: str | None = Field(
         default_factory=lambda values: _first_source(values, "fcd"),
         description="Finished FCD file (XML, CSV or Parquet, may be gzipped); nothing is simulated",
+    )
+    fcd_geo: bool = Field(
+        False, description="x and y of the finished FCD file are longitude and latitude (SUMO's --fcd-output.geo)"
     )
     roads: str | None = Field(
         None,

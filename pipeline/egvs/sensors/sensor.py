@@ -142,7 +142,7 @@ def _read_cached(path: Path, _content_hash: str) -> BeamTable:
                 azimuth_deg = _parse_angle(path, number, "azimuth_deg", row["azimuth_deg"])
                 angles.append((elevation_deg, azimuth_deg))
                 if len(angles) > max_beams:
-                    raise InputError(path, f"the file has more than {max_beams:,} beams", limits.BEAMS.expected)
+                    raise InputError(path, f"the file has more than {max_beams:,} beams", limits.BEAMS.hint)
     except (UnicodeDecodeError, csv.Error) as error:
         hint = "Save it as UTF-8 text with a header row."
         raise InputError(path, f"the file cannot be read as CSV ({error})", hint) from None

@@ -190,9 +190,7 @@ def _site_rows(scenario: Scenario, path: Path) -> Iterator[SiteRow]:
 def _check_site_count(count: float, where: object, reason: str) -> None:
     if not count <= limits.SITES.maximum:
         problem = f"there are more than {limits.SITES.maximum:,} candidates ({reason})"
-        raise InputError(
-            where, problem, f"Use a wider spacing, or fewer heights and pitches ({limits.SITES.expected})."
-        )
+        raise InputError(where, problem, f"Use a wider spacing, or fewer heights and pitches. {limits.SITES.hint}")
 
 
 def _group_errors(errors: list[InputError]) -> Iterator[Diagnostic]:

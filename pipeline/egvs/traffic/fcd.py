@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from egvs.core import limits, reading
 from egvs.core.errors import InputError
 from egvs.formats import xml
-from egvs.formats.georeference import CoordinateReading, Georeference
+from egvs.formats.georeference import WGS84, WORLD, CoordinateReading, Georeference, look_like_degrees
 from egvs.scenario.fields import MAX_COORDINATE_M
 
 _NUMBERS = ("x", "y", "z", "angle", "slope", "speed")
@@ -65,18 +65,23 @@ EXPECTED_FCD = (
 )
 """What a message asks for where a file is not right."""
 
-_EXPECTED_COORDINATES = "x and y in metres of the world frame, or longitude and latitude (--fcd-output.geo)"
+_GEO_HINT = "Set traffic.fcd_geo = true for longitude and latitude (--fcd-output.geo); without it, x and y are metres."
 
 
-def georeference_rows(tables: Iterable[pa.Table], world: Georeference, path: Path) -> Generator[pa.Table, None, None]:
-    """The rows of a user's file with x, y in the world frame, whether they are metres or degrees.
+def georeference_rows(
+    tables: Iterable[pa.Table], world: Georeference, path: Path, is_geo: bool
+) -> Generator[pa.Table, None, None]:
+    """Yield the rows of a user's file with x, y in the world frame; ``is_geo``: they are longitude and latitude.
 
-    The first table tells. InputError where it is neither, or no vehicle of it is near the region of interest.
+    InputError when no vehicle of the first table is near the region of interest, or its metres can only be degrees.
     """
     reading: CoordinateReading | None = None
     for table in tables:
         xy = np.column_stack([table["x"].to_numpy(), table["y"].to_numpy()])
-        reading = reading or world.read_coordinates(xy, str(path), None, _EXPECTED_COORDINATES)
+        if reading is None:
+            if world.frame is None and not is_geo and look_like_degrees(xy):
+                raise world.unknown_frame_error(str(path), "x and y look like longitude and latitude", xy)
+            reading = world.read_coordinates(xy, str(path), WGS84 if is_geo else WORLD, _GEO_HINT)
         if reading.convert is not None:
             x_m, y_m = reading.to_world(xy).T
             for name, values in (("x", x_m), ("y", y_m)):
@@ -84,9 +89,9 @@ def georeference_rows(tables: Iterable[pa.Table], world: Georeference, path: Pat
         yield table
 
 
-def check_coordinates(path: Path, world: Georeference) -> None:
+def check_coordinates(path: Path, world: Georeference, is_geo: bool) -> None:
     """InputError where a user's file lies in other coordinates, or is none; only its head is read."""
-    with closing(georeference_rows(read_fcd(path), world, path)) as tables:
+    with closing(georeference_rows(read_fcd(path), world, path, is_geo)) as tables:
         next(tables, None)
 
 

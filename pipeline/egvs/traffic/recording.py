@@ -268,7 +268,9 @@ def _record_finished(scenario: Scenario, folder: Path, world: Georeference) -> I
     sumo_folder.copy_network(scenario, folder)
     when, held = finished_fcd.fcd_window(scenario)
     path, sizes = scenario.find(name, "traffic.fcd"), finished_fcd.sizes_of_types(scenario, held.types, held.sizes)
-    rows = fcd.read_fcd(path) if held.metadata is not None else fcd.georeference_rows(fcd.read_fcd(path), world, path)
+    rows = fcd.read_fcd(path)
+    if held.metadata is None:
+        rows = fcd.georeference_rows(rows, world, path, scenario.traffic.fcd_geo)
     yield Recording(rows, when, sizes, place, source=f"{place}.fcd = {name!r}")
 
 

@@ -66,7 +66,7 @@ def network_world_frame(location: Location | None) -> WorldFrame | None:
     if location is None or location.projection in _NO_PROJECTION:
         return None
     try:
-        return WorldFrame.of(location.projection, location.offset_m, "<location>")
+        return WorldFrame.from_projection(location.projection, location.offset_m, "<location>")
     except InputError:  # "-", ".": SUMO's own rough projections
         return None
 
@@ -75,7 +75,7 @@ def _declared_frame(scenario: Scenario) -> WorldFrame | None:
     crs = scenario.crs
     if crs.epsg is None:
         return None
-    return WorldFrame.of(f"EPSG:{crs.epsg}", crs.offset_m, f"{scenario.file}: crs.epsg")
+    return WorldFrame.from_projection(f"EPSG:{crs.epsg}", crs.offset_m, f"{scenario.file}: crs.epsg")
 
 
 def _network_path(scenario: Scenario) -> Path | None:
@@ -108,7 +108,7 @@ def _converted_location(path: Path, changed_ns: int, size: int) -> Location | No
 
 def _check_stretch(frame: WorldFrame, scenario: Scenario) -> None:
     x, y, _ = scenario.roi.center_m
-    place, stretch = f"{scenario.file}: crs", frame.stretch((x, y))
+    place, stretch = f"{scenario.file}: crs", frame.scale_factor((x, y))
     if abs(stretch - 1.0) <= MAX_SCALE_ERROR:
         return
     lon_deg, lat_deg = frame.to_degrees(np.array([[x, y]]))[0]
@@ -125,7 +125,7 @@ def _check_stretch(frame: WorldFrame, scenario: Scenario) -> None:
 
 def _check_network(network_frame: WorldFrame, scenario: Scenario) -> None:
     x, y, _ = scenario.roi.center_m
-    if abs((stretch := network_frame.stretch((x, y))) - 1.0) > MAX_SCALE_ERROR:
+    if abs((stretch := network_frame.scale_factor((x, y))) - 1.0) > MAX_SCALE_ERROR:
         found = (
             f"its <location> ({network_frame.projection}) draws lengths {stretch:.3g} times as long at the "
             f"region of interest"

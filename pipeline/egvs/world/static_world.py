@@ -154,10 +154,10 @@ def _to_world(vertices_m: Floats, model: MeshConfig, path: Path, world: Georefer
     """A mesh's vertices (n, 3) in the world frame: moved by its offset, then brought from its own system, if any."""
     placed: Floats = np.add(vertices_m, model.offset_m, dtype=np.float64)
     if model.crs is None:
-        world.metres(placed[:, :2], str(path), "offset_m, epsg or origin_deg beside the mesh's file")
+        world.check_metres(placed[:, :2], str(path), "Set offset_m, epsg or origin_deg beside the mesh's file.")
         return placed
-    right = "the epsg or the origin_deg that the mesh was made with"
-    reading = world.read_coordinates(placed[:, :2], str(path), model.crs, right)
+    hint = "Set the epsg or the origin_deg that the mesh was made with."
+    reading = world.read_coordinates(placed[:, :2], str(path), model.crs, hint)
     return np.column_stack([reading.to_world(placed[:, :2]), placed[:, 2]])
 
 

@@ -32,7 +32,7 @@ _INNER = "inner"
 _WHITE = ("white", "255,255,255")  # polyconvert's colour of courtyards, which --osm.keep-full-type gives another type
 _NO_TYPE = "(none)"
 _MAX_LISTED = 12  # types that a warning names
-_EXPECTED = "a file that polyconvert made with the scenario's network (-n)"
+_HINT = "Make the file with polyconvert and the scenario's network (-n)."
 
 
 def read_poly_xml(path: Path, types: SolidTypes, height_m: float, world: Georeference) -> FootprintFile:
@@ -126,7 +126,7 @@ class _PolygonReader:
 
     def _reading(self, where: str, points: list[tuple[float, float]], is_geo: bool) -> CoordinateReading:
         if (reading := self._readings[is_geo]) is None:
-            raise self._world.unknown(where, "is in longitude and latitude", np.array(points))
+            raise self._world.unknown_frame_error(where, "the shape is in longitude and latitude", np.array(points))
         return reading
 
     def _areas(self, where: str, points: list[tuple[float, float]], element: Element) -> list[Polygon]:
@@ -257,8 +257,8 @@ def _readings(path: Path, world: Georeference) -> dict[bool, CoordinateReading |
     degrees, metres = (np.array(finite[is_geo]).reshape(-1, 2) for is_geo in (True, False))
     own = network_world_frame(read_location(path, "additional"))
     return {
-        True: None if world.frame is None else world.read_coordinates(degrees, str(path), WGS84, _EXPECTED),
-        False: world.of_frame(own, metres, str(path), _EXPECTED),
+        True: None if world.frame is None else world.read_coordinates(degrees, str(path), WGS84, _HINT),
+        False: world.read_framed_coordinates(own, metres, str(path), _HINT),
     }
 
 

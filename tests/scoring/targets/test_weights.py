@@ -149,9 +149,9 @@ def test_where_no_vehicle_counts_none_can_rank(mini: Path, tmp_path: Path, run_e
         ("score.weights.kinds.buss=2", "score.weights.kinds.buss"),
         ("score.weights.kinds.bus=-1", "score.weights.kinds.bus: expected a value greater than or equal to 0, got -1"),
         ("score.weights.zones.z={weight=1, polygon_m=[[0,0],[1,1]]}", "score.weights.zones.z.polygon_m"),
-        ("score.weights.zones.z={weight=1, polygon_m=[[0,0],[1,1],[1,0],[0,1]]}", "expected a polygon that encloses an area"),
-        ("score.weights.zones.z={weight=1, polygon_m=[[0,0],[1,1],[2,2]]}", "expected a polygon that encloses an area (Self"),
-        ("score.weights.zones.z={polygon_m=[[0,0],[1,1],[2,0]]}", "score.weights.zones.z.weight: missing"),
+        ("score.weights.zones.z={weight=1, polygon_m=[[0,0],[1,1],[1,0],[0,1]]}", "expected a polygon"),
+        ("score.weights.zones.z={weight=1, polygon_m=[[0,0],[1,1],[2,2]]}", "encloses an area (Self"),
+        ("score.weights.zones.z={polygon_m=[[0,0],[1,1],[2,0]]}", "score.weights.zones.z.weight: this key is required"),
         ("score.weights.zone={}", "Did you mean zones?"),
     ],
 )  # fmt: skip
