@@ -165,17 +165,17 @@ BAD: dict[str, tuple[Change, str]] = {
     ),
     "statics self-crossing polygon": (
         statics(polygon([[0, 0], [4, 4], [4, 0], [0, 4], [0, 0]], name="bow")),
-        r"feature 0 \(bow\): geometry: is not a sound polygon \(Self-intersection",
+        r"feature 0 \(bow\): geometry: is not a valid polygon \(Self-intersection",
     ),
     "statics hole outside": (
         statics(polygon(BUILDING[0], [[50, 50], [51, 50], [51, 51], [50, 50]])),
-        r"is not a sound polygon \(Hole lies outside",
+        r"is not a valid polygon \(Hole lies outside",
     ),
     "statics without area": (
         statics(polygon([[0, 0], [4, 4], [2, 2], [0, 0]])),
         r"not a sound polygon|encloses no area",
     ),
-    "statics odd geometry": (statics(feature({"type": "Circle"}, height_m=3)), r"cannot be understood"),
+    "statics odd geometry": (statics(feature({"type": "Circle"}, height_m=3)), r"expected a GeoJSON geometry"),
     "statics infinite coordinate": (
         put("statics.geojson", collection(polygon(BUILDING[0])).replace("14", "1e999", 1)),
         r"coordinate that is no number",

@@ -593,7 +593,7 @@ BAD = {
     "effects.divergence.subbeams=7": "Did you mean sub_beams",
     f"{SWAY}-1": "effects.mount_sway.tilt_deg: -1",
     f"{SWAY}nan": "effects.mount_sway.tilt_deg",
-    "effects.mount_sway.samples=9": "effects.mount_sway.tilt_deg: missing",
+    "effects.mount_sway.samples=9": "effects.mount_sway.tilt_deg: this key is required",
     "effects.mount_sway={tilt_deg = 1, samples = 5}": "effects.mount_sway.samples: 5",
     f"{FOLIAGE}-0.1": "effects.foliage.leaf_area_density: -0.1",
     f"{FOLIAGE}inf": "effects.foliage.leaf_area_density",

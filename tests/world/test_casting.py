@@ -400,7 +400,7 @@ def test_world_without_triangles_or_with_one():
 def test_corner_that_is_no_number_is_refused(value):
     scene = np.ones((2, 3, 3))
     scene[1, 2, 0] = value
-    with pytest.raises(InputError, match="corner that is no number"):
+    with pytest.raises(InputError, match="expected finite coordinates"):
         caster(scene)
 
 

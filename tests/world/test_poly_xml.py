@@ -107,8 +107,8 @@ def test_every_type_of_polyconvert_is_in_the_table() -> None:
     types = SolidTypes()
     home = sumo_home()
     for element in parse(home / "data" / "typemap" / "osmPolyconvert.typ.xml").getroot():
-        assert types.knows(element.get("id")) or element.get("id") == "inner", element.get("id")
-        assert types.knows(element.get("name")) or element.get("name") == "inner", element.get("name")
+        assert types.is_known(element.get("id")) or element.get("id") == "inner", element.get("id")
+        assert types.is_known(element.get("name")) or element.get("name") == "inner", element.get("name")
 
 
 def test_a_type_that_no_table_names_is_left_out_and_warned_of(tmp_path: Path) -> None:
@@ -121,15 +121,14 @@ def test_a_type_that_no_table_names_is_left_out_and_warned_of(tmp_path: Path) ->
     }
     assert [(w.rule, w.is_error) for w in file.warnings] == [("polygon types", False)]
     assert str(file.warnings[0]) == (
-        f"{tmp_path / 's.poly.xml'}: polygons of type sculpture (2), (none) (1), mine.own (1): left out, for no table "
-        'says whether this is solid; say it in [statics.polygon_types]: "solid", "ignore" or a height in metres for '
-        "each type"
+        f"{tmp_path / 's.poly.xml'}: unknown types of polygons were left out: sculpture (2), (none) (1), mine.own (1). "
+        'Set each in [statics.polygon_types] to "solid", "ignore" or a height in metres'
     )
 
 
 def test_a_file_without_anything_solid_is_warned_of(tmp_path: Path) -> None:
     file = read(tmp_path, poly("parking"), poly("landuse"))
-    assert [w.problem for w in file.warnings] == ["none of its 2 polygons is solid"]
+    assert [w.problem for w in file.warnings] == ["none of the 2 polygons is solid"]
 
 
 def test_a_shape_that_is_not_solid_need_not_be_sound(tmp_path: Path) -> None:
@@ -144,7 +143,7 @@ def test_an_outline_that_crosses_itself_stops_no_file(tmp_path: Path) -> None:
     assert file.repaired["rings that cross themselves, each part that they enclose kept"] == 1
     assert file.ignored["outlines that enclose nothing of type building"] == 1
     (warning,) = file.warnings
-    assert warning.problem == "outlines that cross themselves: 1 (x); each part that they enclose is kept"
+    assert warning.problem == "outlines that cross themselves: 1 (x). All parts that they enclose were kept"
 
 
 # ---- the user's own table
@@ -201,7 +200,7 @@ def test_types_without_quotes_mean_the_same(tmp_path: Path) -> None:
 @pytest.mark.parametrize("value", ["yes", -1.0, 0, True, None, [3.0]])
 def test_a_value_that_says_nothing_is_refused(tmp_path: Path, value: Any) -> None:
     with pytest.raises(
-        InputError, match=r'statics.polygon_types: .*"building.shed" = .*; "solid", "ignore" or a height'
+        InputError, match=r'statics.polygon_types: expected "solid", "ignore" or a height .* for "building.shed", got'
     ):
         load(tmp_path, polygon_types={"building.shed": value})
 
@@ -265,7 +264,7 @@ def test_a_tag_that_cannot_be_read_is_counted(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("height", ["tall", "0", "-3", "nan", "inf"])
 def test_a_height_of_sumos_own_that_is_none_is_refused(tmp_path: Path, height: str) -> None:
-    with pytest.raises(InputError, match=rf"poly x: height: '{height}'; a number of metres above 0"):
+    with pytest.raises(InputError, match=rf"poly x: height: expected a number of metres above 0, got '{height}'"):
         read(tmp_path, poly("building", height=height))
 
 
@@ -287,7 +286,7 @@ def test_a_wall_is_a_strip_and_a_closed_outline_an_area(tmp_path: Path) -> None:
 def test_an_open_outline_of_a_building_is_left_out_and_warned_of(tmp_path: Path) -> None:
     file = read(tmp_path, poly("fence"), poly("building.school", "0,0 4,0 4,4", fill="0"))
     assert file.ignored == {"open lines of type building.school": 1}
-    assert [w.problem for w in file.warnings] == ["outlines of type building.school (1) are not closed: left out"]
+    assert [w.problem for w in file.warnings] == ["open outlines of solid types were left out: building.school (1)"]
     assert "--osm.merge-relations" in file.warnings[0].hint
 
 
@@ -319,7 +318,7 @@ def test_a_solid_inside_another_is_warned_of(tmp_path: Path) -> None:
     file = read(tmp_path, poly("building", "0,0 20,0 20,20 0,20"), poly("building", "5,5 15,5 15,15 5,15"))
     assert len(file.footprints) == 2
     assert [w.problem for w in file.warnings] == [
-        "solids inside another of their kind and height: 1; they may be courtyards that are filled"
+        "solids inside another of the same kind and height: 1. They may be filled courtyards"
     ]
     tower = poly("building", "5,5 15,5 15,15 5,15", height="30")
     assert not read(tmp_path, poly("building", "0,0 20,0 20,20 0,20"), tower).warnings
@@ -364,11 +363,11 @@ def test_what_stands_there_twice_is_built_once(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("shape", "message"),
     [
-        ("", "poly x: shape: ''; three points for an area"),
-        ("1,2", "poly x: shape: '1,2'; three points"),
-        ("0,0 a,0 4,4", "poly x: has a value that is no number"),
-        ("0,0 4 4,4", "poly x: has a value that is no number"),
-        ("0,0 nan,0 4,4 0,4", "poly x: geometry: .*no number"),
+        ("", "poly x: shape: expected three points for an area, two for a line, got ''"),
+        ("1,2", "poly x: shape: expected three points for an area, two for a line, got '1,2'"),
+        ("0,0 a,0 4,4", "poly x: expected shape='x,y x,y ...' in metres"),
+        ("0,0 4 4,4", "poly x: expected shape='x,y x,y ...' in metres"),
+        ("0,0 nan,0 4,4 0,4", "poly x: geometry: expected finite coordinates"),
     ],
 )
 def test_shapes_that_are_none_are_refused(tmp_path: Path, shape: str, message: str) -> None:

@@ -136,29 +136,29 @@ def test_dirt_with_one_meaning_is_mended_and_counted(tmp_path, features, mended,
     [
         ({"type": "Polygon", "coordinates": [[[0, 0], [4, 4], [4, 0], [0, 4], [0, 0]]]}, "Self-intersection"),
         ({"type": "Polygon", "coordinates": [SQUARE, [[9, 9], [9, 10], [10, 9], [9, 9]]]}, "Hole lies outside"),
-        ({"type": "Polygon", "coordinates": [SQUARE, [[2, 2], [9, 2], [2, 9], [2, 2]]]}, "not a sound polygon"),
+        ({"type": "Polygon", "coordinates": [SQUARE, [[2, 2], [9, 2], [2, 9], [2, 2]]]}, "not a valid polygon"),
         (
             {"type": "Polygon", "coordinates": [COURT, HOLE, [[16, 16], [17, 16], [16, 17], [16, 16]]]},
             "Holes are nested",
         ),
         (
             {"type": "Polygon", "coordinates": [[[0, 0], [4, 0], [2, 0], [0, 0]]]},
-            "not a sound polygon|encloses no area",
+            "not a valid polygon|encloses no area",
         ),
         (
             {"type": "Polygon", "coordinates": [[[1, 1], [1, 1], [1, 1], [1, 1]]]},
-            "not a sound polygon|encloses no area",
+            "not a valid polygon|encloses no area",
         ),
-        ({"type": "Polygon", "coordinates": [[[0, 0], [4, 0], [0, 0]]]}, "cannot be understood|not a sound polygon"),
-        ({"type": "Polygon", "coordinates": [[[0, 0], [math.nan, 0], [4, 4], [0, 0]]]}, "no number"),
-        ({"type": "Polygon", "coordinates": [[[0, 0], [math.inf, 0], [4, 4], [0, 0]]]}, "no number"),
+        ({"type": "Polygon", "coordinates": [[[0, 0], [4, 0], [0, 0]]]}, "not a valid polygon"),
+        ({"type": "Polygon", "coordinates": [[[0, 0], [math.nan, 0], [4, 4], [0, 0]]]}, "expected finite coordinates"),
+        ({"type": "Polygon", "coordinates": [[[0, 0], [math.inf, 0], [4, 4], [0, 0]]]}, "expected finite coordinates"),
         ({"type": "Polygon", "coordinates": []}, "is empty"),
-        ({"type": "MultiPolygon", "coordinates": [[SQUARE], [SQUARE]]}, "not a sound polygon"),
+        ({"type": "MultiPolygon", "coordinates": [[SQUARE], [SQUARE]]}, "not a valid polygon"),
         ({"type": "GeometryCollection", "geometries": []}, "is empty"),
         ({"type": "Polygon", "coordinates": [[[0, 0, 1], [4, 0, 1], [4, 4, 1], [0, 0, 1]]]}, "z coordinates"),
         ({"type": "Point", "coordinates": [1, 1]}, "radius_m is missing"),
-        ({"type": "Curve", "coordinates": [1, 1]}, "cannot be understood"),
-        (None, "cannot be understood"),
+        ({"type": "Curve", "coordinates": [1, 1]}, "expected a GeoJSON geometry"),
+        (None, "expected a GeoJSON geometry"),
     ],
 )
 def test_dirt_with_two_meanings_is_refused(tmp_path, geometry, reason):
@@ -290,16 +290,16 @@ def test_ply_comes_back_bit_for_bit(tmp_path):
         b"ply\nend_header\n",
     ):
         (tmp_path / "w.ply").write_bytes(broken)
-        with pytest.raises(InputError, match=r"whole statics\.ply"):
+        with pytest.raises(InputError, match=r"complete statics\.ply"):
             read_ply(tmp_path / "w.ply")
 
 
 INDICES = {
-    "a vertex beyond the last": ("faces", 8, "a triangle names vertex 8 of 8; 0 to 7; run the statics stage again"),
-    "a vertex before the first": ("faces", -1, "a triangle names vertex -1 of 8; 0 to 7; run the statics stage again"),
-    "a solid beyond the last": ("solid_of_face", 1, "a triangle names solid 1 of 1; 0 to 0; run the statics stage"),
-    "a solid before the first": ("solid_of_face", -2, "a triangle names solid -2 of 1; 0 to 0; run the statics stage"),
-    "a vertex that is no number": ("vertices_m", np.nan, "a vertex is no number; finite coordinates; run the statics"),
+    "a vertex beyond the last": ("faces", 8, "expected a vertex from 0 to 7, got 8"),
+    "a vertex before the first": ("faces", -1, "expected a vertex from 0 to 7, got -1"),
+    "a solid beyond the last": ("solid_of_face", 1, "expected a solid from 0 to 0, got 1"),
+    "a solid before the first": ("solid_of_face", -2, "expected a solid from 0 to 0, got -2"),
+    "a vertex that is no number": ("vertices_m", np.nan, "expected finite coordinates"),
 }
 
 
@@ -497,11 +497,11 @@ def test_rings_that_rounded_degrees_make_cross_are_mended_and_others_are_not(tmp
     world, counts = located(tmp_path, footprints=["s.geojson"])
     assert counts.repaired["rings that rounded degrees made cross"] == 1
     assert volumes(world).sum() == pytest.approx(80, rel=0.01)
-    with pytest.raises(InputError, match="is not a sound polygon"):
+    with pytest.raises(InputError, match="is not a valid polygon"):
         built(tmp_path, polygon(notched))
     tie = FRAME.to_degrees(np.array([[0, 0], [4, 4], [4, 0], [0, 4], [0, 0]], dtype=float)).tolist()
     (tmp_path / "s.geojson").write_text(collection(polygon(tie), crs="OGC:CRS84"))
-    with pytest.raises(InputError, match="is not a sound polygon"):
+    with pytest.raises(InputError, match="is not a valid polygon"):
         located(tmp_path, footprints=["s.geojson"])
 
 
@@ -551,6 +551,6 @@ def test_all_wrong_features_of_a_file_are_told_at_once(tmp_path: Path) -> None:
         built(tmp_path, polygon(SQUARE), polygon(SQUARE, height_m="tall", name="t"), *wrong)
     told = [str(finding) for finding in caught.value.findings]
     assert len(told) == 21
-    assert "feature 1 (t): height_m: 'tall'" in told[0]
+    assert "feature 1 (t): height_m: expected metres, at most 1e+08, got 'tall'" in told[0]
     assert "feature 2 (w0): height_m is missing" in told[1]
     assert "4 more features are wrong" in told[-1]

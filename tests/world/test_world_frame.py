@@ -123,13 +123,13 @@ def test_a_scenario_may_say_it_itself(tmp_path: Path) -> None:
         ({"epsg": 2263}, r"crs.epsg: EPSG:2263 .* counts in US survey foot"),
         ({"epsg": 1}, "crs.epsg: unknown coordinate reference system 'EPSG:1'"),
         ({"epsg": 3857, "offset_m": [-1081000, -6594000]},
-         r"crs: epsg = 3857 draws lengths 1.58 times as long at the region of interest \(longitude 9.71\d*, latitude "
-         r"50.8\d*\); a system that keeps lengths there, for example epsg = 32632, with its offset_m"),
-        ({"epsg": 25832}, r"crs: epsg = 25832 .*(has no place|draws lengths|puts the region)"),  # a forgotten offset
+         r"crs: epsg = 3857 scales lengths by 1.58 at the region of interest \(longitude 9.71\d*, latitude "
+         r"50.8\d*\). Use a system .* e.g. epsg = 32632, with its offset_m"),
+        ({"epsg": 25832}, r"crs: epsg = 25832 .*(is outside of|scales lengths|puts the region)"),  # a forgotten offset
         ({"epsg": 32633, "offset_m": [-550000, -5634000]}, r"puts the region of interest [\d,]+ m from where"),
         ({"epsg": 25832, "offset_m": [-550000, -5634020]},
-         r"puts the region of interest 20 m from where the network's <location> puts it .*; "
-         r"no \[crs\], or one that agrees: netOffset \[-550000.0, -5634000.0\], projParameter '\+proj=utm \+zone=32"),
+         r"puts the region of interest 20 m from where the network's <location> puts it .*"
+         r"Remove \[crs\], or make it agree: netOffset \[-550000.0, -5634000.0\], projParameter '\+proj=utm \+zone=32"),
     ],
 )  # fmt: skip
 def test_what_contradicts_itself_is_refused(tmp_path: Path, crs: dict[str, Any], message: str) -> None:
@@ -140,7 +140,7 @@ def test_what_contradicts_itself_is_refused(tmp_path: Path, crs: dict[str, Any],
 def test_a_network_that_draws_lengths_too_long_is_refused(tmp_path: Path) -> None:
     """Vehicles keep their size, streets do not: at 51 degrees Web Mercator draws them 1.6 times as long."""
     scene = load(tmp_path, with_location(tmp_path, "EPSG:3857", "-1081000,-6594000"), (700, 1200))
-    with pytest.raises(InputError, match=r"the network: its <location> \(EPSG:3857\) draws lengths 1.58 times as long"):
+    with pytest.raises(InputError, match=r"the network: its <location> \(EPSG:3857\) scales lengths by 1.58"):
         geolocation.scenario_georeference(scene)
     geolocation.scenario_georeference(
         load(tmp_path, with_location(tmp_path, UTM, "0,0"), (700, 1200))
