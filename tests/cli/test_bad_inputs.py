@@ -152,13 +152,13 @@ BAD: dict[str, tuple[Change, str]] = {
     # statics
     "statics missing": (remove("statics.geojson"), r"statics.footprints = 'statics.geojson': no such file"),
     "statics no JSON": (put("statics.geojson", "{"), r"statics.geojson: is not valid JSON"),
-    "statics no collection": (put("statics.geojson", "[]"), r"has no list of features"),
+    "statics no collection": (put("statics.geojson", "[]"), r"got no list of features"),
     "statics without height": (
         statics(feature({"type": "Point", "coordinates": [1, 1]}, radius_m=1)),
         r"height_m is missing",
     ),
-    "statics upside down": (statics(polygon(BUILDING[0], base_m=7)), r"height_m = 5 with base_m = 7"),
-    "statics NaN height": (statics(polygon(BUILDING[0], height_m=math.nan)), r"height_m: nan"),
+    "statics upside down": (statics(polygon(BUILDING[0], base_m=7)), r"expected height_m above base_m = 7, got 5"),
+    "statics NaN height": (statics(polygon(BUILDING[0], height_m=math.nan)), r"height_m: .*, got nan"),
     "statics point without radius": (
         statics(feature({"type": "Point", "coordinates": [1, 1]}, height_m=3)),
         r"radius_m is missing",
@@ -173,12 +173,12 @@ BAD: dict[str, tuple[Change, str]] = {
     ),
     "statics without area": (
         statics(polygon([[0, 0], [4, 4], [2, 2], [0, 0]])),
-        r"not a sound polygon|encloses no area",
+        r"not a valid polygon|encloses no area",
     ),
     "statics odd geometry": (statics(feature({"type": "Circle"}, height_m=3)), r"expected a GeoJSON geometry"),
     "statics infinite coordinate": (
         put("statics.geojson", collection(polygon(BUILDING[0])).replace("14", "1e999", 1)),
-        r"coordinate that is no number",
+        r"expected finite coordinates",
     ),
     "mesh that is none": (
         put("m.stl", "solid nothing", add('\n[[statics.meshes]]\nfile = "m.stl"\n')),
@@ -245,7 +245,7 @@ BAD: dict[str, tuple[Change, str]] = {
     ),
     "statics beyond the Earth": (
         statics(polygon([[0, 0], [1e300, 0], [1e300, 1], [0, 0]])),
-        r"lies 1e\+300 m from the world's zero",
+        r"expected coordinates within .*, got 1e\+300 m",
     ),
     "statics nested without end": (
         put("statics.geojson", "[" * 200_000),
@@ -385,7 +385,7 @@ def test_sites_without_end_are_refused(mini: Path, run_egvs, spacing: str, rule:
     said = " ".join("".join(refused(run_egvs, "check", mini, "--set", asked)).split())
     told = f"more than 100,000 candidates (spacing_m = {spacing}). Use a wider spacing, or fewer heights and pitches"
     assert told in said
-    assert "EGVS_MAX_SITES=... raises that" in said
+    assert "EGVS_MAX_SITES to raise it" in said
 
 
 def spoil_parquet(path: Path) -> None:

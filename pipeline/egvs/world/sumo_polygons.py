@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -185,7 +186,7 @@ class _PolygonReader:
             raise self._world.unknown_frame_error(shape.where, what, np.array(points))
         return reading
 
-    def _widen(self, shape: _Shape, geometry: dict[str, object], points: Points, radius_m: float) -> list[Polygon]:
+    def _widen(self, shape: _Shape, geometry: Mapping[str, object], points: Points, radius_m: float) -> list[Polygon]:
         """Return a point or line as an area."""
         reading = self._reading(shape, points)
         return to_polygons(geometry, {"radius_m": radius_m}, shape.where, self._file.repaired, reading)
