@@ -1,6 +1,6 @@
 """Where a scenario's world frame is on the Earth, according to its network and ``[crs]``.
 
-The reference is the map: a node of OpenStreetMap has a longitude and latitude, and the junction that netconvert makes of
+The reference is the map: a node of OpenStreetMap has a longitude and latitude, the junction that netconvert makes of
 it an x, y.
 """
 

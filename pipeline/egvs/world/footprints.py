@@ -29,17 +29,17 @@ if TYPE_CHECKING:
 
 
 CROSSING_RINGS = "rings that cross themselves, each part that they enclose kept"
+# rings whose crossing changes no more than this share of an area cross because coordinates were rounded
 _MAX_SLIVER_SHARE = 0.01
-"""Rings whose crossing changes no more than this share of an area cross because coordinates were rounded."""
+# sides of a quarter of a disc
 _QUARTER_SIDES = 4
-"""Sides of a quarter of a disc."""
 
+# properties that must not be misspelt
 _HEIGHT_KEYS = ("height_m", "base_m")
-"""Properties that must not be misspelt."""
+# properties that ``egvs new`` adds as notes
 _NOTE_KEYS = ("height_from",)
-"""Properties that ``egvs new`` adds as notes."""
+# invalid features of a file that are reported one by one
 _MAX_REPORTED = 20
-"""Invalid features of a file that are reported one by one."""
 
 
 @dataclass(frozen=True)

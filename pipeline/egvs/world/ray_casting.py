@@ -33,25 +33,25 @@ from egvs.world.mesh import World
 Floats = NDArray[np.float64]
 
 _RIM_M = 1e-4
+# rim per largest coordinate of a triangle: eight times the rounding of float32
 _RIM_SHARE = 2.0**-21
-"""Rim per largest coordinate of a triangle: eight times the rounding of float32."""
+# a needle whose tip would move farther when it is enlarged is replaced by a rectangle
 _MAX_SHIFT_M = 1.0
-"""A needle whose tip would move farther when it is enlarged is replaced by a rectangle."""
+# shapes are left out of the tree only if they are farther away than any triangle is enlarged by
 _CLEARANCE_M = 2.0
-"""Shapes are left out of the tree only if they are farther away than any triangle is enlarged by."""
+# triangles that are longer, and whose box has more than this multiple of their area, are split in the tree
 _LONG_M, _MAX_BOX_RATIO = 10.0, 6.0
-"""Triangles that are longer, and whose box has more than this multiple of their area, are split in the tree."""
+# triangles that are thinner are not split: their pieces would have no plane
 _THIN_M = 1e-3
-"""Triangles that are thinner are not split: their pieces would have no plane."""
+# sine of the angle between two planes above which the rim of one extends far enough out of the other
 _STEEP_SINE = 0.25
-"""Sine of the angle between two planes above which the rim of one extends far enough out of the other."""
+# more than the tolerances of the kernels and the rounding of float64 need
 _PADDING_M = 1e-5
-"""More than the tolerances of the kernels and the rounding of float64 need."""
 
 _ANGLES_DEG = np.arange(64) * (360 / 64)
 _CIRCLE = np.column_stack([cosdg(_ANGLES_DEG), sindg(_ANGLES_DEG), np.zeros(64)])
+# normals of planes that may separate shapes
 _NORMALS = np.concatenate([np.roll(_CIRCLE, axis, axis=1) for axis in range(3)])
-"""Normals of planes that may separate shapes."""
 
 
 @dataclass(frozen=True)

@@ -32,11 +32,11 @@ from egvs.world.geolocation import network_world_frame
 from egvs.world.map_features import TRUNK_RADIUS_M, SolidType, SolidTypes, is_underground, vertical_extent
 
 _INNER = "inner"
+# polyconvert's colour of courtyards, which have another type with --osm.keep-full-type
 _WHITE = ("white", "255,255,255")
-"""polyconvert's colour of courtyards, which have another type with --osm.keep-full-type."""
 _NO_TYPE = "(none)"
+# types, and shapes, that a warning names
 _MAX_LISTED = 12
-"""Types, and shapes, that a warning names."""
 _HINT = "Make the file with polyconvert and the scenario's network (-n)."
 
 Points = list[tuple[float, float]]
