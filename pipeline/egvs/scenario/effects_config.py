@@ -40,9 +40,7 @@ class RangeLimitParameters(EffectParameters):
     incidence_deg: float = Field(0.0, ge=0, lt=90, description="Angle between the beam and the normal of the target")
     softness: float = Field(0.3, ge=0, description="Standard deviation of the logarithm of the received power")
     rated_range_m: float | None = Field(None, gt=0, description="Rated range, instead of each sensor's")
-    rated_reflectivity: float | None = Field(
-        None, gt=0, description="Reflectivity at the rated range, instead of each sensor's"
-    )
+    rated_reflectivity: float | None = Field(None, gt=0, description="Reflectivity there, instead of each sensor's")
 
 
 class RainParameters(EffectParameters):

@@ -8,6 +8,7 @@ accepted as tuples, as in JSON.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -22,6 +23,11 @@ class StrictModel(BaseModel):
     def from_dict(cls, values: dict[str, Any]) -> Self:
         """Return the table with values as TOML gives them; pydantic's ValidationError when some are invalid."""
         return cls.model_validate_json(json.dumps(values, default=str), strict=True)
+
+
+def find_duplicates(names: Sequence[Any]) -> list[Any]:
+    """Return the names that occur more than once, sorted."""
+    return sorted({name for name in names if names.count(name) > 1})
 
 
 MAX_COORDINATE_M = 1e8

@@ -12,9 +12,8 @@ import difflib
 import json
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
@@ -35,8 +34,7 @@ _EXPECTATION = re.compile(r"[A-Z]\w+ should (?:be|have) (?P<what>.+?)(?: after v
 _TOML_TERMS = {"an object": "a table", "a valid array": "a list"}
 
 
-@dataclass
-class _KeyProblem:
+class _KeyProblem(NamedTuple):
     """What is wrong with a key.
 
     Attributes
@@ -44,23 +42,17 @@ class _KeyProblem:
     key
         The key with its tables, e.g. ``"roi.voxel_m"``.
     problem
-        What is wrong; the value, where ``expected`` says the rest.
+        What is wrong; only the value where ``expected`` is set.
     hint
         What to do about it.
     expected
-        What the value should be; several alternatives where it may have several types.
+        What the value should be.
     """
 
     key: str
     problem: str
     hint: str = ""
-    expected: list[str] = field(default_factory=list)
-
-    @property
-    def message(self) -> str:
-        if not self.expected:
-            return self.problem
-        return f"expected {' or '.join(self.expected)}, got {self.problem}"
+    expected: str = ""
 
 
 def format_validation_error(error: ValidationError, where: str, model: type[BaseModel] = Scenario) -> InputError:
@@ -77,18 +69,21 @@ def format_validation_error(error: ValidationError, where: str, model: type[Base
     """
     problems = _merge_alternatives(_key_problems(error, model, ()))
     first = f"{where}: {problems[0].key}"
-    lines = [format_problem(f"{where}: {problem.key}", problem.message, problem.hint) for problem in problems]
+    lines = [format_problem(f"{where}: {problem.key}", problem.problem, problem.hint) for problem in problems]
     return InputError(first, "\n".join(lines).removeprefix(f"{first}: "))
 
 
 def _merge_alternatives(problems: Iterable[_KeyProblem]) -> list[_KeyProblem]:
     """Merge the problems that pydantic reports for each type that a value may have: "a valid number or 'auto'"."""
-    merged: dict[tuple[str, str], _KeyProblem] = {}
+    alternatives: dict[_KeyProblem, dict[str, None]] = {}
     for problem in problems:
-        key = _ALTERNATIVE.sub("", problem.key)
-        first = merged.setdefault((key, problem.problem), replace(problem, key=key, expected=[]))
-        first.expected += [text for text in problem.expected if text not in first.expected]
-    return list(merged.values())
+        merged = problem._replace(key=_ALTERNATIVE.sub("", problem.key), expected="")
+        alternatives.setdefault(merged, {})[problem.expected] = None
+    return [problem._replace(problem=_describe(problem, list(expected))) for problem, expected in alternatives.items()]
+
+
+def _describe(problem: _KeyProblem, expected: list[str]) -> str:
+    return f"expected {' or '.join(expected)}, got {problem.problem}" if any(expected) else problem.problem
 
 
 def _key_problems(error: ValidationError, model: type[BaseModel], parents: tuple[str, ...]) -> Iterator[_KeyProblem]:
@@ -105,7 +100,7 @@ def _key_problems(error: ValidationError, model: type[BaseModel], parents: tuple
             case "missing":
                 yield _KeyProblem(key, "this key is required")
             case "string_pattern_mismatch":
-                yield _KeyProblem(key, value, NAME_DESCRIPTION, ["a name"])
+                yield _KeyProblem(key, value, NAME_DESCRIPTION, "a name")
             case "value_error":
                 yield _KeyProblem(key or "scenario", str(context["error"]))
             case "unknown_effect":
@@ -124,7 +119,7 @@ def _wrong_value(key: str, value: str, message: str) -> _KeyProblem:
     expected = expectation["what"]
     if expected.startswith(("greater ", "less ")):
         expected = f"a value {expected}"
-    return _KeyProblem(key, value, expected=[_TOML_TERMS.get(expected, expected)])
+    return _KeyProblem(key, value, expected=_TOML_TERMS.get(expected, expected))
 
 
 def _suggest_key(location: Sequence[str | int], top: type[BaseModel]) -> str:

@@ -46,9 +46,7 @@ class CrsConfig(StrictModel):
         return self
 
 
-BodyKind = Literal[
-    "sedan", "kei", "taxi", "van", "truck", "bus", "tractor", "trailer", "pedestrian", "bicycle"
-]  # fmt: skip
+BodyKind = Literal["sedan", "kei", "taxi", "van", "truck", "bus", "tractor", "trailer", "pedestrian", "bicycle"]
 """Kinds of bodies in simulated point clouds."""
 
 

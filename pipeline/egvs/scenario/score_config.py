@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from egvs.scenario.fields import Name, NotNegative, Point2, Positive, StrictModel
+from egvs.scenario.fields import Name, NotNegative, Point2, Positive, StrictModel, find_duplicates
 
 VehicleClass = Literal[
     "pedestrian", "wheelchair", "bicycle", "scooter", "moped", "motorcycle", "passenger", "private", "hov", "taxi",
@@ -63,11 +62,6 @@ Corners = Annotated[tuple[Point2, ...], Field(min_length=3), AfterValidator(_che
 """Corners of a polygon in the world frame, in order."""
 
 
-def _first_duplicate(names: Sequence[str]) -> str | None:
-    """Return the first name, in alphabetical order, that occurs twice."""
-    return min((name for name in names if names.count(name) > 1), default=None)
-
-
 class ZoneConfig(StrictModel):
     """A part of the region in which vehicles have another weight."""
 
@@ -83,9 +77,7 @@ class WeightsConfig(StrictModel):
         description="Weight of each SUMO vClass. By default 1; pedestrians and bicycles of [effects] only count if "
         "they have a weight here, e.g. pedestrian = 2",
     )
-    zones: dict[Name, ZoneConfig] = Field(
-        default_factory=dict, description="Parts of the region with other weights, by name"
-    )
+    zones: dict[Name, ZoneConfig] = Field(default_factory=dict, description="Parts of the region with other weights")
 
     @property
     def are_given(self) -> bool:
@@ -128,9 +120,9 @@ class ScoreConfig(StrictModel):
     @field_validator("others")
     @classmethod
     def _check_duplicates(cls, others: tuple[OtherScore, ...]) -> tuple[OtherScore, ...]:
-        duplicate = _first_duplicate(others)
-        if duplicate is not None:
-            raise ValueError(f"{duplicate} is listed twice")
+        duplicates = find_duplicates(others)
+        if duplicates:
+            raise ValueError(f"{duplicates[0]} is listed twice")
         return others
 
     @property
@@ -225,9 +217,9 @@ class PlacementConfig(StrictModel):
     @model_validator(mode="after")
     def _check_names(self) -> PlacementConfig:
         for key in ("forced", "excluded", "periods"):
-            duplicate = _first_duplicate(getattr(self, key))
-            if duplicate is not None:
-                raise ValueError(f"{key} lists {duplicate} twice")
+            duplicates = find_duplicates(getattr(self, key))
+            if duplicates:
+                raise ValueError(f"{key} lists {duplicates[0]} twice")
         for name in self.forced:
             if name in self.excluded:
                 raise ValueError(f"{name} is both forced and excluded")

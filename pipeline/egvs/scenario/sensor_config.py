@@ -45,10 +45,8 @@ class BeamPatternConfig(StrictModel):
             low, high = getattr(self, key)
             if not low < high:
                 raise ValueError(f"{key} = [{low:g}, {high:g}] is not ascending")
-        if self.kind == "rosette" and self.turns is None:
-            raise ValueError("a rosette needs turns")
-        if self.kind == "even" and self.turns is not None:
-            raise ValueError("turns has no effect without a rosette")
+        if (self.kind == "rosette") != (self.turns is not None):
+            raise ValueError("turns must be set for a rosette, and only for a rosette")
         return self
 
 
@@ -58,9 +56,7 @@ class SensorConfig(StrictModel):
     elevations_deg: tuple[Elevation, ...] = Field(
         (), description="Elevation of each ring; or the first and the last of `channels` uniform ones"
     )
-    channels: int | None = Field(
-        None, ge=1, le=MAX_RINGS, description="Number of rings, uniform between two elevations_deg"
-    )
+    channels: int | None = Field(None, ge=1, le=MAX_RINGS, description="Number of rings between two elevations_deg")
     azimuth_offsets_deg: tuple[Azimuth, ...] = Field((), description="Azimuth offset of each ring. By default 0")
     azimuth_step_deg: Positive | None = Field(
         None, description="Azimuth between neighbouring beams of a ring; divides 360 or the width of azimuth_deg"

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from egvs.scenario.fields import Name, Positive, StrictModel
+from egvs.scenario.fields import Name, Positive, StrictModel, find_duplicates
 
 _ATTRIBUTE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9]*")
 """Names of attributes of a vType, which are written into XML unchanged."""
@@ -193,12 +193,6 @@ def keys_without_effect(source: str) -> frozenset[str]:
     return unused | demand | ({"routes"} if source == "sumocfg" else set())
 
 
-def _duplicates(names: Iterable[Any]) -> list[Any]:
-    """Return the names that occur more than once, sorted."""
-    names = list(names)
-    return sorted({name for name in names if names.count(name) > 1})
-
-
 class TrafficConfig(StrictModel):
     """Where vehicles come from: a network (with random or given demand), a SUMO configuration, or a finished FCD
     file.
@@ -288,7 +282,7 @@ class TrafficConfig(StrictModel):
     @model_validator(mode="after")
     def _check_periods(self) -> TrafficConfig:
         # names become folders, and some file systems ignore case
-        duplicates = _duplicates(period.name.casefold() for period in self.periods)
+        duplicates = find_duplicates([period.name.casefold() for period in self.periods])
         if duplicates:
             raise ValueError(f"two periods have the same name: {', '.join(duplicates)}")
         for period in self.periods:
@@ -301,14 +295,14 @@ class TrafficConfig(StrictModel):
         if len(sources) != 1:
             actual = " and ".join(sources) or "none"
             raise ValueError(f"expected exactly one of network, sumocfg and fcd, got {actual}")
-        duplicates = _duplicates(kind.name for kind in self.kinds)
+        duplicates = find_duplicates([kind.name for kind in self.kinds])
         if duplicates:
             raise ValueError(f"two kinds have the same name: {', '.join(duplicates)}")
         return self
 
     @model_validator(mode="after")
     def _check_counts(self) -> TrafficConfig:
-        duplicates = _duplicates((count.title, count.kind) for count in self.counts)
+        duplicates = find_duplicates([(count.title, count.kind) for count in self.counts])
         if duplicates:
             names = ", ".join(f"{title} ({kind})" if kind else title for title, kind in duplicates)
             raise ValueError(f"counts: expected one count for each location and kind, got two for {names}")
