@@ -59,7 +59,7 @@ def _work(name: str) -> tuple[dict[str, Callable[[], Any]], int, int]:
         hits = ray_triangle.Hits(*filled, *ends)
         settled = (tree.nearest(o, beam, directions), caster._owner, mesh, rays, hits, doubtful)
         some = doubtful[: ray_triangle.resolve_hits(*settled)]
-        searched = (some, mesh, ray_triangle.BoxTree(caster._boxes, caster._starts), rays, hits)
+        searched = (some, mesh, ray_triangle.BoxTree(caster._boxes, caster._level_starts), rays, hits)
         jobs.append(
             (
                 (site.pose.position_m, directions, sensor.range_m),

@@ -80,7 +80,7 @@ def scored(scenario: Scenario, out: Path, parameters: dict[str, Any] | None) -> 
     beforehand."""
     others = scenario.effects.without("moving_occlusion").model_dump()
     wanted = others if parameters is None else {**others, "moving_occlusion": parameters}
-    work = open_folder(scenario.with_effects(EffectsConfig.of(wanted)), out)
+    work = open_folder(scenario.with_effects(EffectsConfig.from_dict(wanted)), out)
     tpog, trajectories, found = read_tpog(out / "tpog.parquet"), out / "trajectories.parquet", list(empty_scans(work))
     scorer = Scorer(get_scene(work), tpog, trajectories)
     scorer.score(found[0].beams)

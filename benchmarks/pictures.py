@@ -84,7 +84,7 @@ def before_and_after(name: str, folder: Path) -> Iterator[tuple[str, str]]:
     found = []
     for word, named in (("before", {}), ("after", {name: own})):
         scenario, out = (
-            base.with_effects(EffectsConfig.of(named)),
+            base.with_effects(EffectsConfig.from_dict(named)),
             folder / where / (word if named else "plain") / (name if named else ""),
         )
         run.run(scenario, out)

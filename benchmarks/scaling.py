@@ -146,7 +146,7 @@ def _city(buildings: int, long: float, wide: float) -> str:
                 {"type": "Feature", "geometry": {"type": "Polygon", "coordinates": [corners]}, "properties": about}
             )
         ring += 1
-    return json.dumps({"type": "FeatureCollection", "features": features})
+    return json.dumps({"type": "FeatureCollection", "crs": None, "features": features})
 
 
 def _traffic(size: Size, long: float, wide: float, path: Path) -> None:

@@ -78,9 +78,10 @@ def feature(geometry: dict, **properties: object) -> dict:
     return {"type": "Feature", "geometry": geometry, "properties": properties}
 
 
-def collection(*features: dict) -> str:
-    """A GeoJSON FeatureCollection as text."""
-    return json.dumps({"type": "FeatureCollection", "features": list(features)})
+def collection(*features: dict, crs: str | None = None) -> str:
+    """A GeoJSON FeatureCollection as text, in a named system, or in world-frame metres."""
+    named = None if crs is None else {"type": "name", "properties": {"name": crs}}
+    return json.dumps({"type": "FeatureCollection", "crs": named, "features": list(features)})
 
 
 def fcd() -> str:

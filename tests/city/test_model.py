@@ -68,11 +68,14 @@ def test_rejects_wrong_row(tmp_path: Path, rows: list[str], message: str) -> Non
 @pytest.mark.parametrize(
     ("toml", "message"),
     [
-        ("seed = -1\n[traffic]\nnetwork = 'n'\n", "city.toml: seed: -1; input should be greater than or equal to 0"),
-        ("sed = 1\n[traffic]\nnetwork = 'n'\n", "city.toml: sed: unknown key; did you mean seed?"),
-        ("seed = 1\n", "city.toml: traffic: missing; this key is needed"),
-        ("[traffic]\nfcd = 'a'\nnetwork = 'n'\n", "exactly one of network, sumocfg and fcd is needed"),
-        ("[traffic]\nfcd = 'a'\nvehicles = 3\n", "city.toml: traffic: vehicles would act on nothing beside fcd"),
+        (
+            "seed = -1\n[traffic]\nnetwork = 'n'\n",
+            "city.toml: seed: expected a value greater than or equal to 0, got -1",
+        ),
+        ("sed = 1\n[traffic]\nnetwork = 'n'\n", "city.toml: sed: unknown key. Did you mean seed?"),
+        ("seed = 1\n", "city.toml: traffic: this key is required"),
+        ("[traffic]\nfcd = 'a'\nnetwork = 'n'\n", "exactly one of network, sumocfg and fcd"),
+        ("[traffic]\nfcd = 'a'\nvehicles = 3\n", "city.toml: traffic: vehicles has no effect with fcd"),
         ("[traffic\n", "city.toml: is not valid TOML"),
     ],
 )

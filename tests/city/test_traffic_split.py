@@ -177,7 +177,7 @@ def test_files_are_fcd_as_sumo_writes_it(city: City) -> None:
         ("junctions/west/scenario.toml", "../../traffic/west.parquet", "mine.parquet",
          'fcd = "../../traffic/west.parquet"'),
         ("junctions/west/scenario.toml", "frame_period_s = 0.5", "periods = 3",
-         "scenario.toml: traffic.periods: 3; input should be a valid array"),
+         "scenario.toml: traffic.periods: expected a list, got 3"),
         ("junctions/west/scenario.toml", "frame_period_s = 0.5", "frame_period_s = 0.75",
          "traffic.frame_period_s: expected a multiple of 0.5 s"),
         ("junctions/east/scenario.toml", "gamma = 4", "gamma = -4", "score.gamma"),

@@ -93,10 +93,10 @@ def test_an_interrupt_while_loading_is_no_fault_of_the_plug_in(site: Path) -> No
 @pytest.mark.parametrize(
     ("group", "entry", "lacks"),
     [
-        ("egvs.effects", "collections:OrderedDict", "NAME, SOURCE, STAGE, KIND, Model.of; expected a subclass"),
-        ("egvs.effects", "plug_a:TABLE", "NAME, SOURCE, STAGE, KIND, Model.of; expected a subclass"),
-        ("egvs.effects", "plug_a", "NAME, SOURCE, STAGE, KIND, Model.of; expected a subclass"),
-        ("egvs.effects", "egvs.effects.base:Detect", "NAME, SOURCE, Model.of; expected a subclass"),
+        ("egvs.effects", "collections:OrderedDict", "NAME, SOURCE, STAGE, KIND, Model.from_dict; expected a subclass"),
+        ("egvs.effects", "plug_a:TABLE", "NAME, SOURCE, STAGE, KIND, Model.from_dict; expected a subclass"),
+        ("egvs.effects", "plug_a", "NAME, SOURCE, STAGE, KIND, Model.from_dict; expected a subclass"),
+        ("egvs.effects", "egvs.effects.base:Detect", "NAME, SOURCE, Model.from_dict; expected a subclass"),
         ("egvs.point_clouds", "plug_a", "read; expected a module or an object with a function read"),
     ],
 )

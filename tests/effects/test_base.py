@@ -179,25 +179,52 @@ def test_detect_effects_name_their_source(name: str) -> None:
 
 # Bad parameters
 BAD_DETECT = {
-    "negative rain": ("rain.rate_mm_h=-1", "effects.rain.rate_mm_h: -1; input should be greater than or equal to 0"),
-    "too much rain": ("rain.rate_mm_h=301", "effects.rain.rate_mm_h: 301"),
-    "rain that is no number": ("rain.rate_mm_h=nan", "effects.rain.rate_mm_h: nan"),
-    "rain in words": ("rain.rate_mm_h=heavy", "effects.rain.rate_mm_h: 'heavy'"),
-    "no rain rate": ("rain.law=france", "effects.rain.rate_mm_h: missing; this key is needed"),
-    "unknown law": ("rain={rate_mm_h = 1, law = 'spain'}", "effects.rain.law: 'spain'"),
-    "unknown key": ("rain={rate_mm_h = 1, rate = 2}", "effects.rain.rate: unknown key; did you mean rate_mm_h?"),
-    "unknown effect": ("fogg.visibility_m=100", "effects.fogg: unknown effect; did you mean fog?"),
-    "no visibility": ("fog.model=kim", "effects.fog.visibility_m: missing"),
-    "visibility of 0": ("fog.visibility_m=0", "effects.fog.visibility_m: 0"),
-    "infinite visibility": ("fog.visibility_m=inf", "effects.fog.visibility_m: inf"),
-    "contrast of 1": ("fog={visibility_m = 9, contrast = 1}", "effects.fog.contrast: 1"),
-    "unknown model": ("fog={visibility_m = 9, model = 'kimm'}", "effects.fog.model: 'kimm'"),
-    "no share": ("dropout={}", "effects.dropout.share: missing"),
-    "share above 1": ("dropout.share=1.1", "effects.dropout.share: 1.1"),
-    "reflectivity of 0": ("range_limit.reflectivity=0", "effects.range_limit.reflectivity: 0"),
-    "grazing incidence": ("range_limit.incidence_deg=90", "effects.range_limit.incidence_deg: 90"),
-    "negative softness": ("range_limit.softness=-0.1", "effects.range_limit.softness: -0.1"),
-    "rated at 0 m": ("range_limit.rated_range_m=0", "effects.range_limit.rated_range_m: 0"),
+    "negative rain": (
+        "rain.rate_mm_h=-1",
+        "effects.rain.rate_mm_h: expected a value greater than or equal to 0, got -1",
+    ),
+    "too much rain": (
+        "rain.rate_mm_h=301",
+        "effects.rain.rate_mm_h: expected a value less than or equal to 300, got 301",
+    ),
+    "rain that is no number": ("rain.rate_mm_h=nan", "effects.rain.rate_mm_h: expected a finite number, got nan"),
+    "rain in words": ("rain.rate_mm_h=heavy", "effects.rain.rate_mm_h: expected a valid number, got 'heavy'"),
+    "no rain rate": ("rain.law=france", "effects.rain.rate_mm_h: this key is required"),
+    "unknown law": (
+        "rain={rate_mm_h = 1, law = 'spain'}",
+        "effects.rain.law: expected 'japan', 'france', 'itu2025' or 'goodin', got 'spain'",
+    ),
+    "unknown key": ("rain={rate_mm_h = 1, rate = 2}", "effects.rain.rate: unknown key. Did you mean rate_mm_h?"),
+    "unknown effect": ("fogg.visibility_m=100", "effects.fogg: unknown effect. Did you mean fog?"),
+    "no visibility": ("fog.model=kim", "effects.fog.visibility_m: this key is required"),
+    "visibility of 0": ("fog.visibility_m=0", "effects.fog.visibility_m: expected a value greater than 0, got 0"),
+    "infinite visibility": ("fog.visibility_m=inf", "effects.fog.visibility_m: expected a finite number, got inf"),
+    "contrast of 1": (
+        "fog={visibility_m = 9, contrast = 1}",
+        "effects.fog.contrast: expected a value less than 1, got 1",
+    ),
+    "unknown model": (
+        "fog={visibility_m = 9, model = 'kimm'}",
+        "effects.fog.model: expected 'kim' or 'kruse', got 'kimm'",
+    ),
+    "no share": ("dropout={}", "effects.dropout.share: this key is required"),
+    "share above 1": ("dropout.share=1.1", "effects.dropout.share: expected a value less than or equal to 1, got 1.1"),
+    "reflectivity of 0": (
+        "range_limit.reflectivity=0",
+        "effects.range_limit.reflectivity: expected a value greater than 0, got 0",
+    ),
+    "grazing incidence": (
+        "range_limit.incidence_deg=90",
+        "effects.range_limit.incidence_deg: expected a value less than 90, got 90",
+    ),
+    "negative softness": (
+        "range_limit.softness=-0.1",
+        "effects.range_limit.softness: expected a value greater than or equal to 0, got -0.1",
+    ),
+    "rated at 0 m": (
+        "range_limit.rated_range_m=0",
+        "effects.range_limit.rated_range_m: expected a value greater than 0, got 0",
+    ),
 }
 
 
@@ -428,10 +455,10 @@ BAD_SCAN = {
     f"{DIVERGENCE}5": "effects.divergence.sub_beams: 5",
     "effects.divergence.divergence_mrad=[-1, 2]": "effects.divergence.divergence_mrad.0: -1",
     "effects.divergence.divergence_mrad=[1]": "effects.divergence.divergence_mrad",
-    "effects.divergence.subbeams=7": "did you mean sub_beams",
+    "effects.divergence.subbeams=7": "Did you mean sub_beams",
     f"{SWAY}-1": "effects.mount_sway.tilt_deg: -1",
     f"{SWAY}nan": "effects.mount_sway.tilt_deg",
-    "effects.mount_sway.samples=9": "effects.mount_sway.tilt_deg: missing",
+    "effects.mount_sway.samples=9": "effects.mount_sway.tilt_deg: this key is required",
     "effects.mount_sway={tilt_deg = 1, samples = 5}": "effects.mount_sway.samples: 5",
     f"{FOLIAGE}-0.1": "effects.foliage.leaf_area_density: -0.1",
     f"{FOLIAGE}inf": "effects.foliage.leaf_area_density",
@@ -545,7 +572,7 @@ BAD_TRAFFIC = {
         "effects.articulated.kinds.car={parts_m=[2,2],hinges_m=[2,3]}",
         r"hinges_m has 2 values for 2 parts, 1",
     ),
-    "a wrong word": ("effects.articulated.kind=1", r"articulated\.kind: unknown key; did you mean kinds\?"),
+    "a wrong word": ("effects.articulated.kind=1", r"articulated\.kind: unknown key. Did you mean kinds\?"),
     "people beside a finished file": (
         "effects.pedestrians_bicycles.bicycles_per_h=9",
         r"cannot be added to a finished FCD file",

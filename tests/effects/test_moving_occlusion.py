@@ -104,7 +104,7 @@ def reference_blocked(
 def occlusion(out: Path, **parameters: Any) -> moving_occlusion.MovingOcclusion:
     """The effect, prepared from a finished run."""
     tpog = egvs.read_tpog(out / "tpog.parquet")
-    made = moving_occlusion.MovingOcclusion(MovingOcclusionParameters.of(parameters))
+    made = moving_occlusion.MovingOcclusion(MovingOcclusionParameters.from_dict(parameters))
     return made.prepare(None, tpog, out / "trajectories.parquet")  # type: ignore[arg-type]
 
 
@@ -562,15 +562,15 @@ def test_frames_all_and_zero_are_the_same_setting(mini: Path, tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        (["method=sometimes"], "moving_occlusion.method: 'sometimes'; input should be 'frames' or 'independent'"),
-        (["frames=-1"], "moving_occlusion.frames: -1; input should be greater than or equal to 0"),
-        (["frames=2.5"], "moving_occlusion.frames: 2.5; input should be a valid integer"),
-        (["frames=true"], "moving_occlusion.frames: True; input should be a valid integer"),
-        (["frames=most"], "moving_occlusion.frames: 'most'; input should be a valid integer"),
-        (["frame=7"], "moving_occlusion.frame: unknown key; did you mean frames?"),
+        (["method=sometimes"], "moving_occlusion.method: expected 'frames' or 'independent', got 'sometimes'"),
+        (["frames=-1"], "moving_occlusion.frames: expected a value greater than or equal to 0, got -1"),
+        (["frames=2.5"], "moving_occlusion.frames: expected a valid integer, got 2.5"),
+        (["frames=true"], "moving_occlusion.frames: expected a valid integer, got True"),
+        (["frames=most"], "moving_occlusion.frames: expected a valid integer, got 'most'"),
+        (["frame=7"], "moving_occlusion.frame: unknown key. Did you mean frames?"),
         (
             ["method=independent", "frames=7"],
-            'moving_occlusion.frames: 7; acts on nothing with method = "independent"',
+            'moving_occlusion.frames: 7: has no effect with method = "independent"',
         ),
     ],
 )

@@ -91,9 +91,9 @@ def test_changed_plugin_source_runs_the_score_stage_again(mini, package, tmp_pat
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("effects.half.shares=0.25", "effects.half.shares: unknown key; did you mean share?"),
-        ('effects.half.share="much"', "effects.half.share: 'much'; input should be a valid number"),
-        ("effects.halve.share=0.25", "effects.halve: unknown effect; did you mean half?"),
+        ("effects.half.shares=0.25", "effects.half.shares: unknown key. Did you mean share?"),
+        ('effects.half.share="much"', "effects.half.share: expected a valid number, got 'much'"),
+        ("effects.halve.share=0.25", "effects.halve: unknown effect. Did you mean half?"),
     ],
 )
 def test_rejects_bad_parameters_of_plugin_effect(mini, package, tmp_path, setting, message):
@@ -129,7 +129,7 @@ class Thing:
         (NO_EFFECT + "Half = Thing", "expected a subclass of Expand, .* of egvs.effects.base"),
         (NO_EFFECT + "Half = Thing()", "expected a subclass of Expand"),
         (
-            EFFECT + '    NAME = "zz"\n    Model = type("M", (), {"of": 1})',
+            EFFECT + '    NAME = "zz"\n    Model = type("M", (), {"from_dict": 1})',
             ".*EffectParameters as its Model, got <class ",
         ),
     ],

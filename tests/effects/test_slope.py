@@ -118,7 +118,7 @@ def test_footprints_are_on_the_hill_and_sites_below_it_rejected(hill_road, tmp_p
         },
         {"type": "Feature", "geometry": pole, "properties": {"name": "p", "height_m": 5, "base_m": 2, "radius_m": 0.1}},
     ]
-    (tmp_path / "s.geojson").write_text(f'{{"features": {features}}}'.replace("'", '"'))
+    (tmp_path / "s.geojson").write_text(f'{{"crs": null, "features": {features}}}'.replace("'", '"'))
     values = road_scenario(tmp_path, **SMALL).model_dump(mode="json") | {"statics": {"footprints": ["s.geojson"]}}
     scene = scenario_from_dict(values, tmp_path, "place")
     result = run_stage(statics, scene, tmp_path / "out")

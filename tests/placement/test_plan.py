@@ -235,7 +235,7 @@ REJECTED = {
     ),
     "forced and excluded": (
         ["--count", "2", "--set", "placement.forced=['a']", "--set", "placement.excluded=['a']"],
-        "a is forced and excluded: it can be one of them",
+        "a is both forced and excluded",
     ),
     "no such candidate": (
         ["--count", "2", "--set", "placement.forced=['nobody']"],

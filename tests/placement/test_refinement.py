@@ -365,10 +365,10 @@ def test_rejects_polygon_without_candidate_before_running(mini: Path, run_egvs) 
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("heights_m=[5, 3]", "5 to 3: the lower end comes first"),
+        ("heights_m=[5, 3]", "expected the lower limit first, got 5 and 3"),
         ("pitch_deg=[-100, 0]", "greater than or equal to -90"),
         ("evaluations=5", "greater than or equal to 20"),
-        ("within_m=[[[0, 0], [1, 1], [2, 2]]]", "no polygon that encloses an area"),
+        ("within_m=[[[0, 0], [1, 1], [2, 2]]]", "expected a polygon that encloses an area"),
         ("radius_m=-1", "greater than or equal to 0"),
     ],
 )

@@ -172,7 +172,7 @@ def test_shows_the_record_of_the_run(plain_run):
 def test_lists_effects_that_are_modelled_and_those_that_are_not(plain_run):
     scenario, out, text = plain_run
     assert "Effects none" in PageReader(text).text and "fog" in text
-    foggy = scenario.with_effects(EffectsConfig.of({"fog": {"visibility_m": 100}, "moving_occlusion": {}}))
+    foggy = scenario.with_effects(EffectsConfig.from_dict({"fog": {"visibility_m": 100}, "moving_occlusion": {}}))
     ranking, tpog = Ranking.read(out / "scores.parquet"), read_tpog(out / "tpog.parquet")
     html = page.render_page(PageContents(foggy, ranking, tpog, Figures("", "", None, EMPTY_BACKDROP), {}))
     assert "This run models these effects: fog, moving occlusion. It does not model rain, " in PageReader(html).text

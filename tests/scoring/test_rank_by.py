@@ -198,9 +198,9 @@ def test_additional_scores_are_unique() -> None:
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("score.rank_by=detections", "score.rank_by: 'detections'; input should be 'egvs'"),
-        ('score.others=["egvs"]', "score.others.0: 'egvs'; input should be 'expected_detections'"),
-        ('score.others=["seen_well","seen_well"]', "seen_well stands there twice"),
+        ("score.rank_by=detections", "score.rank_by: expected 'egvs'"),
+        ('score.others=["egvs"]', "score.others.0: expected 'expected_detections'"),
+        ('score.others=["seen_well","seen_well"]', "seen_well is listed twice"),
     ],
 )
 def test_rejects_unknown_scores(mini: Path, tmp_path: Path, run_egvs, override: str, message: str) -> None:  # type: ignore[no-untyped-def]

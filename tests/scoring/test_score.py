@@ -140,6 +140,7 @@ def test_static_voxels_have_no_entropy(mini, tmp_path):
         json.dumps(
             {
                 "type": "FeatureCollection",
+                "crs": None,
                 "features": [{"type": "Feature", "geometry": geometry, "properties": {"height_m": 5}}],
             }
         )

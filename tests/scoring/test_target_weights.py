@@ -33,7 +33,7 @@ def record_of(people=()) -> TargetRecord:
 
 def test_a_vehicle_counts_by_its_kind_and_by_every_zone_that_holds_it() -> None:
     overlap = {"polygon_m": [[114.0, 200.0], [119.0, 200.0], [119.0, 220.0], [114.0, 220.0]], "weight": 5.0}
-    wanted = WeightsConfig.of({"kinds": {"bus": 3.0, "pedestrian": 2.0}, "zones": {
+    wanted = WeightsConfig.from_dict({"kinds": {"bus": 3.0, "pedestrian": 2.0}, "zones": {
         "crosswalk": {"polygon_m": SQUARE, "weight": 0.5}, "stop": overlap,
     }})  # fmt: skip
     record = record_of(weighted_people(wanted))
@@ -44,8 +44,8 @@ def test_a_vehicle_counts_by_its_kind_and_by_every_zone_that_holds_it() -> None:
 def test_people_are_to_be_seen_only_where_they_have_a_weight() -> None:
     assert len(record_of()) == 3
     assert not record_of().are_people.any()
-    assert weighted_people(WeightsConfig.of({"kinds": {"bus": 3.0}})) == frozenset()
-    assert len(record_of(weighted_people(WeightsConfig.of({"kinds": {"pedestrian": 0.0}})))) == 5
+    assert weighted_people(WeightsConfig.from_dict({"kinds": {"bus": 3.0}})) == frozenset()
+    assert len(record_of(weighted_people(WeightsConfig.from_dict({"kinds": {"pedestrian": 0.0}})))) == 5
     assert target_weights(WeightsConfig(), record_of()).tolist() == [1.0] * 3
     assert not len(target_weights(WeightsConfig(), TargetRecord.of([], GRID)))
 
@@ -150,12 +150,12 @@ def test_rejects_ranking_without_weighted_vehicles(mini: Path, tmp_path: Path, r
     ("override", "message"),
     [
         ("score.weights.kinds.buss=2", "score.weights.kinds.buss"),
-        ("score.weights.kinds.bus=-1", "score.weights.kinds.bus: -1; input should be greater than or equal to 0"),
+        ("score.weights.kinds.bus=-1", "score.weights.kinds.bus: expected a value greater than or equal to 0, got -1"),
         ("score.weights.zones.z={weight=1, polygon_m=[[0,0],[1,1]]}", "score.weights.zones.z.polygon_m"),
-        ("score.weights.zones.z={weight=1, polygon_m=[[0,0],[1,1],[1,0],[0,1]]}", "no polygon that encloses an area"),
-        ("score.weights.zones.z={weight=1, polygon_m=[[0,0],[1,1],[2,2]]}", "no polygon that encloses an area (Self"),
-        ("score.weights.zones.z={polygon_m=[[0,0],[1,1],[2,0]]}", "score.weights.zones.z.weight: missing"),
-        ("score.weights.zone={}", "did you mean zones?"),
+        ("score.weights.zones.z={weight=1, polygon_m=[[0,0],[1,1],[1,0],[0,1]]}", "expected a polygon"),
+        ("score.weights.zones.z={weight=1, polygon_m=[[0,0],[1,1],[2,2]]}", "encloses an area (Self"),
+        ("score.weights.zones.z={polygon_m=[[0,0],[1,1],[2,0]]}", "score.weights.zones.z.weight: this key is required"),
+        ("score.weights.zone={}", "Did you mean zones?"),
     ],
 )  # fmt: skip
 def test_rejects_wrong_weights(mini: Path, run_egvs, override: str, message: str) -> None:  # type: ignore[no-untyped-def]

@@ -261,7 +261,7 @@ TABLE = "elevation_deg,azimuth_deg,channel\n0,0,a\n-30,0,a\n0,90,b\n-45,350,b\n"
 
 
 def make_config(**keys: object) -> SensorConfig:
-    return SensorConfig.of({"range_m": 50, **keys})
+    return SensorConfig.from_dict({"range_m": 50, **keys})
 
 
 def sensor_with_window(first: float, last: float, step: float, *elevations: float) -> Sensor:

@@ -220,12 +220,13 @@ def test_run_from_geojson_has_the_scores_of_csv(mini: Path, tmp_path: Path) -> N
           for value in ([], ["b"], {}, True)),
         (collection(point(0, 0, 3, name="\ud800")), r"is not valid JSON: it is not valid text"),
         *((json.dumps({"crs": crs, "features": [point(0, 0, 3, name="a")]}),
-           r"sites\.geojson: crs: .*; .*or null$") for crs in (5, "EPSG:25832", {}, {"properties": {"name": 5}})),
+           r"sites\.geojson: crs: expected a named system or null, got ")
+          for crs in (5, "EPSG:25832", {}, {"properties": {"name": 5}})),
         (json.dumps({"crs": named("local"), "features": [point(0, 0, 3, name="a")]}),
-           r"sites\.geojson: crs: 'local' is none that is known; a coordinate reference system, for example"),
+           r"sites\.geojson: crs: unknown coordinate reference system 'local'"),
         *((json.dumps({"crs": named(crs), "features": [point(9, 51, 3, name="a")]}),
-           rf"sites\.geojson: is in {name}.*, and nothing says where the scenario's world frame lies on the Earth; "
-           r"\[crs\] with epsg .*scenario\.toml, or a network with a <location>")
+           rf"sites\.geojson: the file is in {name}.*, but the position of the world frame on the Earth is unknown.*"
+           r"under \[crs\] in .*scenario\.toml, or use a network with a <location>")
           for crs, name in (("EPSG:4326", "WGS 84"), ("urn:ogc:def:crs:OGC:1.3:CRS84", "WGS"), ("EPSG:2263", "NAD83"))),
         (
             collection(feature({"type": "LineString", "coordinates": [[0, 0, 3], [1, 1, 3]]}, name="a")),
@@ -242,7 +243,7 @@ def test_run_from_geojson_has_the_scores_of_csv(mini: Path, tmp_path: Path) -> N
         (collection(point(0, 0, 3, name="a", yaw_deg="north")), "feature 0: yaw_deg.*'north'"),
         (collection(point(0, 0, math.nan, name="a")), "feature 0: z_m.*nan"),
         (
-            json.dumps({"features": [feature({"type": "Point", "coordinates": ["x", 0, 3]}, name="a")]}),
+            json.dumps({"crs": None, "features": [feature({"type": "Point", "coordinates": ["x", 0, 3]}, name="a")]}),
             "feature 0: x_m.*'x'",
         ),
     ],

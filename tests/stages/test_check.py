@@ -424,7 +424,7 @@ def test_junction_with_invalid_walking_areas_drops_candidates() -> None:
 
 
 def test_file_keeps_all_sites(street: Path) -> None:
-    with pytest.raises(InputError, match="only_free acts on grid and along"):
+    with pytest.raises(InputError, match="only_free has no effect with file"):
         egvs.load(street, ["sites.only_free=false"])
 
 

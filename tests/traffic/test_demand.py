@@ -170,19 +170,16 @@ def test_isolated_location_is_a_route_by_itself(tmp_path):
             [{"from_edge": "A0top0", "to_edge": "left0A0", "per_hour": 5}],
             r"\(A0top0 to left0A0\): there is no way from 'A0top0' to 'left0A0'",
         ),
-        ([{"edge": "a", "to_edge": "b", "per_hour": 1}], r"either edge, or both from_edge and to_edge are needed"),
-        ([{"to_edge": "b", "per_hour": 1}], r"either edge, or both from_edge and to_edge are needed"),
+        ([{"edge": "a", "to_edge": "b", "per_hour": 1}], r"expected either edge, or both from_edge and to_edge"),
+        ([{"to_edge": "b", "per_hour": 1}], r"expected either edge, or both from_edge and to_edge"),
         ([{"from_edge": "b", "to_edge": "b", "per_hour": 1}], r"from_edge and to_edge are both 'b'"),
         ([{"edge": "a", "per_hour": -1}], r"per_hour"),
-        ([{"edge": "", "per_hour": 1}], r"counts\.0\.edge: ''; string should have at least 1 character"),
+        ([{"edge": "", "per_hour": 1}], r"counts\.0\.edge: expected at least 1 character, got ''"),
         (
             [{"edge": "a", "per_hour": 1}, {"edge": "a", "per_hour": 9}],
-            r"counts: given twice for a; one for each place",
+            r"counts: expected one count for each location and kind, got two for a",
         ),
-        (
-            [{"edge": "a", "per_hour": 0}],
-            r"counts: no vehicle was counted anywhere; at least one per_hour above 0",
-        ),
+        ([{"edge": "a", "per_hour": 0}], r"counts: expected at least one per_hour above 0"),
     ],
 )
 def test_rejects_wrong_count(cross, tmp_path, rows, message):

@@ -122,7 +122,7 @@ def test_rejects_warm_up_longer_than_the_file(mini: Path, tmp_path: Path, run_eg
 
 
 def test_default_length_of_a_simulation() -> None:
-    traffic = TrafficConfig.of({"network": "n.net.xml"})
+    traffic = TrafficConfig.from_dict({"network": "n.net.xml"})
     assert (traffic.frames, traffic.warmup_s) == (5000, 300.0)
 
 
@@ -196,7 +196,7 @@ def test_rejects_invalid_vtypes_file(mini: Path, tmp_path: Path, files: list[str
 
 
 def test_rejects_vtypes_without_finished_file(mini: Path) -> None:
-    with pytest.raises(InputError, match=r"vtypes.* would act on nothing beside network"):
+    with pytest.raises(InputError, match=r"vtypes.* have no effect with network"):
         egvs.load(mini, ["traffic.network=n.net.xml", 'traffic.vtypes=["x.xml"]'])
 
 
@@ -245,7 +245,7 @@ def test_roads_with_a_finished_file(mini: Path, tmp_path: Path, run_egvs) -> Non
     [
         (["traffic.roads='no.net.xml'"], "traffic.roads = 'no.net.xml': no such file"),
         (["traffic.roads='fcd.csv'"], "fcd.csv: is not well-formed XML"),
-        (["traffic.network='net.net.xml'", "traffic.roads='net.net.xml'"], "roads would act on nothing beside network"),
+        (["traffic.network='net.net.xml'", "traffic.roads='net.net.xml'"], "roads has no effect with network"),
     ],
 )
 def test_rejects_wrong_roads(mini: Path, tmp_path: Path, run_egvs, settings: list[str], message: str) -> None:

@@ -214,8 +214,8 @@ def test_user_demand_is_limited_on_request(crowded_folder):
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ('routes = ["r.xml"]\nvehicles_per_lane_km = 3', r"vehicles_per_lane_km would act on nothing beside routes"),
-        ("vehicles = 5\nvehicles_per_lane_km = 3", r"vehicles_per_lane_km would act on nothing beside vehicles"),
+        ('routes = ["r.xml"]\nvehicles_per_lane_km = 3', r"vehicles_per_lane_km has no effect with routes"),
+        ("vehicles = 5\nvehicles_per_lane_km = 3", r"vehicles_per_lane_km has no effect with vehicles"),
     ],
 )
 def test_rejects_density_without_effect(tmp_path, keys, message):

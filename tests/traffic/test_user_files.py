@@ -247,7 +247,7 @@ def test_outputs_of_a_network_are_not_written(demand_folder, tmp_path):
 def test_rejects_markup_in_attribute_name_of_a_kind(demand_folder, tmp_path):
     foreign = tmp_path / "foreign.txt"
     attributes = {f'x="1"/><edgeData id="d" file="{foreign}" y': 1}
-    with pytest.raises(InputError, match=r"attributes.*is no attribute's name: letters and digits"):
+    with pytest.raises(InputError, match=r"attributes.*expected a name of letters and digits"):
         scenario(
             demand_folder, network="net.xml", kinds=[{**car().model_dump(), "attributes": attributes}], **THREE_FRAMES
         )

@@ -89,7 +89,7 @@ def build_scene(folder, *settings):
 def make_sensor(**keys):
     """A sensor from the keys of ``[sensors.own]``, without noise by default."""
     return sensor.resolve_sensor(
-        "own", {"own": SensorConfig.of({"range_sigma_m": 0.0, "range_m": 100.0, **keys})}, "test"
+        "own", {"own": SensorConfig.from_dict({"range_sigma_m": 0.0, "range_m": 100.0, **keys})}, "test"
     )
 
 

@@ -133,7 +133,7 @@ def test_rejects_unusable_mesh(mini, name, write, message):
 
 
 def test_rejects_unknown_kind(mini):
-    with pytest.raises(InputError, match=r"validation\.bodies\.lorry: 'lorry'; input should be 'sedan', 'kei'"):
+    with pytest.raises(InputError, match=r"validation\.bodies\.lorry: expected 'sedan', 'kei'"):
         load(mini, ['validation.bodies.lorry="own.ply"'])
 
 

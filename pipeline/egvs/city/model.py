@@ -124,7 +124,7 @@ def load_city(folder: str | Path) -> City:
     values = reading.read_toml(file)
     values.setdefault("name", default_name(file.parent) or "city")
     try:
-        model = CityModel.of(values)
+        model = CityModel.from_dict(values)
     except ValidationError as error:
         raise format_validation_error(error, str(file), CityModel) from None
     check_unused_keys(model.traffic, file)

@@ -22,7 +22,7 @@ PACKAGE_NAME = "egvs"
 
 _REQUIREMENTS = {
     "egvs.effects": (
-        ("NAME", "SOURCE", "STAGE", "KIND", "Model.of"),
+        ("NAME", "SOURCE", "STAGE", "KIND", "Model.from_dict"),
         "a subclass of Detect or another kind in egvs.effects.base, with NAME, SOURCE and Model",
     ),
     "egvs.detectors": (

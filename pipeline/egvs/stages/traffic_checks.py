@@ -130,7 +130,8 @@ def check_recorded_positions(inputs: CheckInputs) -> Iterator[Diagnostic]:
 def _check_recorded_position(scenario: Scenario, name: str) -> None:
     path = scenario.find(name, "traffic.fcd")
     if finished_fcd.read_fcd_metadata(path) is None:
-        fcd.check_coordinates(path, geolocation.scenario_georeference(scenario))
+        world = geolocation.scenario_georeference(scenario)
+        fcd.check_coordinates(path, world, scenario.traffic.fcd_geo)
 
 
 @_for_each_period

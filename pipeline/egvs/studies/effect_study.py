@@ -313,7 +313,7 @@ def _unnamed_effect_status(kind: type[Effect[Any]], scene: Scene, trials: Effect
 
     if untold := [key for key in registry.required_parameters(kind.NAME) if key not in kind.TRIAL]:
         return call("off", f"not named; it needs {', '.join(untold)}, which the scene does not tell")
-    effect = kind(kind.Model.of(kind.TRIAL))
+    effect = kind(kind.Model.from_dict(kind.TRIAL))
     if (idle := effect.why_idle(scene)) is not None:
         return call("off", f"not called for: {idle}")
     if (refusal := effect.refusal(scene)) is not None:

@@ -314,7 +314,7 @@ def _fits(scenario: Scenario, voxel_m: float) -> bool:
 
 def _accepts(name: str, parameters: dict[str, object]) -> bool:
     try:
-        registry.find_effect_class(name).Model.of(parameters)
+        registry.find_effect_class(name).Model.from_dict(parameters)
     except ValidationError:
         return False
     return True

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from egvs.core import limits, reading
 from egvs.core.errors import InputError
 from egvs.formats import xml
-from egvs.formats.georeference import CoordinateReading, Georeference
+from egvs.formats.georeference import WGS84, WORLD, CoordinateReading, Georeference, look_like_degrees
 from egvs.scenario.fields import MAX_COORDINATE_M
 
 _NUMBERS = ("x", "y", "z", "angle", "slope", "speed")
@@ -57,11 +57,13 @@ EXPECTED_FCD = (
     "Use FCD with the attributes id, x, y, angle and type (--fcd-output.attributes id,x,y,z,angle,slope,type,speed)."
 )
 
-_EXPECTED_COORDINATES = "Use metres of the world frame, or longitude and latitude (--fcd-output.geo)."
+_GEO_HINT = "Set traffic.fcd_geo = true for longitude and latitude (--fcd-output.geo); without it, x and y are metres."
 
 
-def georeference_rows(tables: Iterable[pa.Table], world: Georeference, path: Path) -> Generator[pa.Table, None, None]:
-    """Convert a user's file to the world frame; the first table tells whether it is in metres or degrees.
+def georeference_rows(
+    tables: Iterable[pa.Table], world: Georeference, path: Path, is_geo: bool
+) -> Generator[pa.Table, None, None]:
+    """Convert a user's file to the world frame.
 
     Parameters
     ----------
@@ -71,6 +73,8 @@ def georeference_rows(tables: Iterable[pa.Table], world: Georeference, path: Pat
         The world frame.
     path
         The file, for messages.
+    is_geo
+        Whether x and y are longitude and latitude in degrees; otherwise they are metres of the world frame.
 
     Yields
     ------
@@ -80,13 +84,15 @@ def georeference_rows(tables: Iterable[pa.Table], world: Georeference, path: Pat
     Raises
     ------
     InputError
-        When the coordinates are neither, or no vehicle is near the region of interest.
+        When no vehicle of the first table is near the region of interest, or its metres look like degrees.
     """
     coordinates: CoordinateReading | None = None
     for table in tables:
         xy = np.column_stack([table["x"].to_numpy(), table["y"].to_numpy()])
         if coordinates is None:
-            coordinates = world.read_coordinates(xy, str(path), None, _EXPECTED_COORDINATES)
+            if world.frame is None and not is_geo and look_like_degrees(xy):
+                raise world.unknown_frame_error(str(path), "x and y look like longitude and latitude", xy)
+            coordinates = world.read_coordinates(xy, str(path), WGS84 if is_geo else WORLD, _GEO_HINT)
         if coordinates.convert is not None:
             x_m, y_m = coordinates.to_world(xy).T
             for name, values in (("x", x_m), ("y", y_m)):
@@ -94,9 +100,9 @@ def georeference_rows(tables: Iterable[pa.Table], world: Georeference, path: Pat
         yield table
 
 
-def check_coordinates(path: Path, world: Georeference) -> None:
+def check_coordinates(path: Path, world: Georeference, is_geo: bool) -> None:
     """Raise the InputError of :func:`georeference_rows` or :func:`read_fcd` for the head of a file, if any."""
-    with closing(georeference_rows(read_fcd(path), world, path)) as tables:
+    with closing(georeference_rows(read_fcd(path), world, path, is_geo)) as tables:
         next(tables, None)
 
 

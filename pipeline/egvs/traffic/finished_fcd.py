@@ -84,7 +84,7 @@ def read_fcd_metadata(path: Path) -> FcdMetadata | None:
     if not isinstance(values, dict) or _MARKER_KEY not in values:
         return None
     try:
-        return FcdMetadata.of({key: value for key, value in values.items() if key != "schema"})
+        return FcdMetadata.from_dict({key: value for key, value in values.items() if key != "schema"})
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(map(str, first["loc"]))

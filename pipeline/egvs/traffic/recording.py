@@ -156,7 +156,7 @@ def _record_finished(scenario: Scenario, folder: Path, world: Georeference) -> I
     sizes = finished_fcd.sizes_of_types(scenario, survey.types, survey.sizes)
     rows = fcd.read_fcd(path)
     if survey.metadata is None:
-        rows = fcd.georeference_rows(rows, world, path)
+        rows = fcd.georeference_rows(rows, world, path, scenario.traffic.fcd_geo)
     yield Recording(rows, window, sizes, where, source=f"{where}.fcd = {name!r}")
 
 

@@ -1,4 +1,4 @@
-"""Does every beam end on the surface that it truly meets first, to a nanometre, and does none leak?"""
+"""Every beam ends on the surface that it hits first, to a nanometre, and no beam leaks."""
 
 import numpy as np
 import pytest
@@ -70,18 +70,18 @@ def box_ranges(o, d, low, high):
         ((1.0, 39.9999), 100.0, False),
     ],
 )
-def test_float32_is_not_trusted_near_edges_and_at_shallow_angles(end, range_m, doubtful):
+def test_hits_near_edges_and_at_shallow_angles_are_doubtful(end, range_m, doubtful):
     """A large triangle on the ground, a sensor 0.5 m above it at x = 0; what a float32 caster proposed is always
     triangle 0."""
     triangles, planes, _ = with_planes(np.array([[[-500.0, 40.0, 0.0], [0.0, -900.0, 0.0], [500.0, 40.0, 0.0]]]))
     o = np.array([0.0, 0.0, 0.5])
     d = towards(o, [[*end, 0.0]])
-    ranges, found = np.empty(1), np.empty(1, np.int64)
+    ranges, result = np.empty(1), np.empty(1, np.int64)
     nearest, owner = np.zeros(1, np.int32), np.array([0, -1], np.int32)
-    beam, met, ends, returned = np.zeros(1, np.uint32), np.empty(1, np.int64), np.empty((1, 3)), np.empty(1, np.bool_)
+    beam, hit, ends, returned = np.zeros(1, np.uint32), np.empty(1, np.int64), np.empty((1, 3)), np.empty(1, np.bool_)
     mesh, rays = ray_triangle.TriangleMesh(triangles, planes), ray_triangle.Rays(o, beam, d, range_m)
-    hits = ray_triangle.Hits(ranges, met, ends, returned)
-    count = ray_triangle.resolve_hits(nearest, owner, mesh, rays, hits, found)
+    hits = ray_triangle.Hits(ranges, hit, ends, returned)
+    count = ray_triangle.resolve_hits(nearest, owner, mesh, rays, hits, result)
     assert ranges[0] == pytest.approx(np.linalg.norm([*end, 0.5]), abs=1e-9)
     assert bool(count) == doubtful
 
@@ -105,12 +105,12 @@ def test_sphere_of_many_triangles():
     centre, o = np.array([60.0, 40.0, 5.0]), np.array([5.3, 12.7, 4.1])
     rng = np.random.default_rng(2)
     d = towards(o, centre + 10.0 * random_directions(rng, 3000))
-    found, true = cast_both(ball.triangles + centre, o, d)
-    assert not cast.differ(found, true).any()
-    met = np.isfinite(found)
-    off = np.linalg.norm(o + d[met] * found[met, None] - centre, axis=1)
+    result, true = cast_both(ball.triangles + centre, o, d)
+    assert not cast.differ(result, true).any()
+    hit = np.isfinite(result)
+    off = np.linalg.norm(o + d[hit] * result[hit, None] - centre, axis=1)
     inner = np.abs((ball.triangles[:, 0] * ball.face_normals).sum(axis=1)).min()
-    assert 1000 < met.sum() < 3000
+    assert 1000 < hit.sum() < 3000
     assert off.min() > inner - 1e-9
     assert off.max() < 8.0 + 1e-9
 
@@ -121,12 +121,12 @@ def test_thin_pole_far_away():
     pole = trimesh.creation.box((0.1, 0.1, 8.0)).triangles + np.array([150.05, 50.0, 5.0])
     y = np.linspace(-0.08, 0.08, 1601)
     y = y[np.abs(np.abs(y) - 0.05) > 2e-6]
-    found, _ = caster(pole).first_hits(
+    result, _ = caster(pole).first_hits(
         o, towards(o, np.column_stack([np.full_like(y, 150.0), 50 + y, np.full_like(y, 4.9)]))
     )
-    assert (np.isfinite(found) == (np.abs(y) < 0.05)).all()
-    met = np.isfinite(found)
-    assert np.abs(found[met] - np.sqrt(150.0**2 + y[met] ** 2 + 0.01)).max() < 1e-9
+    assert (np.isfinite(result) == (np.abs(y) < 0.05)).all()
+    hit = np.isfinite(result)
+    assert np.abs(result[hit] - np.sqrt(150.0**2 + y[hit] ** 2 + 0.01)).max() < 1e-9
 
 
 @pytest.mark.parametrize("graze_deg", [0.1, 5.0, 90.0])
@@ -153,12 +153,12 @@ def test_fan_of_slivers(width_m, start):
     s = rng.random((1500, 1)) * 0.99
     target = tip * s + (rim[[0]] + rng.random((1500, 1)) * (rim[[-1]] - rim[[0]])) * (1 - s)
     o = np.array(start)
-    found, true = cast_both(fan, o, towards(o, target))
-    assert not cast.differ(found, true).any()
-    assert np.abs(found - np.linalg.norm(target - o, axis=1)).max() < 1e-6
+    result, true = cast_both(fan, o, towards(o, target))
+    assert not cast.differ(result, true).any()
+    assert np.abs(result - np.linalg.norm(target - o, axis=1)).max() < 1e-6
 
 
-def test_sides_of_a_needle_met_squarely():
+def test_hits_needle_close_to_its_sides():
     """A cable of 2 mm, 100 m long; beams that pass 0.1 to 3 micrometres inside its sides, where no fin stands in the
     way."""
     rng = np.random.default_rng(5)
@@ -169,11 +169,11 @@ def test_sides_of_a_needle_met_squarely():
         y = rng.choice([-1, 1], 500) * (1e-3 * (50 - x) / 100 - inside)
         target = np.column_stack([x, y, np.zeros(500)]) @ turn.T + [50, 50, 5]
         o = turn @ np.array([0.0, 0.0, 30.0]) + [50, 50, 5]
-        found, _ = caster(cable @ turn.T + [50, 50, 5]).first_hits(o, towards(o, target))
-        assert np.abs(found - np.linalg.norm(target - o, axis=1)).max() < 1e-6
+        result, _ = caster(cable @ turn.T + [50, 50, 5]).first_hits(o, towards(o, target))
+        assert np.abs(result - np.linalg.norm(target - o, axis=1)).max() < 1e-6
 
 
-def test_duplicates_and_triangles_without_area_change_nothing():
+def test_ignores_duplicates_and_triangles_without_area():
     rng = np.random.default_rng(5)
     scene = rng.random((200, 3, 3)) * [100, 100, 10]
     o, d = np.array([50.0, 50.0, 5.0]), random_directions(rng, 2000)
@@ -195,9 +195,9 @@ def test_no_leak_through_t_junctions():
     rng = np.random.default_rng(6)
     s = np.concatenate([rng.random((5000, 1)) * 0.998 + 0.001, at[1:3, None]])
     o = np.array([40.0, 50.0, 20.0])
-    found, true = cast_both(scene, o, towards(o, side[0] + s * (side[3] - side[0])))
-    assert np.isfinite(found).all()
-    assert not cast.differ(found, true).any()
+    result, true = cast_both(scene, o, towards(o, side[0] + s * (side[3] - side[0])))
+    assert np.isfinite(result).all()
+    assert not cast.differ(result, true).any()
 
 
 def test_no_leak_at_a_closed_box():
@@ -213,7 +213,7 @@ def test_no_leak_at_a_closed_box():
 
 
 @pytest.mark.parametrize("centre", [(0.0, 0.0, 0.0), (50.0, 50.0, 5.0)])
-def test_no_leak_at_the_vertices_and_edges_of_a_sphere(centre):
+def test_no_leak_at_vertices_and_edges_of_sphere(centre):
     """10,242 vertices and 30,720 edges, aimed at exactly from inside; Embree alone leaks at 34 vertices of the
     first."""
     ball = trimesh.creation.icosphere(subdivisions=5, radius=10.0)
@@ -244,25 +244,25 @@ def test_no_leak_along_a_surface_of_many_triangles(graze_deg, size_m):
 
 
 @pytest.mark.parametrize("height_m", [2.0, 0.3])
-def test_feet_of_poles_on_the_ground(height_m):
+def test_error_at_feet_of_poles_is_below_1_mm(height_m):
     """Where surfaces stand on each other, a beam may be given the farther of the two only when it is less than 1 mm
     behind."""
     rng = np.random.default_rng(12)
     ground = quad([-600, -600, 0], [700, -600, 0], [700, 700, 0], [-600, 700, 0])
-    places = np.column_stack([rng.uniform(20, 150, 40), rng.uniform(30, 70, 40), np.full(40, 4.75)])
+    positions = np.column_stack([rng.uniform(20, 150, 40), rng.uniform(30, 70, 40), np.full(40, 4.75)])
     pole = trimesh.creation.cylinder(radius=0.09, height=9.5, sections=16).triangles
-    scene = np.concatenate([ground, *(pole + place for place in places)])
+    scene = np.concatenate([ground, *(pole + site for site in positions)])
     o, n = np.array([0.0, 50.0, height_m]), 8000
     corners = scene[2:].reshape(-1, 3)
     corners = corners[
-        (corners[:, 2] == 0) & (np.linalg.norm(corners - np.repeat(places, len(pole) * 3, axis=0), axis=1) > 4.75)
+        (corners[:, 2] == 0) & (np.linalg.norm(corners - np.repeat(positions, len(pole) * 3, axis=0), axis=1) > 4.75)
     ]
     spread = 10.0 ** rng.uniform(-6, -3.5, (n, 3)) * rng.choice([-1, 1], (n, 3))
     target = corners[rng.integers(0, len(corners), n)] + spread
-    found, true = cast_both(scene, o, towards(o, target))
-    assert not cast.differ(found, true, 1e-5).mean() > 1e-3
-    assert np.abs(found - true)[np.isfinite(true)].max() < 1e-3
-    assert (np.isfinite(found) == np.isfinite(true)).all()
+    result, true = cast_both(scene, o, towards(o, target))
+    assert not cast.differ(result, true, 1e-5).mean() > 1e-3
+    assert np.abs(result - true)[np.isfinite(true)].max() < 1e-3
+    assert (np.isfinite(result) == np.isfinite(true)).all()
 
 
 COARSE = st.tuples(*[st.integers(0, 8).map(lambda v: v * 1.25)] * 3)
@@ -275,8 +275,8 @@ def test_lattice_scenes_agree_with_brute_force(corners, start):
     scene, o = np.array(corners), np.asarray(start) + np.array([0.3, 0.2, 0.1])
     lattice = np.stack(np.meshgrid(*[np.arange(9) * 1.25] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     targets = np.concatenate([lattice, scene.mean(axis=1), scene[:, :2].mean(axis=1)])
-    found, true = cast_both(scene, o, towards(o, targets))
-    assert not cast.differ(found, true).any()
+    result, true = cast_both(scene, o, towards(o, targets))
+    assert not cast.differ(result, true).any()
 
 
 @pytest.mark.slow
@@ -299,33 +299,33 @@ def test_random_scenes_agree_with_brute_force(seed, thin, size):
         rng.random((100, 3)) * 100,
     ]
     d = towards(o, np.concatenate(targets))
-    found, true = cast_both(scene, o, d)
+    result, true = cast_both(scene, o, d)
     # A needle's plane is known no better than its height allows: where two ways to compute differ, exact arithmetic
     # tells what may come out.
-    assert all(cast.allowed(found[ray], o, d[ray], scene) for ray in np.flatnonzero(cast.differ(found, true)))
+    assert all(cast.allowed(result[ray], o, d[ray], scene) for ray in np.flatnonzero(cast.differ(result, true)))
 
 
 @pytest.mark.slow
 @pytest.mark.xfail(strict=True, reason="seen along its length, a lone spike's fins end before float32's rounding does")
-def test_the_far_tip_of_a_spike_seen_along_its_length():
+def test_hits_far_tip_of_spike_along_its_length():
     """A lone triangle 40 m long and 6 cm high, 87 m away, at 2.5 degrees; the beam is aimed at its very tip."""
     spike = np.array([[[50.0, 50.0, 5.0], [16.58, 45.34, -16.48], [18.29, 45.63, -15.48]]])
     o = np.array([-21.11, 41.95, -44.47])
-    found, true = cast_both(spike, o, towards(o, spike[0, :1]))
+    result, true = cast_both(spike, o, towards(o, spike[0, :1]))
     assert np.isfinite(true).all()
-    assert not cast.differ(found, true).any()
+    assert not cast.differ(result, true).any()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("degrees", range(1, 90, 8))
-def test_a_sensor_on_a_wall_is_not_blocked_by_it(degrees):
+def test_sensor_on_wall_is_not_blocked(degrees):
     """Rounding must not tell on which side of the wall the sensor stands."""
     turn, centre = turned(degrees), np.array([50.3, 49.9, 3.0])
     house = trimesh.creation.box((10, 8, 6)).triangles @ turn.T + centre
     directions = CATALOGUE["VLP-16"].directions()[::7]
     outwards = directions @ turn[:, 0] > 1e-3
-    for away in (-1e-9, -1e-13, 0.0, 1e-13, 1e-9):
-        o = turn @ np.array([5.0 + away, 1.3, 0.7]) + centre
+    for offsets in (-1e-9, -1e-13, 0.0, 1e-13, 1e-9):
+        o = turn @ np.array([5.0 + offsets, 1.3, 0.7]) + centre
         assert np.isinf(caster(house).first_hits(o, directions)[0][outwards]).all()
     assert touches_sensor(house - o).sum() in (1, 2)
     deep = turn @ np.array([4.99, 1.3, 0.7]) + centre
@@ -334,7 +334,7 @@ def test_a_sensor_on_a_wall_is_not_blocked_by_it(degrees):
 
 
 @pytest.mark.slow
-def test_moved_scene_is_the_same_bit_for_bit():
+def test_moved_scene_gives_identical_scan():
     shift = np.array([393216.0, 3932160.0, 64.0])
     rng = np.random.default_rng(9)
     scene = np.round(rng.random((500, 3, 3)) * [100, 100, 10] * 2**20) / 2**20
@@ -362,7 +362,7 @@ def test_georeferenced_scene_loses_no_digits(offset):
     assert wrong.sum() <= 1
 
 
-def test_range_ends_a_beam_that_meets_nothing():
+def test_beam_without_hit_ends_at_range():
     wall = quad([50, -500, -500], [50, 500, -500], [50, 500, 500], [50, -500, 500])
     d = CATALOGUE["VLP-16"].directions()
     scan = caster(wall).scan((10.0, 50.0, 5.0), d, 60.0)
@@ -397,10 +397,10 @@ def test_world_without_triangles_or_with_one():
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_corner_that_is_no_number_is_refused(value):
+def test_rejects_triangle_that_is_not_finite(value):
     scene = np.ones((2, 3, 3))
     scene[1, 2, 0] = value
-    with pytest.raises(InputError, match="corner that is no number"):
+    with pytest.raises(InputError, match="expected finite coordinates"):
         caster(scene)
 
 
@@ -411,20 +411,20 @@ def test_shipped_scene_agrees_with_brute_force(name, site):
     them."""
     loaded = loading.load(f"scenarios/{name}")
     scene = build_scene(loaded)
-    place, world = scene.sites[site], scene.world
-    scan = Scanner(scene).scan_site(place).rows
+    site, world = scene.sites[site], scene.world
+    scan = Scanner(scene).scan_site(site).rows
     chosen = slice(None, None, 5)
-    d = CATALOGUE[place.sensor].directions(*place.pose.angles_deg)[scan.beam[chosen]]
+    d = CATALOGUE[site.sensor].directions(*site.pose.angles_deg)[scan.beam[chosen]]
     corners = world.triangles_m - np.asarray(loaded.roi.box.origin_m)
-    true, _ = cast.first_hits(np.asarray(place.pose.position_m) - loaded.roi.box.origin_m, d, corners)
-    reach = CATALOGUE[place.sensor].range_m
+    true, _ = cast.first_hits(np.asarray(site.pose.position_m) - loaded.roi.box.origin_m, d, corners)
+    reach = CATALOGUE[site.sensor].range_m
     assert (scan.returned[chosen] == (true <= reach)).all()
     assert np.abs(scan.ends_m[chosen] - d * np.minimum(true, reach)[:, None]).max() < 1e-9
     assert scan.doubtful < 0.01 * len(scan.beam)
 
 
 @pytest.mark.parametrize("dtype", [np.int64, np.float32])
-def test_ends_are_float64_whatever_the_directions_are(dtype):
+def test_ends_are_float64_for_other_types_of_directions(dtype):
     wall = quad((10.3, 0, 0), (10.3, 9, 0), (10.3, 9, 9), (10.3, 0, 9))
     swept = caster(wall).sweep((0.0, 5.0, 3.0), np.array([[1, 0, 0], [0, -1, 0]], dtype), 20.7)
     assert swept.ends_m.dtype == np.float64
@@ -444,7 +444,7 @@ def meets(o, ends, size):
 
 @settings(max_examples=60)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([1e-3, 1.0, 200.0, 1e5]))
-def test_beams_that_can_meet_the_region_are_those_of_exact_quotients(seed, reach):
+def test_can_meet_box_agrees_with_quotients(seed, reach):
     """At random, along axes, along the box's faces, and past its edges with a chord of about CHORD_M."""
     rng, size = np.random.default_rng(seed), np.array([40.0, 20.0, 5.0])
     o = rng.choice([rng.uniform(-50, 90, 3), size * rng.integers(-1, 3, 3), size * rng.random(3)], axis=0)
@@ -454,35 +454,35 @@ def test_beams_that_can_meet_the_region_are_those_of_exact_quotients(seed, reach
     ends = np.concatenate([(past - o) * rng.choice([0.9, 1.0, 1.5], (400, 1)), random_directions(rng, 400) * reach])
     ends *= rng.choice([1.0, 0.0], ends.shape, p=[0.9, 0.1])
     ends[::50, 0], ends[1::50, 2] = 1e-300, -5e-324
-    found = np.empty(len(ends), dtype=np.bool_)
-    ray_triangle.can_meet_box(o, ends, size, found)
-    np.testing.assert_array_equal(found, meets(o, ends, size))
+    result = np.empty(len(ends), dtype=np.bool_)
+    ray_triangle.can_meet_box(o, ends, size, result)
+    np.testing.assert_array_equal(result, meets(o, ends, size))
 
 
-def test_a_chord_that_rounding_makes_too_short_is_measured_by_quotients():
+def test_can_meet_box_is_exact_for_chords_at_the_limit():
     """Through a box no thicker than CHORD_M: which beams share a longer piece with it, rounding alone says."""
     rng, size, o = np.random.default_rng(9), np.array([ray_triangle.CHORD_M, 20.0, 5.0]), np.array([0.0, 10.0, 2.5])
-    away = np.array([1.0, 0.0, 0.0]) + rng.uniform(-1e-8, 1e-8, (20_000, 3)) * [0.0, 1.0, 1.0]
-    ends = away * rng.uniform(1.0, 300.0, (20_000, 1))
+    offsets = np.array([1.0, 0.0, 0.0]) + rng.uniform(-1e-8, 1e-8, (20_000, 3)) * [0.0, 1.0, 1.0]
+    ends = offsets * rng.uniform(1.0, 300.0, (20_000, 1))
     true = meets(o, ends, size)
     per = 1.0 / ends[:, 0]
     chord = size[0] * per * np.sqrt((ends**2).sum(axis=1))
     assert (true != (chord > ray_triangle.CHORD_M)).mean() > 0.01  # so products alone would not do
-    found = np.empty(len(ends), dtype=np.bool_)
+    result = np.empty(len(ends), dtype=np.bool_)
     for n in range(2000):  # alone: one in doubt has those beside it measured too
-        ray_triangle.can_meet_box(o, ends[n : n + 1], size, found[n : n + 1])
-    np.testing.assert_array_equal(found[:2000], true[:2000])
+        ray_triangle.can_meet_box(o, ends[n : n + 1], size, result[n : n + 1])
+    np.testing.assert_array_equal(result[:2000], true[:2000])
 
 
-def test_what_is_taken_is_what_can_meet():
+def test_select_beams_agrees_with_can_meet_box():
     """The beams that are cast, of a whole turn, from within the region, above it, beside it and far away."""
     size, d = np.array([40.0, 20.0, 5.0]), random_directions(np.random.default_rng(3), 20_011)
     for o in ([20.0, 10.0, 2.0], [20.0, 10.0, 9.0], [-3.0, 5.0, 4.0], [300.0, 5.0, 40.0]):
-        beam, found = np.empty(len(d), dtype=np.uint32), np.empty(len(d), dtype=np.bool_)
+        beam, result = np.empty(len(d), dtype=np.uint32), np.empty(len(d), dtype=np.bool_)
         count = ray_triangle.select_beams(np.array(o), d, size, 60.0, beam)
-        ray_triangle.can_meet_box(np.array(o), d, size, found, 60.0)
-        np.testing.assert_array_equal(beam[:count], np.flatnonzero(found))
-        np.testing.assert_array_equal(found, meets(np.array(o), d * 60.0, size))
+        ray_triangle.can_meet_box(np.array(o), d, size, result, 60.0)
+        np.testing.assert_array_equal(beam[:count], np.flatnonzero(result))
+        np.testing.assert_array_equal(result, meets(np.array(o), d * 60.0, size))
 
 
 def fan(slivers, reach, turn_deg):
@@ -492,16 +492,21 @@ def fan(slivers, reach, turn_deg):
     return np.dstack([flat + 50.0, 1.0 + flat @ [0.03, -0.02]])
 
 
-def test_slivers_are_cut_into_pieces_that_are_them():
-    whole = np.concatenate([fan(12, 180.0, 31.0), quad((0, 0, 0), (9, 0, 0), (9, 9, 0), (0, 9, 0))])
-    pieces, owner = _split_large(whole)
-    assert len(whole) < len(pieces) <= 2 * len(whole)
-    assert (owner[-2:] != len(whole) - 1).all() and (owner == len(whole) - 1).sum() == 1  # the quad stays as it is
+def test_pieces_of_slivers_have_their_area_and_plane():
+    slivers_and_quad = np.concatenate([fan(12, 180.0, 31.0), quad((0, 0, 0), (9, 0, 0), (9, 9, 0), (0, 9, 0))])
+    pieces, owner = _split_large(slivers_and_quad)
+    assert len(slivers_and_quad) < len(pieces) <= 2 * len(slivers_and_quad)
+    assert (owner[-2:] != len(slivers_and_quad) - 1).all() and (
+        owner == len(slivers_and_quad) - 1
+    ).sum() == 1  # the quad stays as it is
     area = np.linalg.norm(np.cross(pieces[:, 1] - pieces[:, 0], pieces[:, 2] - pieces[:, 0]), axis=1)
-    true = np.linalg.norm(np.cross(whole[:, 1] - whole[:, 0], whole[:, 2] - whole[:, 0]), axis=1)
+    true = np.linalg.norm(
+        np.cross(slivers_and_quad[:, 1] - slivers_and_quad[:, 0], slivers_and_quad[:, 2] - slivers_and_quad[:, 0]),
+        axis=1,
+    )
     assert np.bincount(owner, area) == pytest.approx(true, rel=1e-12)
     for corner in range(3):
-        np.testing.assert_allclose(along_plane(pieces[:, corner], whole[owner]), 0.0, atol=1e-12)
+        np.testing.assert_allclose(along_plane(pieces[:, corner], slivers_and_quad[owner]), 0.0, atol=1e-12)
 
 
 def along_plane(points, triangles):
@@ -512,7 +517,7 @@ def along_plane(points, triangles):
 
 @pytest.mark.parametrize("turn_deg", [0.0, 31.0])
 @pytest.mark.parametrize("height_m", [0.05, 4.0])
-def test_a_fan_of_slivers_leaks_nowhere(turn_deg, height_m):
+def test_no_leak_at_fan_of_large_slivers(turn_deg, height_m):
     """Beams at the cuts, at the sides, and at anything, steep and nearly along the plane, against brute force."""
     rng, slivers = np.random.default_rng(5), fan(60, 150.0, turn_deg)
     pieces, _ = _split_large(slivers)
@@ -522,6 +527,6 @@ def test_a_fan_of_slivers_leaks_nowhere(turn_deg, height_m):
     inside = (np.repeat(slivers, 40, axis=0) * share[:, :, None]).sum(axis=1)
     o = np.array([50.0, 50.0, 1.0 + height_m]) + (turned(turn_deg) @ [20.0, 3.0, 0.0])
     d = towards(o, np.concatenate([pieces.reshape(-1, 3), sides, inside]))
-    found, true = cast_both(slivers, o, d)
+    result, true = cast_both(slivers, o, d)
     assert np.isfinite(true).mean() > 0.9
-    assert not cast.differ(found, true).any()
+    assert not cast.differ(result, true).any()

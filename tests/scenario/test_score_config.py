@@ -1,4 +1,4 @@
-"""What gamma = "auto" stands for, where it stays what it is, and where it is told."""
+"""The number that gamma = "auto" stands for, when it is kept, and where it is shown."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def auto(mini: Path) -> Path:
     return mini
 
 
-def test_it_goes_through_the_gammas_of_the_study() -> None:
+def test_default_gamma_matches_study() -> None:
     plain, hidden = (
         {voxel_m: default_gamma(voxel_m, moving_occlusion=occlusion) for voxel_m in (0.125, 0.25, 0.5, 1.0, 2.0)}
         for occlusion in (False, True)
@@ -38,13 +38,13 @@ def test_it_goes_through_the_gammas_of_the_study() -> None:
 
 @pytest.mark.slow
 @given(st.floats(0.01, 100), st.booleans())
-def test_two_digits_and_rising(voxel_m: float, occlusion: bool) -> None:
-    found = default_gamma(voxel_m, moving_occlusion=occlusion)
-    assert found == float(f"{found:.1e}")
-    assert default_gamma(1.2 * voxel_m, moving_occlusion=occlusion) > found > 0
+def test_default_gamma_rises_and_has_two_digits(voxel_m: float, occlusion: bool) -> None:
+    gamma = default_gamma(voxel_m, moving_occlusion=occlusion)
+    assert gamma == float(f"{gamma:.1e}")
+    assert default_gamma(1.2 * voxel_m, moving_occlusion=occlusion) > gamma > 0
 
 
-def test_of_a_scenario(auto: Path) -> None:
+def test_gamma_of_scenario(auto: Path) -> None:
     def of(*overrides: str) -> float:
         return egvs.load(auto, overrides).gamma
 
@@ -53,28 +53,31 @@ def test_of_a_scenario(auto: Path) -> None:
     assert of("score.gamma=inf") == float("inf")
 
 
-def test_other_effects_keep_the_number(auto: Path) -> None:
+def test_with_effects_keeps_gamma(auto: Path) -> None:
     """What an effect changes is seen with one gamma."""
     scenario = egvs.load(auto)
-    assert scenario.with_effects(EffectsConfig.of({"moving_occlusion": {}})).gamma == 4.5
+    assert scenario.with_effects(EffectsConfig.from_dict({"moving_occlusion": {}})).gamma == 4.5
     hidden = egvs.load(auto, [OCCLUSION])
     assert hidden.with_effects(hidden.effects.only()).gamma == 2.2
 
 
-def test_settings_of_a_study_keep_the_number(auto: Path, tmp_path: Path) -> None:
+def test_study_settings_keep_gamma(auto: Path, tmp_path: Path) -> None:
     runner = SettingRunner(auto, [], tmp_path, 1, lambda *_: None)
-    tried = {its.name: its for its in study_settings.list_settings(runner.scenario(study_settings.SCENARIO_AS_IS))}
-    gammas = {name: runner.scenario(setting).gamma for name, setting in tried.items()}
+    settings = {
+        setting.name: setting
+        for setting in study_settings.list_settings(runner.scenario(study_settings.SCENARIO_AS_IS))
+    }
+    gammas = {name: runner.scenario(setting).gamma for name, setting in settings.items()}
     assert gammas["scenario"] == gammas["voxel 1 m"] == gammas["with moving_occlusion"] == 4.5
     assert gammas["voxel 1 m, gamma 18"] == 18.0
     assert gammas["gamma 2"] == 2.0
 
 
 @pytest.mark.slow
-def test_a_run_is_that_with_the_number_and_tells_it(auto: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
-    code, _, told = run_egvs("run", auto, "--out", tmp_path / "auto")
+def test_run_with_auto_equals_run_with_number(auto: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
+    code, _, message = run_egvs("run", auto, "--out", tmp_path / "auto")
     assert code == 0
-    assert "gamma auto 4.5" in told
+    assert "gamma auto 4.5" in message
     assert "4.5 beams<small>per voxel; further beams add nothing; chosen for the voxel size (auto)" in (
         tmp_path / "auto" / "report.html"
     ).read_text(encoding="utf-8")
@@ -91,12 +94,12 @@ def test_a_run_is_that_with_the_number_and_tells_it(auto: Path, tmp_path: Path, 
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        ('"Auto"', "score.gamma: 'Auto'; input should be a valid number or 'auto'"),
-        ("-1", "score.gamma: -1; input should be greater than or equal to 0 or 'auto'"),
+        ('"Auto"', "score.gamma: expected a valid number or 'auto', got 'Auto'"),
+        ("-1", "score.gamma: expected a value greater than or equal to 0 or 'auto', got -1"),
     ],
 )
-def test_what_is_no_gamma(mini: Path, run_egvs, value: str, message: str) -> None:  # type: ignore[no-untyped-def]
-    code, _, told = run_egvs("check", mini, "--set", f"score.gamma={value}")
+def test_rejects_invalid_gamma(mini: Path, run_egvs, value: str, message: str) -> None:  # type: ignore[no-untyped-def]
+    code, _, message = run_egvs("check", mini, "--set", f"score.gamma={value}")
     assert code == 2
-    assert told.count("score.gamma") == 1
-    assert message in told
+    assert message.count("score.gamma") == 1
+    assert message in message

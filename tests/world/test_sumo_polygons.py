@@ -1,6 +1,7 @@
-"""Is what stands in a SUMO .poly.xml solid when its type is, at its own height, and everything else counted?
+"""Shapes of a SUMO .poly.xml are solid if their type is, with their own heights; all others are counted.
 
-Shapes are squares of whole metres, so that volumes can be worked out by hand."""
+Shapes are squares of whole metres, so that volumes can be computed by hand.
+"""
 
 from __future__ import annotations
 
@@ -81,7 +82,7 @@ def extents(file: FootprintFile) -> list[tuple[str, float, float, float]]:
         ("natural.tree", ("tree_crown", 2.4, 8.0, 16.0)),
     ],
 )
-def test_a_type_that_is_solid(tmp_path: Path, kind: str, expected: tuple[str, float, float, float]) -> None:
+def test_heights_of_solid_types(tmp_path: Path, kind: str, expected: tuple[str, float, float, float]) -> None:
     assert extents(read(tmp_path, poly(kind))) == [pytest.approx(expected)]
 
 
@@ -93,25 +94,25 @@ def test_a_type_that_is_solid(tmp_path: Path, kind: str, expected: tuple[str, fl
         *("building.no", "building.demolished", "building.underground", "barrier.kerb", "barrier.gate", "school"),
     ],
 )
-def test_a_type_that_is_none_is_counted(tmp_path: Path, kind: str) -> None:
+def test_counts_types_that_are_not_solid(tmp_path: Path, kind: str) -> None:
     file = read(tmp_path, poly("building", "9,9 10,9 10,10"), poly(kind), poly(kind, "7,7 8,8", fill="0"))
     assert len(file.footprints) == 1
     assert file.ignored == {f"polygons of type {kind}": 2}
     assert not file.warnings
 
 
-def test_every_type_of_polyconvert_is_in_the_table() -> None:
+def test_knows_all_types_of_polyconvert() -> None:
     """Those that its own type file makes, under the names that it gives by default and with the full ones."""
     from defusedxml.ElementTree import parse
 
     types = SolidTypes()
     home = sumo_home()
     for element in parse(home / "data" / "typemap" / "osmPolyconvert.typ.xml").getroot():
-        assert types.knows(element.get("id")) or element.get("id") == "inner", element.get("id")
-        assert types.knows(element.get("name")) or element.get("name") == "inner", element.get("name")
+        assert types.is_known(element.get("id")) or element.get("id") == "inner", element.get("id")
+        assert types.is_known(element.get("name")) or element.get("name") == "inner", element.get("name")
 
 
-def test_a_type_that_no_table_names_is_left_out_and_warned_of(tmp_path: Path) -> None:
+def test_warns_about_unknown_types(tmp_path: Path) -> None:
     file = read(tmp_path, poly("building"), poly("sculpture"), poly("sculpture"), poly(None), poly("mine.own"))
     assert len(file.footprints) == 1
     assert file.ignored == {
@@ -121,22 +122,21 @@ def test_a_type_that_no_table_names_is_left_out_and_warned_of(tmp_path: Path) ->
     }
     assert [(w.rule, w.is_error) for w in file.warnings] == [("polygon types", False)]
     assert str(file.warnings[0]) == (
-        f"{tmp_path / 's.poly.xml'}: polygons of type sculpture (2), (none) (1), mine.own (1): left out, for no table "
-        'says whether this is solid; say it in [statics.polygon_types]: "solid", "ignore" or a height in metres for '
-        "each type"
+        f"{tmp_path / 's.poly.xml'}: unknown types of polygons were left out: sculpture (2), (none) (1), mine.own (1). "
+        'Set each in [statics.polygon_types] to "solid", "ignore" or a height in metres'
     )
 
 
-def test_a_file_without_anything_solid_is_warned_of(tmp_path: Path) -> None:
+def test_warns_about_file_without_solids(tmp_path: Path) -> None:
     file = read(tmp_path, poly("parking"), poly("landuse"))
-    assert [w.problem for w in file.warnings] == ["none of its 2 polygons is solid"]
+    assert [w.problem for w in file.warnings] == ["none of the 2 polygons is solid"]
 
 
-def test_a_shape_that_is_not_solid_need_not_be_sound(tmp_path: Path) -> None:
+def test_accepts_invalid_shapes_that_are_not_solid(tmp_path: Path) -> None:
     assert not read(tmp_path, poly("landuse", "0,0 4,4 4,0 0,4"), poly("landuse", "")).footprints
 
 
-def test_an_outline_that_crosses_itself_stops_no_file(tmp_path: Path) -> None:
+def test_keeps_all_parts_of_crossing_outline(tmp_path: Path) -> None:
     """A bow tie: two triangles of 4 m2 that meet at (2, 2). What encloses nothing is left out."""
     square = poly("building", "10,0 14,0 14,4 10,4")
     file = read(tmp_path, poly("building", "0,0 4,4 4,0 0,4"), poly("building", "0,0 4,0 8,0"), square)
@@ -144,7 +144,7 @@ def test_an_outline_that_crosses_itself_stops_no_file(tmp_path: Path) -> None:
     assert file.repaired["rings that cross themselves, each part that they enclose kept"] == 1
     assert file.ignored["outlines that enclose nothing of type building"] == 1
     (warning,) = file.warnings
-    assert warning.problem == "outlines that cross themselves: 1 (x); each part that they enclose is kept"
+    assert warning.problem == "outlines that cross themselves: 1 (x). All parts that they enclose were kept"
 
 
 # ---- the user's own table
@@ -170,7 +170,7 @@ def test_an_outline_that_crosses_itself_stops_no_file(tmp_path: Path) -> None:
         ({"landuse": "solid"}, "landuse.forest", 9.0),
     ],
 )
-def test_the_users_table_stands_before_the_programs(
+def test_polygon_types_override_tables(
     tmp_path: Path, types: dict[str, Any], kind: str | None, top_m: float | None
 ) -> None:
     file = read(tmp_path, poly("fence"), poly(kind), types=types)
@@ -178,7 +178,7 @@ def test_the_users_table_stands_before_the_programs(
     assert not file.warnings
 
 
-def test_a_height_of_the_user_leaves_a_roof_open(tmp_path: Path) -> None:
+def test_roof_with_user_height_stays_open(tmp_path: Path) -> None:
     assert extents(read(tmp_path, poly("building.roof"), types={"building.roof": 6.0})) == [("roof", 5.5, 6.0, 16.0)]
 
 
@@ -192,31 +192,31 @@ def load(folder: Path, **settings: Any) -> Any:
     return scenario_from_dict(values, folder, "scenario.toml")
 
 
-def test_types_without_quotes_mean_the_same(tmp_path: Path) -> None:
+def test_accepts_types_without_quotes(tmp_path: Path) -> None:
     nested = {"building": {"shed": 2.2, "yes": {"old": "ignore"}}, "parking": "solid"}
     flat = {"building.shed": 2.2, "building.yes.old": "ignore", "parking": "solid"}
     assert load(tmp_path, polygon_types=nested).statics.polygon_types == flat
 
 
 @pytest.mark.parametrize("value", ["yes", -1.0, 0, True, None, [3.0]])
-def test_a_value_that_says_nothing_is_refused(tmp_path: Path, value: Any) -> None:
+def test_rejects_invalid_polygon_type(tmp_path: Path, value: Any) -> None:
     with pytest.raises(
-        InputError, match=r'statics.polygon_types: .*"building.shed" = .*; "solid", "ignore" or a height'
+        InputError, match=r'statics.polygon_types: expected "solid", "ignore" or a height .* for "building.shed", got'
     ):
         load(tmp_path, polygon_types={"building.shed": value})
 
 
-def test_the_stage_counts_and_warns(tmp_path: Path) -> None:
+def test_build_world_counts_and_warns(tmp_path: Path) -> None:
     (tmp_path / "s.poly.xml").write_text(
         f"<additional>{poly('building')}{poly('parking')}{poly('odd')}</additional>", encoding="utf-8"
     )
     settings = {"polygons": ["s.poly.xml"], "polygon_height_m": 4.0}
     world, counts = static_world.build_world(load(tmp_path, **settings))
     assert volumes(world) == pytest.approx([64.0])
-    told = counts.to_json()
-    assert told["built"] == {"building": 1}
-    assert told["left_out"] == {"polygons of type odd": 1, "polygons of type parking": 1}
-    assert [warning["rule"] for warning in told["warnings"]] == ["polygon types"]
+    summary = counts.to_json()
+    assert summary["built"] == {"building": 1}
+    assert summary["left_out"] == {"polygons of type odd": 1, "polygons of type parking": 1}
+    assert [warning["rule"] for warning in summary["warnings"]] == ["polygon types"]
     _, quiet = static_world.build_world(load(tmp_path, **settings, polygon_types={"odd": "ignore"}))
     assert "warnings" not in quiet.to_json()
 
@@ -249,7 +249,7 @@ def volumes(world: World) -> np.ndarray:
         ("building", {"building": "roof"}, {}, (4.5, 5)),
     ],
 )
-def test_heights(
+def test_heights_from_tags_and_attributes(
     tmp_path: Path, kind: str, tags: dict[str, str], attributes: dict[str, str], base_top: tuple[float, float]
 ) -> None:
     file = read(tmp_path, poly(kind, tags=tags, **attributes))
@@ -257,22 +257,22 @@ def test_heights(
     assert not file.repaired
 
 
-def test_a_tag_that_cannot_be_read_is_counted(tmp_path: Path) -> None:
+def test_counts_unreadable_tags(tmp_path: Path) -> None:
     file = read(tmp_path, poly("building", tags={"height": "tall", "building:levels": "2"}))
     assert [f.height_m for f in file.footprints] == [6.0]
     assert file.repaired == {"height that cannot be read, taken as not there": 1}
 
 
 @pytest.mark.parametrize("height", ["tall", "0", "-3", "nan", "inf"])
-def test_a_height_of_sumos_own_that_is_none_is_refused(tmp_path: Path, height: str) -> None:
-    with pytest.raises(InputError, match=rf"poly x: height: '{height}'; a number of metres above 0"):
+def test_rejects_invalid_height_attribute(tmp_path: Path, height: str) -> None:
+    with pytest.raises(InputError, match=rf"poly x: height: expected a number of metres above 0, got '{height}'"):
         read(tmp_path, poly("building", height=height))
 
 
 # ---- lines, courtyards, points
 
 
-def test_a_wall_is_a_strip_and_a_closed_outline_an_area(tmp_path: Path) -> None:
+def test_wall_is_strip_and_closed_outline_is_area(tmp_path: Path) -> None:
     file = read(
         tmp_path,
         poly("barrier.wall", "0,0 10,0", fill="0"),
@@ -284,14 +284,14 @@ def test_a_wall_is_a_strip_and_a_closed_outline_an_area(tmp_path: Path) -> None:
     assert not file.footprints[1].polygon.covers(shapely.Point(5, 5))
 
 
-def test_an_open_outline_of_a_building_is_left_out_and_warned_of(tmp_path: Path) -> None:
+def test_warns_about_open_outline_of_building(tmp_path: Path) -> None:
     file = read(tmp_path, poly("fence"), poly("building.school", "0,0 4,0 4,4", fill="0"))
     assert file.ignored == {"open lines of type building.school": 1}
-    assert [w.problem for w in file.warnings] == ["outlines of type building.school (1) are not closed: left out"]
+    assert [w.problem for w in file.warnings] == ["open outlines of solid types were left out: building.school (1)"]
     assert "--osm.merge-relations" in file.warnings[0].hint
 
 
-def test_a_courtyard_is_cut_out_of_what_surrounds_it(tmp_path: Path) -> None:
+def test_cuts_out_courtyards(tmp_path: Path) -> None:
     outer, inner = "0,0 20,0 20,20 0,20", "5,5 15,5 15,15 5,15"
     shed, far = "6,6 8,6 8,8 6,8", "50,50 52,50 52,52 50,52"
     file = read(
@@ -303,7 +303,7 @@ def test_a_courtyard_is_cut_out_of_what_surrounds_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("color", ["white", "255,255,255"])
-def test_a_courtyard_that_full_types_hide_is_white(tmp_path: Path, color: str) -> None:
+def test_cuts_out_white_courtyards(tmp_path: Path, color: str) -> None:
     """With --osm.keep-full-type it has the type of its building; its colour alone tells it."""
     outer, inner = "0,0 20,0 20,20 0,20", "5,5 15,5 15,15 5,15"
     school = "building.school"
@@ -314,18 +314,18 @@ def test_a_courtyard_that_full_types_hide_is_white(tmp_path: Path, color: str) -
     assert not file.warnings
 
 
-def test_a_solid_inside_another_is_warned_of(tmp_path: Path) -> None:
+def test_warns_about_solid_inside_another(tmp_path: Path) -> None:
     """Without --osm.merge-relations, polyconvert fills courtyards."""
     file = read(tmp_path, poly("building", "0,0 20,0 20,20 0,20"), poly("building", "5,5 15,5 15,15 5,15"))
     assert len(file.footprints) == 2
     assert [w.problem for w in file.warnings] == [
-        "solids inside another of their kind and height: 1; they may be courtyards that are filled"
+        "solids inside another of the same kind and height: 1. They may be filled courtyards"
     ]
     tower = poly("building", "5,5 15,5 15,15 5,15", height="30")
     assert not read(tmp_path, poly("building", "0,0 20,0 20,20 0,20"), tower).warnings
 
 
-def test_trees_and_poles_among_the_points(tmp_path: Path) -> None:
+def test_reads_trees_and_poles(tmp_path: Path) -> None:
     file = read(
         tmp_path,
         '<poi id="t" type="natural.tree" x="5" y="6"><param key="height" value="10"/></poi>',
@@ -343,7 +343,7 @@ def test_trees_and_poles_among_the_points(tmp_path: Path) -> None:
     assert file.ignored == {"points of type shop": 1, "points of type building": 1, "points of type natural": 1}
 
 
-def test_the_users_table_goes_for_points_too(tmp_path: Path) -> None:
+def test_polygon_types_apply_to_points(tmp_path: Path) -> None:
     points = [
         f'<poi id="{i}" type="{kind}" x="{i}" y="2"/>'
         for i, kind in enumerate(("highway.street_lamp", "power.pole", "barrier.bollard", "man_made.mast"))
@@ -354,7 +354,7 @@ def test_the_users_table_goes_for_points_too(tmp_path: Path) -> None:
     assert file.ignored == {"points of type power": 1, "points of type barrier": 1}
 
 
-def test_what_stands_there_twice_is_built_once(tmp_path: Path) -> None:
+def test_drops_duplicate_solids(tmp_path: Path) -> None:
     """With full types, polyconvert writes a tower as a building and as a tower."""
     file = read(tmp_path, poly("building.yes"), poly("man_made.tower"), poly("historic.yes"))
     assert len(file.footprints) == 1
@@ -364,19 +364,19 @@ def test_what_stands_there_twice_is_built_once(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("shape", "message"),
     [
-        ("", "poly x: shape: ''; three points for an area"),
-        ("1,2", "poly x: shape: '1,2'; three points"),
-        ("0,0 a,0 4,4", "poly x: has a value that is no number"),
-        ("0,0 4 4,4", "poly x: has a value that is no number"),
-        ("0,0 nan,0 4,4 0,4", "poly x: geometry: .*no number"),
+        ("", "poly x: shape: expected three points for an area, two for a line, got ''"),
+        ("1,2", "poly x: shape: expected three points for an area, two for a line, got '1,2'"),
+        ("0,0 a,0 4,4", "poly x: expected shape='x,y x,y ...' in metres"),
+        ("0,0 4 4,4", "poly x: expected shape='x,y x,y ...' in metres"),
+        ("0,0 nan,0 4,4 0,4", "poly x: geometry: expected finite coordinates"),
     ],
 )
-def test_shapes_that_are_none_are_refused(tmp_path: Path, shape: str, message: str) -> None:
+def test_rejects_invalid_shapes(tmp_path: Path, shape: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
         read(tmp_path, poly("building", shape))
 
 
-def test_a_tunnelled_garage_is_left_out(tmp_path: Path) -> None:
+def test_ignores_underground_garage(tmp_path: Path) -> None:
     file = read(tmp_path, poly("fence"), poly("building.garage", tags={"location": "underground"}))
     assert file.ignored == {"underground polygons of type building.garage": 1}
 
@@ -389,7 +389,7 @@ def as_geo(shape: str) -> str:
     return " ".join(f"{lon:.13f},{lat:.13f}" for lon, lat in FRAME.to_degrees(metres).tolist())
 
 
-def test_a_shape_in_degrees_is_brought_into_the_world(tmp_path: Path) -> None:
+def test_converts_shapes_in_degrees(tmp_path: Path) -> None:
     here = Georeference(FRAME, HERE, "scenario.toml")
     lon, lat = as_geo("10,10").split(",")
     tree = f'<poi id="t" type="natural.tree" lon="{lon}" lat="{lat}"/>'
@@ -399,23 +399,23 @@ def test_a_shape_in_degrees_is_brought_into_the_world(tmp_path: Path) -> None:
     assert [f.polygon.wkb for f in geo.footprints] == [f.polygon.wkb for f in metres.footprints]
     assert len(geo.footprints) == 4
     with pytest.raises(
-        InputError, match=r"s.poly.xml: poly x: is in longitude and latitude, and nothing says where the scen"
+        InputError, match=r"s.poly.xml: poly x: the shape is in longitude and latitude, but the position of the world"
     ):
         read(tmp_path, poly("building", as_geo(SQUARE), geo="1"))
 
 
-def test_a_files_own_location_counts(tmp_path: Path) -> None:
+def test_converts_from_location_of_file(tmp_path: Path) -> None:
     """polyconvert without the scenario's network lays another zero."""
     here = Georeference(FRAME, HERE, "scenario.toml")
-    own = f'<location netOffset="-550690.00,-5635195.00" projParameter="{UTM}"/>'
-    moved = read(tmp_path, own, poly("building", "10,5 14,5 14,9 10,9"), world=here)
+    location = f'<location netOffset="-550690.00,-5635195.00" projParameter="{UTM}"/>'
+    moved = read(tmp_path, location, poly("building", "10,5 14,5 14,9 10,9"), world=here)
     assert moved.footprints[0].polygon.equals(read(tmp_path, poly("building")).footprints[0].polygon)
     same = f'<location netOffset="-550700.00,-5635200.00" projParameter="{UTM}"/>'
     assert read(tmp_path, same, poly("building"), world=here).footprints[0].polygon.bounds == (0, 0, 4, 4)
     far = f'<location netOffset="-500000.00,-5635200.00" projParameter="{UTM}"/>'
-    with pytest.raises(InputError, match=r"s.poly.xml: .* \(51 km\) as metres of its own <location>; .*polyconvert"):
+    with pytest.raises(InputError, match=r"s.poly.xml: .* are 51 km .* as metres of its own <location>. .*polyconvert"):
         read(tmp_path, far, poly("building"), world=here)
-    with pytest.raises(InputError, match=r"lie far from the region of interest \(141 km\)"):
+    with pytest.raises(InputError, match=r"are 141 km from the region of interest"):
         read(tmp_path, poly("building", "100000,100000 100004,100000 100004,100004"))
 
 
@@ -423,7 +423,7 @@ def test_a_files_own_location_counts(tmp_path: Path) -> None:
 
 
 @pytest.mark.system
-def test_what_polyconvert_makes_of_a_map(tmp_path: Path) -> None:
+def test_reads_output_of_polyconvert(tmp_path: Path) -> None:
     """The corners of each building lie where the network says, at the heights of the map."""
     (tmp_path / "m.osm").write_text(
         SMALL.read_text(encoding="utf-8").replace('<nd ref="131"/><nd ref="132"/><nd ref="133"/>', '<nd ref="131"/>'),
@@ -442,12 +442,12 @@ def test_what_polyconvert_makes_of_a_map(tmp_path: Path) -> None:
     world = Georeference(network_world_frame(read_location(tmp_path / "n.net.xml")), HERE, "scenario.toml")
     assert world.frame is not None
     file = read_poly_xml(tmp_path / "p.poly.xml", SolidTypes(), 9.0, world)
-    found = {f.name: (f.base_m, f.height_m) for f in file.footprints}
+    heights = {f.name: (f.base_m, f.height_m) for f in file.footprints}
     expected = {
         "2001": (0, 12), "2002": (0, 12.19), "2003": (0, 9), "2004": (0, 9), "2005": (0, 6), "2006": (3, 9),
         "2015": (4.5, 5), "3001": (0, 12), "4001": (3, 10), "4001/trunk": (0, 3),
     }  # fmt: skip
-    assert {name: found[name] for name in expected} == {name: pytest.approx(v) for name, v in expected.items()}
+    assert {name: heights[name] for name in expected} == {name: pytest.approx(v) for name, v in expected.items()}
     areas = {f.name: f.polygon.area for f in file.footprints}
     assert areas["3001"] == pytest.approx(40 * 40 - 20 * 20, rel=1e-2)
     assert file.ignored["underground polygons of type building.garage"] == 1

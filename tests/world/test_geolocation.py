@@ -1,7 +1,8 @@
-"""Where a scenario's world lies on the Earth: from its network, from ``[crs]``, and what is refused.
+"""Where a scenario's world frame is on the Earth, according to its network and ``[crs]``.
 
-The oracle is the map itself: a node of OpenStreetMap has its longitude and latitude, and the junction that netconvert
-made of it its x, y."""
+The reference is the map: a node of OpenStreetMap has a longitude and latitude, the junction that netconvert makes of
+it an x, y.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +48,7 @@ UTM = "+proj=utm +zone=32 +ellps=WGS84 +datum=WGS84 +units=m +no_defs"
 @pytest.mark.system
 @pytest.mark.parametrize("map_file", [SMALL, pytest.param(REAL, marks=pytest.mark.skipif(
     not REAL.is_file(), reason="bad_hersfeld.osm is not beside the checkout (shared/real)"))])  # fmt: skip
-def test_a_junction_is_where_its_node_is_on_the_map(tmp_path: Path, map_file: Path) -> None:
+def test_junctions_are_at_their_map_nodes(tmp_path: Path, map_file: Path) -> None:
     sumo_folder.convert_osm(map_file, tmp_path / "n.net.xml")
     world = geolocation.scenario_georeference(load(tmp_path, {"network": "n.net.xml"}))
     assert world.frame is not None
@@ -56,8 +57,8 @@ def test_a_junction_is_where_its_node_is_on_the_map(tmp_path: Path, map_file: Pa
     assert len(known) > 5
     junctions = np.array([j.at_m for j in known])
     lon_lat_deg = np.array([nodes[int(j.id)] for j in known])[:, ::-1]
-    away_m = np.hypot(*(world.frame.from_degrees(lon_lat_deg) - junctions).T)
-    assert np.median(away_m) < 0.01  # netconvert writes centimetres
+    distances_m = np.hypot(*(world.frame.from_degrees(lon_lat_deg) - junctions).T)
+    assert np.median(distances_m) < 0.01  # netconvert writes centimetres
     assert np.ptp(junctions, axis=0).min() > 100
     back = world.lon_lat_deg(junctions)
     assert back is not None
@@ -65,7 +66,7 @@ def test_a_junction_is_where_its_node_is_on_the_map(tmp_path: Path, map_file: Pa
 
 
 @pytest.mark.system
-def test_a_map_as_network_lies_where_netconvert_will_put_it(tmp_path: Path) -> None:
+def test_map_has_frame_of_its_converted_network(tmp_path: Path) -> None:
     sumo_folder.convert_osm(SMALL, tmp_path / "n.net.xml")
     (tmp_path / "m.osm.xml").write_bytes(SMALL.read_bytes())
     by_net, by_map = (load(tmp_path, {"network": name}) for name in ("n.net.xml", "m.osm.xml"))
@@ -75,26 +76,26 @@ def test_a_map_as_network_lies_where_netconvert_will_put_it(tmp_path: Path) -> N
     assert geolocation.world_frame_settings(by_map)["world_frame"].keys() == {"map", "sumo"}
 
 
-def test_a_real_network_knows_its_town(tmp_path: Path) -> None:
+def test_agrees_with_sumolib_on_real_network(tmp_path: Path) -> None:
     """Against sumolib, which inverts the same location with its own code."""
     import sumolib
 
     world = geolocation.scenario_georeference(load(tmp_path, {"network": f"$SUMO_HOME/{INGOLSTADT}"}, (5770, 5665)))
-    found = world.lon_lat_deg(np.array([[5770.0, 5665.0], [5525.68, 5517.09]]))
-    assert found is not None
+    lon_lat_deg_of_town = world.lon_lat_deg(np.array([[5770.0, 5665.0], [5525.68, 5517.09]]))
+    assert lon_lat_deg_of_town is not None
     net = sumolib.net.readNet(str(sumo_home() / INGOLSTADT))
-    assert found[0] == pytest.approx(net.convertXY2LonLat(5770, 5665), abs=1e-8)
-    assert found[1] == pytest.approx((11.42, 48.77), abs=0.02)
+    assert lon_lat_deg_of_town[0] == pytest.approx(net.convertXY2LonLat(5770, 5665), abs=1e-8)
+    assert lon_lat_deg_of_town[1] == pytest.approx((11.42, 48.77), abs=0.02)
 
 
-def test_a_network_that_was_drawn_lies_nowhere(tmp_path: Path) -> None:
+def test_drawn_network_has_no_frame(tmp_path: Path) -> None:
     for projection in ("!", "", "-", "."):
         scene = load(tmp_path, with_location(tmp_path, projection))
         assert geolocation.scenario_georeference(scene).frame is None
         assert ("world_frame" in geolocation.world_frame_settings(scene)) == (projection in ("-", "."))
 
 
-def test_a_network_that_is_missing_is_told_by_who_needs_it(tmp_path: Path) -> None:
+def test_missing_network_is_no_error(tmp_path: Path) -> None:
     """Statics, scans and scores can be made again where only they are kept."""
     for traffic in ({"network": "gone.net.xml"}, {"sumocfg": "gone.sumocfg"}):
         scene = load(tmp_path, traffic)
@@ -102,14 +103,14 @@ def test_a_network_that_is_missing_is_told_by_who_needs_it(tmp_path: Path) -> No
         assert geolocation.world_frame_settings(scene) == {}
 
 
-def test_a_scenario_may_say_it_itself(tmp_path: Path) -> None:
+def test_crs_of_scenario_gives_frame(tmp_path: Path) -> None:
     crs = {"epsg": 32632, "offset_m": [-550000, -5634000]}
     scene = load(tmp_path, {"fcd": "f.csv"}, (700, 1200), crs=crs)
     by_net = load(tmp_path, with_location(tmp_path, UTM), (700, 1200))
-    stated, own = (
+    declared, from_network = (
         geolocation.scenario_georeference(s).lon_lat_deg(np.array([[700.0, 1200.0]])) for s in (scene, by_net)
     )
-    assert np.array_equal(stated, own)
+    assert np.array_equal(declared, from_network)
     assert geolocation.world_frame_settings(scene) == {"world_frame": {"crs": [32632, -550000, -5634000]}}
     assert geolocation.world_frame_settings(by_net) == {"world_frame": {"location": [UTM, -550000, -5634000]}}
     assert geolocation.world_frame_settings(load(tmp_path, {"fcd": "f.csv"})) == {}
@@ -119,47 +120,47 @@ def test_a_scenario_may_say_it_itself(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("crs", "message"),
     [
-        ({"epsg": 4326}, r"crs.epsg: EPSG:4326 \(WGS 84\) is no map projection; a projected system in metres"),
+        ({"epsg": 4326}, r"crs.epsg: EPSG:4326 \(WGS 84\) is not a map projection. Use a projection in metres"),
         ({"epsg": 2263}, r"crs.epsg: EPSG:2263 .* counts in US survey foot"),
-        ({"epsg": 1}, "crs.epsg: 'EPSG:1' is none that is known"),
+        ({"epsg": 1}, "crs.epsg: unknown coordinate reference system 'EPSG:1'"),
         ({"epsg": 3857, "offset_m": [-1081000, -6594000]},
-         r"crs: epsg = 3857 draws lengths 1.58 times as long at the region of interest \(longitude 9.71\d*, latitude "
-         r"50.8\d*\); a system that keeps lengths there, for example epsg = 32632, with its offset_m"),
-        ({"epsg": 25832}, r"crs: epsg = 25832 .*(has no place|draws lengths|puts the region)"),  # a forgotten offset
+         r"crs: epsg = 3857 scales lengths by 1.58 at the region of interest \(longitude 9.71\d*, latitude "
+         r"50.8\d*\). Use a system .* e.g. epsg = 32632, with its offset_m"),
+        ({"epsg": 25832}, r"crs: epsg = 25832 .*(is outside of|scales lengths|puts the region)"),  # a forgotten offset
         ({"epsg": 32633, "offset_m": [-550000, -5634000]}, r"puts the region of interest [\d,]+ m from where"),
         ({"epsg": 25832, "offset_m": [-550000, -5634020]},
-         r"puts the region of interest 20 m from where the network's <location> puts it .*; "
-         r"no \[crs\], or one that agrees: netOffset \[-550000.0, -5634000.0\], projParameter '\+proj=utm \+zone=32"),
+         r"puts the region of interest 20 m from where the network's <location> puts it .*"
+         r"Remove \[crs\], or make it agree: netOffset \[-550000.0, -5634000.0\], projParameter '\+proj=utm \+zone=32"),
     ],
 )  # fmt: skip
-def test_what_contradicts_itself_is_refused(tmp_path: Path, crs: dict[str, Any], message: str) -> None:
+def test_rejects_contradictory_crs(tmp_path: Path, crs: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         geolocation.scenario_georeference(load(tmp_path, with_location(tmp_path, UTM), (700, 1200), crs=crs))
 
 
-def test_a_network_that_draws_lengths_too_long_is_refused(tmp_path: Path) -> None:
+def test_rejects_network_that_distorts_lengths(tmp_path: Path) -> None:
     """Vehicles keep their size, streets do not: at 51 degrees Web Mercator draws them 1.6 times as long."""
     scene = load(tmp_path, with_location(tmp_path, "EPSG:3857", "-1081000,-6594000"), (700, 1200))
-    with pytest.raises(InputError, match=r"the network: its <location> \(EPSG:3857\) draws lengths 1.58 times as long"):
+    with pytest.raises(InputError, match=r"the network: its <location> \(EPSG:3857\) scales lengths by 1.58"):
         geolocation.scenario_georeference(scene)
     geolocation.scenario_georeference(
         load(tmp_path, with_location(tmp_path, UTM, "0,0"), (700, 1200))
     )  # a forgotten offset is none
 
 
-def test_an_offset_needs_its_projection(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="crs: offset_m without epsg"):
+def test_rejects_offset_without_epsg(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="crs: offset_m needs epsg"):
         load(tmp_path, {"fcd": "f.csv"}, crs={"offset_m": [1, 2]})
     assert load(tmp_path, {"fcd": "f.csv"}, crs={"zero_height_m": 210.0}).crs.zero_height_m == 210.0
 
 
-def test_a_damaged_location_is_told(tmp_path: Path) -> None:
+def test_rejects_damaged_location(tmp_path: Path) -> None:
     scene = load(tmp_path, with_location(tmp_path, UTM, "here"))
     with pytest.raises(InputError, match=r"n.net.xml: <location> is not as SUMO writes it"):
         geolocation.scenario_georeference(scene)
 
 
-def test_what_sumo_says_in_words_of_its_own_is_no_frame() -> None:
+def test_projections_of_sumo_give_no_frame() -> None:
     assert geolocation.network_world_frame(None) is None
     assert geolocation.network_world_frame(Location("-", (0.0, 0.0))) is None
     assert geolocation.network_world_frame(Location(UTM, (1.0, 2.0))) is not None
