@@ -151,11 +151,6 @@ _PASTING_TEMPLATE = """\
 """
 
 
-def present_classes(summary: SiteSummary) -> list[str]:
-    """Return the classes with labels, in the order of listings."""
-    return [name for name in CLASSES if summary.classes[name]]
-
-
 def point_cloud_range_m(summary: SiteSummary) -> list[float]:
     """Return OpenPCDet's POINT_CLOUD_RANGE: lowest x, y, z, highest x, y, z.
 
@@ -173,7 +168,7 @@ def point_cloud_range_m(summary: SiteSummary) -> list[float]:
 def openpcdet_config(summary: SiteSummary) -> str:
     """Return the text of :data:`CONFIG_FILE`."""
     grid = point_cloud_range_m(summary)
-    names = present_classes(summary)
+    names = [name for name in CLASSES if summary.classes[name]]
     pasted = [name for name in names if summary.pasted[name]]
     pasting = ""
     if pasted:

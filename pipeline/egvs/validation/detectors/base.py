@@ -8,7 +8,8 @@ more method, see :class:`JointDetector`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, Protocol, TypeGuard
+from dataclasses import dataclass
+from typing import Any, ClassVar, Generic, Protocol, TypeGuard, TypeVar
 
 import numpy as np
 
@@ -71,6 +72,20 @@ class JointSiteDetector(Protocol):
     def detect(self, sweeps: Sequence[Sweep]) -> Detections:
         """Return the vehicles in the sweeps of one instant, one of each sensor in the order of the sites."""
         raise NotImplementedError
+
+
+JointSiteDetectorT = TypeVar("JointSiteDetectorT", bound=JointSiteDetector, covariant=True)
+
+
+@dataclass(frozen=True)
+class AtOneSite(Generic[JointSiteDetectorT]):
+    """A joint detector at a single site."""
+
+    joint: JointSiteDetectorT
+
+    def detect(self, sweep: Sweep) -> Detections:
+        """Return the vehicles of one sweep."""
+        return self.joint.detect((sweep,))
 
 
 class JointDetector(Detector, Protocol):

@@ -46,7 +46,7 @@ from egvs.core.grid import FloatArray, IntArray, Roi
 from egvs.kernels import detection
 from egvs.validation.detectors import background
 from egvs.validation.detectors.background import GroundMap, empty_scan_points
-from egvs.validation.detectors.base import suppress_overlaps
+from egvs.validation.detectors.base import AtOneSite, suppress_overlaps
 from egvs.validation.detectors.clustering import Clusters, Density, find_clusters
 from egvs.validation.sweeps import BoolArray, Detections, SiteView, Sweep
 
@@ -511,9 +511,9 @@ class Cluster:
         """Its parameters, and the sha256 of the table of kinds."""
         return asdict(self) | {"kinds": files.hash_file(KINDS_FILE)}
 
-    def at_site(self, view: SiteView, roi: Roi) -> ClusterAtSite:
+    def at_site(self, view: SiteView, roi: Roi) -> AtOneSite[ClusterAtSites]:
         """Prepare the detector for one site."""
-        return ClusterAtSite(self.at_sites((view,), roi))
+        return AtOneSite(self.at_sites((view,), roi))
 
     def at_sites(self, views: Sequence[SiteView], roi: Roi) -> ClusterAtSites:
         """Prepare the detector for several sites."""
@@ -524,17 +524,6 @@ class Cluster:
             above_ground = points[points[:, 2] - ground.height_m(points[:, :2]) > HEIGHTS_M[0]]
             images.append(RangeImage.from_points(above_ground - np.asarray(view.pose.position_m)))
         return ClusterAtSites(self, tuple(views), roi, ground, tuple(images))
-
-
-@dataclass(frozen=True)
-class ClusterAtSite:
-    """The detector at one site."""
-
-    joint: ClusterAtSites
-
-    def detect(self, sweep: Sweep) -> Detections:
-        """Return the vehicles of one sweep."""
-        return self.joint.detect((sweep,))
 
 
 class _VehicleBoxes(NamedTuple):

@@ -37,7 +37,7 @@ from egvs.core.errors import InputError, MissingBackendError
 from egvs.core.grid import FloatArray, IntArray, Roi
 from egvs.validation.detectors import background
 from egvs.validation.detectors.background import GroundMap
-from egvs.validation.detectors.base import suppress_overlaps
+from egvs.validation.detectors.base import AtOneSite, suppress_overlaps
 from egvs.validation.sweeps import BoolArray, Detections, SiteView, Sweep
 
 if TYPE_CHECKING:
@@ -346,24 +346,13 @@ class PointPillars:
         """The sha256 of the model."""
         return {"model": files.hash_file(self.model)}
 
-    def at_site(self, view: SiteView, roi: Roi) -> _AtSite:
+    def at_site(self, view: SiteView, roi: Roi) -> AtOneSite[_AtSites]:
         """Prepare the detector for one site."""
-        return _AtSite(self.at_sites((view,), roi))
+        return AtOneSite(self.at_sites((view,), roi))
 
     def at_sites(self, views: Sequence[SiteView], roi: Roi) -> _AtSites:
         """Prepare the detector for several sites."""
         return _AtSites(OnnxModel.load(self.model), tuple(views), roi)
-
-
-@dataclass(frozen=True)
-class _AtSite:
-    """The detector at one site."""
-
-    joint: _AtSites
-
-    def detect(self, sweep: Sweep) -> Detections:
-        """Return the vehicles of one sweep."""
-        return self.joint.detect((sweep,))
 
 
 @dataclass(frozen=True)
