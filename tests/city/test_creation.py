@@ -208,7 +208,7 @@ def test_radius_limits_streets_and_junctions(extract: Path, tmp_path: Path) -> N
         ("tower,50.0,10.05", "junction tower: the nearest junction of three or more streets is"),
         ("tower,50.0,10.0\nother,50.0,10.00001", "junction other: these coordinates select the same junction as tower"),
         ("tower,50.0,10.0\nTower,50.0,10.00001", "junction Tower: this name occurs twice"),
-        ("a/b,50.0,10.0", "junction a/b: junction: expected a name without"),
+        ("a/b,50.0,10.0", "junction a/b: junction: invalid name 'a/b'"),
         ("", "junctions.csv: the table has no junctions"),
         ("tower,95,10.0", "junction tower: lat_deg: expected a number from -90 to 90, got '95'"),
     ],

@@ -50,7 +50,7 @@ def test_reads_table_as_written(tmp_path: Path) -> None:
     [
         ([], "junctions.csv: the table has no junctions. Add at least one row"),
         ([ROW, ROW.replace("j1", "J1")], "junction J1: this name occurs twice"),
-        ([ROW.replace("j1", "a/b")], "junction a/b: junction: expected a name without spaces"),
+        ([ROW.replace("j1", "a/b")], "junction a/b: junction: invalid name 'a/b'"),
         ([ROW.replace("10.5", "nan")], "junction j1: x_m: expected a number from -1e+08 to 1e+08, got 'nan'"),
         ([ROW.replace("50.1", "91")], "junction j1: lat_deg: expected a number from -90 to 90, got '91'"),
         ([ROW.replace("9.2", "east")], "junction j1: lon_deg: expected a number from -180 to 180, got 'east'"),

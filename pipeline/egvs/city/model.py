@@ -198,8 +198,7 @@ def _check_name(where: str, name: str, other_names: Collection[str]) -> None:
     try:
         TypeAdapter(Name).validate_python(name)
     except ValidationError:
-        problem = f"expected {NAME_DESCRIPTION}, got {repr(name)[:80]}"
-        raise InputError(f"{where}: junction", problem, "Rename the junction.") from None
+        raise InputError(f"{where}: junction", f"invalid name {repr(name)[:80]}", NAME_DESCRIPTION) from None
     if name.casefold() in other_names:
         raise InputError(where, "this name occurs twice", "Give each junction a name of its own.")
 
