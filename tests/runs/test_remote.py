@@ -103,7 +103,7 @@ def test_unreachable_store_is_reported_once(
 
 
 def test_rejects_unknown_url_scheme() -> None:
-    with pytest.raises(InputError, match=r"nowhere://x: cannot be reached .*; a place that this machine may read and"):
+    with pytest.raises(InputError, match=r"nowhere://x: cannot be reached .*\. Check that this machine may read and"):
         RemoteStore("nowhere://x")
 
 

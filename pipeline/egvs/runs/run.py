@@ -92,11 +92,11 @@ def run(
     check_no_overwrite(scenario, folder)
     with lock_run_folder(folder, wait_s), files.hold_inputs(except_in=folder):
         context = open_folder(scenario, folder, jobs=jobs, progress=progress)
-        run = _Run(context, start_record(scenario, folder), listener)
+        current = _Run(context, start_record(scenario, folder), listener)
         for stage in STAGE_NAMES:
             if stage in only:
-                run.ensure_stage(stage, (options or {}).get(stage, {}))
-        return run.finish(keep=(*only, "report"))
+                current.ensure_stage(stage, (options or {}).get(stage, {}))
+        return current.finish(keep=(*only, "report"))
 
 
 def run_one(
@@ -118,9 +118,9 @@ def run_one(
         record = start_record(scenario, out)
         recorded = stages.recorded_digests(record)
         context = open_folder(scenario, out, jobs=jobs, progress=progress, recorded=recorded)
-        run = _Run(context, record, listener)
-        run.ensure_stage(stage, options, again=True)
-        return run.finish(keep=(stage,))
+        current = _Run(context, record, listener)
+        current.ensure_stage(stage, options, again=True)
+        return current.finish(keep=(stage,))
 
 
 def refresh_report(out: Path) -> Path | None:
@@ -147,9 +147,9 @@ def refresh_report(out: Path) -> Path | None:
     for stage in inputs:
         if not _is_up_to_date(stage, context, record) or not _is_intact(context, record.stages[stage]):
             return None
-    run = _Run(context, record, complete=set(inputs))
-    run.ensure_stage("report", {})
-    run.finish(keep=STAGE_NAMES)
+    current = _Run(context, record, complete=set(inputs))
+    current.ensure_stage("report", {})
+    current.finish(keep=STAGE_NAMES)
     return folder.report
 
 
