@@ -135,10 +135,9 @@ def read_fcd(path: Path, element: str = "vehicle") -> Iterator[pa.Table]:
         raise InputError(path, "is empty", EXPECTED_FCD)
     if head.startswith(b"<"):
         yield from _checked_tables(_read_xml(path, element), path, f"{element} element")
-    elif head.startswith(b"PAR1"):
-        yield from _checked_tables(_read_parquet(path, element), path, "row")
     else:
-        yield from _checked_tables(_read_csv(path, element), path, "row")
+        read = _read_parquet if head.startswith(b"PAR1") else _read_csv
+        yield from _checked_tables(read(path, element), path, "row")
 
 
 def _read_csv(path: Path, element: str) -> Iterator[pa.RecordBatch]:
@@ -216,9 +215,7 @@ def _check_rows(metadata: Any, path: Path) -> None:
     groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
     largest = max((group.total_byte_size for group in groups), default=0)
     limits.UNPACKED.check_bytes(path, largest, f"has a row group of {largest / limits.MB:,.0f} MB, unpacked")
-    packed = 0
-    for group in groups:
-        packed += sum(group.column(i).total_compressed_size for i in range(group.num_columns))
+    packed = sum(group.column(i).total_compressed_size for group in groups for i in range(group.num_columns))
     if metadata.num_rows > _MAX_ROWS_PER_BYTE * packed:
         raise InputError(path, f"declares {metadata.num_rows:,} rows in {packed:,} bytes", _COMPLETE_FILE)
 
@@ -268,15 +265,13 @@ def _source_columns(names: list[str], path: Path, element: str) -> dict[str, str
 
 def _checked_tables(batches: Iterable[pa.RecordBatch], path: Path, unit: str) -> Iterator[pa.Table]:
     """Convert batches to :data:`FCD_SCHEMA`; check that numbers are finite and times are in order."""
-    rows_read = 0
-    last_ms = None
+    rows_read, last_ms = 0, None
     for batch in batches:
         rows = _RowBatch(batch, rows_read, path, unit)
         rows_read += batch.num_rows
         rows.check_types()
-        for name in ("time", "x", "y", "angle", *_OPTIONAL_DEFAULTS):
-            if name in rows.columns:
-                rows.check_finite(name)
+        for name in [name for name in rows.columns if name not in _STRINGS]:
+            rows.check_finite(name)
         time_ms = rows.milliseconds()
         if time_ms.size:
             rows.check_order(time_ms, last_ms)
@@ -302,8 +297,7 @@ class _RowBatch:
         has_vehicle = pc.and_(pc.is_valid(names), pc.fill_null(pc.not_equal(names, ""), False))
         self.columns: dict[str, Any] = {n: pc.filter(batch.column(n), has_vehicle) for n in batch.schema.names}
         self._row = _true_positions(has_vehicle) + rows_before + 1
-        self._path = path
-        self._unit = unit
+        self._where = f"{path}: {unit}"
 
     def check_types(self) -> None:
         for i in _true_positions(pc.fill_null(pc.equal(self.columns["type"], ""), True)):
@@ -329,8 +323,7 @@ class _RowBatch:
         return rounded.astype(np.int64)
 
     def check_order(self, time_ms: NDArray[np.int64], last_ms: int | None) -> None:
-        first_ms = time_ms[0] if last_ms is None else last_ms
-        before = np.concatenate([[first_ms], time_ms[:-1]])
+        before = np.concatenate([[time_ms[0] if last_ms is None else last_ms], time_ms[:-1]])
         for i in np.flatnonzero(time_ms < before):
             problem = f"time {time_ms[i] / 1000:g} s comes after {before[i] / 1000:g} s"
             raise self._error(i, problem, "Sort the rows by time.")
@@ -339,7 +332,7 @@ class _RowBatch:
         return f"vehicle {self.columns['id'][int(i)].as_py()!r}"
 
     def _error(self, i: np.int64, problem: str, hint: str) -> InputError:
-        return InputError(f"{self._path}: {self._unit} {self._row[i]}", problem, hint)
+        return InputError(f"{self._where} {self._row[i]}", problem, hint)
 
 
 def _to_table(columns: dict[str, Any], time_ms: NDArray[np.int64]) -> pa.Table:
@@ -432,9 +425,7 @@ class _FrameBuffer:
         if self.first_ms is None:
             self.last_ms = int(time_ms[0])
             self.time_steps = 1
-            self.first_ms = window.first_ms
-            if self.first_ms is None:
-                self.first_ms = self.last_ms + window.skip_ms
+            self.first_ms = self.last_ms + window.skip_ms if window.first_ms is None else window.first_ms
         steps = np.diff(time_ms, prepend=self.last_ms)
         steps = steps[steps > 0]
         self.time_steps += steps.size
@@ -445,10 +436,8 @@ class _FrameBuffer:
         rows = np.flatnonzero((remainder == 0) & (frame >= 0) & (frame < window.count))
         if rows.size:
             self.frames.append(frame[rows])
-            if rows[-1] - rows[0] + 1 == rows.size:
-                self.tables.append(table.slice(int(rows[0]), rows.size))
-            else:
-                self.tables.append(table.take(rows))
+            is_run = rows[-1] - rows[0] + 1 == rows.size
+            self.tables.append(table.slice(int(rows[0]), rows.size) if is_run else table.take(rows))
             buffered = sum(table.num_rows for table in self.tables)
             problem = f"has more than {limits.ROWS.maximum:,} vehicles in the frames of a group"
             limits.ROWS.check(self.where, buffered, problem)
@@ -510,9 +499,8 @@ def check_span(
             f"{file} has {available} frames {period_s:g} s apart after a warm-up of {window.skip_ms / 1000:g} s"
             f" ({time_steps} time steps in all)"
         )
-        raise InputError(
-            f"{where}: frames = {window.count}", problem, f"Use at most {available} frames, or a shorter warmup_s."
-        )
+        hint = f"Use at most {available} frames, or a shorter warmup_s."
+        raise InputError(f"{where}: frames = {window.count}", problem, hint)
 
 
 def merge_groups(vehicles: FrameGroup, persons: FrameGroup) -> FrameGroup:

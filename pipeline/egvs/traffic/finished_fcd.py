@@ -18,7 +18,7 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 from xml.etree.ElementTree import Element, SubElement, tostring
 
 import numpy as np
@@ -34,7 +34,6 @@ from egvs.scenario.fields import Name, Positive, StrictModel
 from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import VehicleKind
 from egvs.traffic import fcd, sumo, sumo_folder
-from egvs.traffic.fcd import FrameWindow, check_span
 from egvs.traffic.vehicle_boxes import VehicleSize
 
 _MARKER_KEY = "period_ms"
@@ -71,9 +70,7 @@ class FcdMetadata(StrictModel):
 
 def read_fcd_metadata(path: Path) -> FcdMetadata | None:
     """Read the metadata of a finished file, if any; InputError if it is invalid."""
-    if not path.is_file():
-        return None
-    raw = fcd.fcd_metadata(path)
+    raw = fcd.fcd_metadata(path) if path.is_file() else None
     if raw is None:
         return None
     hint = "Use an unaltered file; create it again."
@@ -122,12 +119,8 @@ def kind_sizes(kinds: Collection[VehicleKind]) -> dict[str, VehicleSize]:
 def known_sizes(scenario: Scenario) -> dict[str, VehicleSize]:
     """Return the sizes that are known without starting SUMO: from the scenario, and the metadata of a finished file."""
     traffic = scenario.traffic
-    metadata = None
-    if traffic.fcd is not None:
-        metadata = read_fcd_metadata(scenario.find(traffic.fcd, "traffic.fcd"))
-    if metadata is None:
-        return kind_sizes(traffic.kinds)
-    return metadata.sizes | kind_sizes(traffic.named_kinds)
+    metadata = None if traffic.fcd is None else read_fcd_metadata(scenario.find(traffic.fcd, "traffic.fcd"))
+    return kind_sizes(traffic.kinds) if metadata is None else metadata.sizes | kind_sizes(traffic.named_kinds)
 
 
 def sizes_of_types(
@@ -319,15 +312,8 @@ def survey_fcd(path: Path, until_ms: int | None = None) -> FcdSurvey:
     return FcdSurvey(last_ms - first_ms, time_steps, step_ms, frozenset(types))
 
 
-class RecordedFrames(NamedTuple):
-    """The frames of a finished file, and its content up to the last one."""
-
-    window: FrameWindow
-    survey: FcdSurvey
-
-
-def fcd_window(scenario: Scenario) -> RecordedFrames:
-    """Find the frames in the finished file of a scenario.
+def fcd_window(scenario: Scenario) -> tuple[fcd.FrameWindow, FcdSurvey]:
+    """Find the frames in the finished file of a scenario, and its content up to the last one.
 
     Raises
     ------
@@ -340,19 +326,18 @@ def fcd_window(scenario: Scenario) -> RecordedFrames:
     path = scenario.find(traffic.fcd, "traffic.fcd")
     period_ms = max(1, sumo_folder.to_milliseconds(traffic.frame_period_s, f"{where}.frame_period_s"))
     skip_ms = sumo_folder.to_milliseconds(traffic.warmup_s + (traffic.begin_s or 0.0), f"{where}.warmup_s")
-    until_ms = None
-    if traffic.frames is not None:
-        until_ms = skip_ms + (traffic.frames - 1) * period_ms
+    until_ms = None if traffic.frames is None else skip_ms + (traffic.frames - 1) * period_ms
     survey = _cached_survey(path, path.stat().st_mtime_ns, until_ms)
     frames = traffic.frames or (survey.duration_ms - skip_ms) // period_ms + 1
     if frames < 1:
         problem = f"the duration of {path.name} is {survey.duration_ms / 1000:g} s"
         raise InputError(f"{where}.warmup_s = {traffic.warmup_s:g}", problem, "Use a shorter warm-up.")
-    window = FrameWindow(frames, period_ms, skip_ms=skip_ms)
-    if survey.metadata is not None:
-        window = FrameWindow(frames, period_ms, first_ms=skip_ms, skip_ms=skip_ms, complete=True)
-    check_span(window, survey.duration_ms - skip_ms, survey.step_ms, survey.time_steps, where, file=str(traffic.fcd))
-    return RecordedFrames(window, survey)
+    is_complete = survey.metadata is not None
+    window = fcd.FrameWindow(frames, period_ms, skip_ms if is_complete else None, skip_ms, is_complete)
+    fcd.check_span(
+        window, survey.duration_ms - skip_ms, survey.step_ms, survey.time_steps, where, file=str(traffic.fcd)
+    )
+    return window, survey
 
 
 @lru_cache(maxsize=4)
@@ -362,6 +347,4 @@ def _cached_survey(path: Path, _modified_ns: int, until_ms: int | None) -> FcdSu
 
 def recorded_frames(scenario: Scenario) -> int:
     """Return the number of frames that a scenario records: ``traffic.frames``, or all of a finished file."""
-    if scenario.traffic.frames is not None:
-        return scenario.traffic.frames
-    return fcd_window(scenario).window.count
+    return fcd_window(scenario)[0].count if scenario.traffic.frames is None else scenario.traffic.frames

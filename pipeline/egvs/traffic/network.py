@@ -50,9 +50,7 @@ class Permission:
         """Parse ``allow`` and ``disallow`` of a ``<lane>`` or a ``<connection>``."""
         allow = attributes.get("allow", "")
         disallow = frozenset(attributes.get("disallow", "").split())
-        if allow in ("", "all"):
-            return cls(None, disallow)
-        return cls(frozenset(allow.split()), disallow)
+        return cls(None if allow in ("", "all") else frozenset(allow.split()), disallow)
 
     def admits(self, vclass: str) -> bool:
         """Whether vehicles of a vClass may use it."""
@@ -71,11 +69,8 @@ class Shape:
     @cached_property
     def shape_m(self) -> NDArray[np.float64]:
         """Points in metres, shape (n, 3), float64; z is 0 where the file has none."""
-        points = []
         try:
-            for point in self.text.split():
-                coordinates = [parse_coordinate_m(value) for value in point.split(",")]
-                points.append([*coordinates, 0.0][:3])
+            points = [[*map(parse_coordinate_m, point.split(",")), 0.0][:3] for point in self.text.split()]
             return np.array(points, dtype=np.float64).reshape(-1, 3)
         except ValueError as error:
             raise InputError(self.where, f"invalid coordinates in a shape ({error})", _HINT) from None
@@ -323,7 +318,8 @@ def _read_network_file(file: _NamedFile, _content: str) -> Network:
                 case "junction":
                     junctions.append(_parse_junction(element.attrib, file.name))
                 case "tlLogic":
-                    cycle_s = max(cycle_s, _parse_cycle_s(element))
+                    durations_s = [float(p.get("maxDur", p.attrib["duration"])) for p in element.iter("phase")]
+                    cycle_s = max(cycle_s, sum(durations_s))
                 case "location":
                     location = _parse_location(element)
         except (KeyError, ValueError, IndexError) as error:
@@ -367,27 +363,19 @@ def _parse_location(element: Element) -> Location:
     return Location(element.get("projParameter", ""), (x, y))
 
 
-def _parse_cycle_s(signal: Element) -> float:
-    """Return the longest cycle of a signal program."""
-    return sum(float(phase.get("maxDur", phase.attrib["duration"])) for phase in signal.iter("phase"))
-
-
 def _parse_edge(element: Element, path: Path) -> Edge:
     function, start, end, name, kind = (element.get(key, "") for key in ("function", "from", "to", "name", "type"))
     lanes = tuple(_parse_lane(lane, path) for lane in element.iter("lane"))
     edge = Edge(element.attrib["id"], function, start, end, name, lanes, kind)
     if not function:
-        for key in ("from", "to"):
-            if not element.get(key):
-                raise KeyError(key)
+        if not start or not end:
+            raise KeyError("to" if start else "from")
         _ = edge.start_m, edge.end_m  # raises where a road has no lane, or no coordinates
     return edge
 
 
 def _parse_lane(lane: Element, path: Path) -> Lane:
-    width_m = None
-    if "width" in lane.attrib:
-        width_m = float(lane.attrib["width"])
+    width_m = float(lane.attrib["width"]) if "width" in lane.attrib else None
     length_m = float(lane.get("length", 0))
     speed_m_s = float(lane.get("speed", DEFAULT_SPEED_M_S))
     where = f"{path}: lane {lane.get('id', '')}"

@@ -26,14 +26,11 @@ from egvs.formats import xml
 from egvs.formats.georeference import Georeference
 from egvs.scenario.model import Scenario
 from egvs.traffic import demand, fcd, finished_fcd, network, sumo, sumo_folder
-from egvs.traffic.demand import CountFit
-from egvs.traffic.fcd import FrameWindow
 from egvs.traffic.sumo_folder import SimulationFolder, Timing
 from egvs.traffic.vehicle_boxes import TrafficHook, VehicleSize
 
 _MIN_STANDING_LIMIT_S = 180.0
 _MAX_WAITING_SHARE = 0.02
-_MAX_LOCATIONS = 3
 _TABLES = (sumo_folder.FCD_FILE, sumo_folder.PERSONS_FILE)
 _XML_ROOTS = {
     sumo_folder.COLLISIONS_FILE: "collisions",
@@ -52,7 +49,7 @@ class RecordingSummary:
     flags: list[str] | None
     collisions: int
     notes: list[str] = field(default_factory=list)
-    counts: list[CountFit] = field(default_factory=list)
+    counts: list[demand.CountFit] = field(default_factory=list)
     warnings: list[Diagnostic] = field(default_factory=list)
 
 
@@ -85,7 +82,7 @@ class Recording:
     """
 
     rows: Iterable[pa.Table]
-    window: FrameWindow
+    window: fcd.FrameWindow
     sizes: Mapping[str, VehicleSize]
     where: str
     standing_limit_s: float | None = None
@@ -168,9 +165,8 @@ def _record_simulated(
     prepared = sumo_folder.prepare_simulation(scenario, folder, extensions)
     sources = ", ".join(path.name for path in prepared.sources)
     try:
-        if prepared.is_generated:
-            sizes = finished_fcd.kind_sizes(scenario.traffic.kinds)
-        else:
+        sizes = finished_fcd.kind_sizes(scenario.traffic.kinds)
+        if not prepared.is_generated:
             sizes = sumo.query_sizes(["-c", sumo_folder.CONFIG_FILE], folder)
         for extension in extensions:
             sizes |= extension.sizes()
@@ -186,9 +182,7 @@ def _record_simulated(
         summary = RecordingSummary(
             sumo.sumo_version(), duration_s, flags, len(collisions), prepared.notes, fits, warnings
         )
-        persons = None
-        if prepared.has_extra_traffic:
-            persons = _read_rows(folder / sumo_folder.PERSONS_FILE, "person")
+        persons = _read_rows(folder / sumo_folder.PERSONS_FILE, "person") if prepared.has_extra_traffic else None
         yield Recording(
             _read_rows(folder / sumo_folder.FCD_FILE, "vehicle"),
             prepared.timing.window(),
@@ -208,9 +202,7 @@ def _record_simulated(
 
 def _read_rows(path: Path, element: str) -> Iterable[pa.Table]:
     """Read an FCD file that SUMO wrote; without rows, it is a line end without a header."""
-    if path.stat().st_size > 1:
-        return fcd.read_fcd(path, element)
-    return ()
+    return fcd.read_fcd(path, element) if path.stat().st_size > 1 else ()
 
 
 @contextmanager
@@ -219,9 +211,7 @@ def _record_running(scenario: Scenario, host: str, port: int, extensions: Sequen
     inputs = sumo_folder.demand_files(scenario)
     timing = sumo_folder.make_timing(scenario.traffic, inputs.begin_s, where)
     net_file = inputs.files["net-file"][0]
-    cycle_s = 0.0
-    if not network.is_osm(net_file):
-        cycle_s = network.read_net_xml(net_file).cycle_s
+    cycle_s = 0.0 if network.is_osm(net_file) else network.read_net_xml(net_file).cycle_s
     observations = TraciObservations()
     persons = any(extension.ADDS_TRAFFIC for extension in extensions)
     with sumo.connect_traci(host, port) as connection:
@@ -455,9 +445,8 @@ class Collision:
     @property
     def location(self) -> str:
         """The junction or the edge, e.g. ``"junction J1"``."""
-        if self.lane.startswith(":"):
-            return f"junction {self.lane[1:].rsplit('_', 2)[0]}"
-        return f"edge {self.lane.rpartition('_')[0]}"
+        lane = self.lane
+        return f"junction {lane[1:].rsplit('_', 2)[0]}" if lane.startswith(":") else f"edge {lane.rpartition('_')[0]}"
 
 
 def _read_collisions(prepared: SimulationFolder) -> dict[tuple[str, str], Collision]:
@@ -479,12 +468,10 @@ def _collision_warning(collisions: dict[tuple[str, str], Collision], scenario: S
     numbers = Counter(collision.location for collision in collisions.values())
     at_m = {collision.location: collision.at_m for collision in collisions.values()}
     locations = []
-    for location, number in numbers.most_common(_MAX_LOCATIONS):
-        text = f"{number} at {location}"
+    for location, number in numbers.most_common(3):
         point_m = at_m[location]
-        if point_m is not None:
-            text += f" ({describe_distance(point_m, scenario.roi.box)})"
-        locations.append(text)
+        distance = "" if point_m is None else f" ({describe_distance(point_m, scenario.roi.box)})"
+        locations.append(f"{number} at {location}{distance}")
     pairs = "a pair" if len(collisions) == 1 else f"{len(collisions)} pairs"
     problem = f"{pairs} of vehicles collided and drove through each other: {', '.join(locations)}"
     hint = "Check right of way, signals, and the space for waiting on the junctions there, in sumo-gui."
@@ -493,13 +480,9 @@ def _collision_warning(collisions: dict[tuple[str, str], Collision], scenario: S
 
 def describe_distance(at_m: tuple[float, float], roi: Roi) -> str:
     """Describe the horizontal distance of a point in the world frame from the region of interest."""
-    offsets_m = []
-    for position_m, low_m, size_m in zip(at_m, roi.origin_m[:2], roi.size_m[:2], strict=True):
-        offsets_m.append(max(low_m - position_m, position_m - low_m - size_m, 0.0))
-    distance_m = math.hypot(*offsets_m)
-    if not distance_m:
-        return "in the region of interest"
-    return f"{distance_m:.0f} m from the region of interest"
+    axes = zip(at_m, roi.origin_m[:2], roi.size_m[:2], strict=True)
+    distance_m = math.hypot(*(max(low - x, x - low - size, 0.0) for x, low, size in axes))
+    return f"{distance_m:.0f} m from the region of interest" if distance_m else "in the region of interest"
 
 
 def _insertion_warning(prepared: SimulationFolder, scenario: Scenario) -> list[Diagnostic]:
@@ -521,7 +504,7 @@ def _vehicle_counts(prepared: SimulationFolder) -> dict[str, int]:
     return {key: int(vehicles.get(key, "0")) for key in ("loaded", "running", "waiting")}
 
 
-def _compare_counts(scenario: Scenario, prepared: SimulationFolder) -> tuple[list[CountFit], list[Diagnostic]]:
+def _compare_counts(scenario: Scenario, prepared: SimulationFolder) -> tuple[list[demand.CountFit], list[Diagnostic]]:
     """Compare simulated flows with the counts of a scenario, if it has any."""
     if not prepared.has_counts:
         return [], []

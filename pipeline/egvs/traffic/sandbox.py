@@ -58,11 +58,7 @@ def restrict_writes_to(folder: str, libc: ctypes.CDLL) -> bool:
     version = libc.syscall(_CREATE_RULESET, None, ctypes.c_size_t(0), ctypes.c_uint32(_VERSION_FLAG))
     if version < 1:
         return False
-    handled = _WRITE_FILE | _MAKE_AND_REMOVE
-    if version >= 2:
-        handled |= _REFER
-    if version >= 3:
-        handled |= _TRUNCATE
+    handled = _WRITE_FILE | _MAKE_AND_REMOVE | (_REFER if version >= 2 else 0) | (_TRUNCATE if version >= 3 else 0)
     attributes = ctypes.create_string_buffer(struct.pack("=Q", handled), 8)
     rules = libc.syscall(_CREATE_RULESET, attributes, ctypes.c_size_t(8), ctypes.c_uint32(0))
     if rules < 0:

@@ -197,9 +197,8 @@ def _run_command(name: str, command: Sequence[str], folder: Path, log: Path, wat
         with _start_program(command, folder, subprocess.PIPE, stderr) as process:
             output, errors = _wait(process, watch)
     if process.returncode:
-        if has_log:
-            errors = log.read_bytes()
-        raise program_error(name, process.returncode, errors.decode("utf-8", "replace"))
+        text = log.read_bytes() if has_log else errors
+        raise program_error(name, process.returncode, text.decode("utf-8", "replace"))
     return output.decode("utf-8", "replace")
 
 
@@ -259,13 +258,10 @@ def program_error(name: str, code: int, text: str) -> RunError:
         return MissingBackendError(f"{name} cannot be started: {reason}")
 
     errors = [line for line in lines if not line.startswith(("Warning", "Quitting", "pj_obj_create"))] or lines[-1:]
-    kind: type[RunError] = SumoInputError
-    problem = f"ended with exit code {code}"
-    if -code in _CRASHES:
-        problem = f"crashed with signal {-code}"
-    elif code < 0:
-        kind = RunError
-        problem = f"was killed by signal {-code}"
+    is_crash = -code in _CRASHES
+    verb = "crashed with" if is_crash else "was killed by"
+    problem = f"{verb} signal {-code}" if code < 0 else f"ended with exit code {code}"
+    kind = SumoInputError if code > 0 or is_crash else RunError
     return kind("\n".join([f"{name} {problem}:", *(f"  {line[:_MAX_ERROR_LENGTH]}" for line in errors[:_MAX_ERRORS])]))
 
 

@@ -26,7 +26,6 @@ from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import TrafficConfig
 from egvs.traffic import demand, network, sumo, user_files
 from egvs.traffic.fcd import FrameWindow
-from egvs.traffic.user_files import DemandFiles
 from egvs.traffic.vehicle_boxes import TrafficHook
 
 CONFIG_FILE, NETWORK_FILE, TRIPS_FILE, VTYPES_FILE = "run.sumocfg", "network.net.xml", "trips.rou.xml", "vtypes.add.xml"
@@ -113,9 +112,7 @@ def make_timing(traffic: TrafficConfig, begin_s: float, where: str) -> Timing:
         raise InputError(f"{where}.step_s = {traffic.step_s:g}", "expected at least 0.001 s", "Use a longer step.")
     period_ms = _whole_steps_ms(traffic.frame_period_s, step_ms, f"{where}.frame_period_s")
     warmup_ms = _whole_steps_ms(traffic.warmup_s, step_ms, f"{where}.warmup_s")
-    if traffic.begin_s is not None:
-        begin_s = traffic.begin_s
-    begin_ms = to_milliseconds(begin_s, f"{where}: begin")
+    begin_ms = to_milliseconds(begin_s if traffic.begin_s is None else traffic.begin_s, f"{where}: begin")
     assert traffic.frames is not None, "a simulation has an end"
     return Timing(begin_ms, begin_ms + warmup_ms, period_ms, step_ms, traffic.frames)
 
@@ -130,7 +127,7 @@ def _whole_steps_ms(value_s: float, step_ms: int, where: str) -> int:
     return value_ms
 
 
-def demand_files(scenario: Scenario) -> DemandFiles:
+def demand_files(scenario: Scenario) -> user_files.DemandFiles:
     """Return the inputs of a scenario's simulation; InputError if a file is missing."""
     traffic = scenario.traffic
     if traffic.sumocfg is not None:
@@ -139,7 +136,7 @@ def demand_files(scenario: Scenario) -> DemandFiles:
     files: dict[str, tuple[Path, ...]] = {"net-file": (scenario.find(traffic.network, "traffic.network"),)}
     if traffic.routes:
         files["route-files"] = tuple(scenario.find(name, "traffic.routes") for name in traffic.routes)
-    return DemandFiles(files)
+    return user_files.DemandFiles(files)
 
 
 def network_path(scenario: Scenario) -> Path | None:
@@ -232,12 +229,9 @@ class SimulationFolder:
     @property
     def outputs(self) -> dict[str, str]:
         """Options for the outputs of SUMO that are needed."""
-        attributes = _FCD_ATTRIBUTES
-        if self.roads.has_heights:
-            attributes += ",z,slope"
         options = {
             "fcd-output": FCD_FILE,
-            "fcd-output.attributes": attributes,
+            "fcd-output.attributes": _FCD_ATTRIBUTES + (",z,slope" if self.roads.has_heights else ""),
             "fcd-output.skip-empty": "true",
             "device.fcd.begin": _format_seconds(self.timing.first_ms),
             "device.fcd.period": _format_seconds(self.timing.period_ms),
@@ -384,7 +378,9 @@ def _write_trips(
     ]
 
 
-def _copy_files(inputs: DemandFiles, folder: Path, extra_files: Iterable[str]) -> tuple[dict[str, str], list[str]]:
+def _copy_files(
+    inputs: user_files.DemandFiles, folder: Path, extra_files: Iterable[str]
+) -> tuple[dict[str, str], list[str]]:
     """Copy the input files; return the names of the copies by option, and notes for the user."""
     used = {*_RESERVED_NAMES, *extra_files}
     copies, notes = {}, []

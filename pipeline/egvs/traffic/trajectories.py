@@ -21,7 +21,6 @@ from egvs.core.grid import Roi
 from egvs.core.runtime import ProgressCallback
 from egvs.scenario.model import Scenario
 from egvs.traffic import fcd, vehicle_boxes
-from egvs.traffic.fcd import FrameGroup
 from egvs.traffic.recording import Recording, describe_distance
 from egvs.traffic.vehicle_boxes import BoxChange, Ints, TrafficHook, VehicleBoxes
 
@@ -74,8 +73,7 @@ def find_overlaps(boxes: VehicleBoxes) -> NDArray[np.int64]:
     side = max(2 * half.max(), max(np.ptp(boxes.x_m), np.ptp(boxes.y_m)) / _MAX_CELLS)
     column = np.floor((boxes.x_m - boxes.x_m.min()) / side).astype(np.int64)
     row = np.floor((boxes.y_m - boxes.y_m.min()) / side).astype(np.int64)
-    n_rows = int(row.max()) + 3
-    n_columns = int(column.max()) + 2
+    n_rows, n_columns = int(row.max()) + 3, int(column.max()) + 2
     cell = ((boxes.frame - boxes.first_frame) * n_columns + column) * n_rows + row + 1
     order = np.argsort(cell, kind="stable")
     cell, x, y, half = cell[order], boxes.x_m[order], boxes.y_m[order], half[order]
@@ -357,7 +355,7 @@ def write_trajectories(
     return statistics, summaries
 
 
-def frame_groups(recording: Recording, frames_each: int) -> Iterator[FrameGroup]:
+def frame_groups(recording: Recording, frames_each: int) -> Iterator[fcd.FrameGroup]:
     """Return groups of frames of a recording, with vehicles and persons."""
     groups = fcd.group_frames(recording.rows, recording.window, frames_each, recording.where)
     if recording.persons is None:

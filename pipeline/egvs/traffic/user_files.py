@@ -191,10 +191,7 @@ def has_vehicles(paths: Iterable[Path]) -> bool:
 
 def sumocfg_network_path(path: Path) -> Path | None:
     """Return the network that a configuration names, if any."""
-    for option, value in _iter_options(path):
-        if option == "net-file" and value:
-            return path.parent / value
-    return None
+    return next((path.parent / value for key, value in _iter_options(path) if key == "net-file" and value), None)
 
 
 def read_sumocfg(path: Path) -> DemandFiles:
@@ -342,9 +339,7 @@ def _check_element(element: Element, path: Path) -> None:
     """Raise an InputError for an element in a namespace, or one that makes SUMO read a further file."""
     if "}" in element.tag:
         raise InputError(path, f"<{element.tag}> is in a namespace", "Use SUMO's elements, which have none.")
-    inputs = _INPUT_ATTRIBUTES
-    if element.tag in _INPUT_ELEMENTS:
-        inputs = inputs | {"file"}
+    inputs = _INPUT_ATTRIBUTES | ({"file"} if element.tag in _INPUT_ELEMENTS else set())
     for key in sorted(inputs & element.attrib.keys()):
         if element.attrib[key] not in ("", NULL_FILE):
             problem = f"<{element.tag} {key}={element.attrib[key]!r}> makes SUMO read a further file"

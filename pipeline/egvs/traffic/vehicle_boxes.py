@@ -112,9 +112,7 @@ class VehicleBoxes:
 
     def columns(self, first_frame: int = 0) -> dict[str, Any]:
         """Return the columns of the artefact ``trajectories``; ``first_frame`` is added to the frame numbers."""
-        part = self.part
-        if part is None:
-            part = np.zeros(self.frame.size, np.int64)
+        part = np.zeros(self.frame.size, np.int64) if self.part is None else self.part
         return {
             "frame": (self.frame + first_frame).astype(np.uint32),
             "part": part.astype(np.uint8),
@@ -172,16 +170,12 @@ def boxes_from_bumpers(
     x, y, z, angle, slope, speed = (group.rows[key].to_numpy()[order] for key in keys)
     centre = box_centres(x, y, z, angle, slope, length, height)
     yaw, pitch = yaw_from_angle(angle), round_rad(np.deg2rad(slope))
-    uncounted = None
-    if uncounted_types:
-        uncounted = np.array([name in uncounted_types for name in types], dtype=np.bool_)[type_code]
+    uncounted = np.array([name in uncounted_types for name in types], dtype=np.bool_)[type_code]
     boxes = VehicleBoxes(
         group.first_frame, group.frames, frame, names, code, kinds, kind, *centre, yaw, pitch, length, width, height,
-        speed, types, type_code, uncounted=uncounted,
+        speed, types, type_code, uncounted=uncounted if uncounted_types else None,
     )  # fmt: skip
-    if np.isnan(speed).any():
-        return _fill_speeds(boxes, period_s)
-    return boxes
+    return _fill_speeds(boxes, period_s) if np.isnan(speed).any() else boxes
 
 
 def _check_sizes(types: list[str], sizes: Mapping[str, VehicleSize], where: str) -> None:
@@ -191,7 +185,6 @@ def _check_sizes(types: list[str], sizes: Mapping[str, VehicleSize], where: str)
             known = ", ".join(sorted(sizes))
             hint = f"Add a kind of that name with length_m, width_m and height_m (known: {known})."
             raise InputError(where, f"the size of vehicle type {name!r} is unknown", hint)
-    for name in types:
         for key in _SIZE_KEYS:
             value_m = getattr(sizes[name], key)
             if not MIN_BOX_M <= value_m <= MAX_BOX_M:
