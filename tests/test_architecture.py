@@ -64,7 +64,7 @@ def test_no_import_hides_in_a_string() -> None:
         if (isinstance(node, ast.Attribute) and node.attr == "import_module")
         or (isinstance(node, ast.Name) and node.id in ("__import__", "import_module"))
     }
-    assert hidden <= {"__init__.py", "core/plugins.py"}
+    assert hidden <= {"core/lazy.py"}
 
 
 @pytest.mark.slow
@@ -107,13 +107,6 @@ def test_every_folder_with_modules_is_a_package() -> None:
 # ---- what it offers
 
 
-def test_dir_shows_what_the_package_offers() -> None:
-    assert dir(egvs) == sorted(egvs.__all__)
-    assert len(set(egvs.__all__)) == len(egvs.__all__)
-    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
-        _ = egvs.nothing
-
-
 @pytest.fixture(scope="module")
 def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run of a small scenario that keeps what its sites see."""
@@ -127,7 +120,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 SCENE = "from egvs import *; s = load('mini'); scene = build_scene(s); "
 USES = {
     "EgvsError": "EgvsError('text')",
-    "InputError": "InputError('place', 'found', 'right').right == 'right'",
+    "InputError": "InputError('file', 'problem', 'Hint').hint == 'Hint'",
     "JointScore": "JointScore.of(__import__('egvs').load('mini'), 'joint').candidates == ('pole_a', 'pole_b')",
     "Pose": "Pose(1.0, 2.0, 3.0).position_m == (1.0, 2.0, 3.0)",
     "RunError": "RunError('text').exit_code == 1",

@@ -197,5 +197,6 @@ def test_source_behind_stage_key_stays_small(name: str) -> None:
     stage = stages.stage(name)
     modules = [module for module in stages.source_modules(stage.module, *stage.code) if module.startswith("egvs")]
     paths = [stages._module_path(module) for module in modules]
-    total = sum(code_lines(path) for path in paths if path is not None)
+    # An __init__.py lists public names and computes nothing.
+    total = sum(code_lines(path) for path in paths if path is not None and path.name != "__init__.py")
     assert total <= GROWTH.get(name, 1.1) * SOURCE_BEFORE[name]

@@ -116,6 +116,13 @@ def load(path: str | Path, overrides: Iterable[str] = ()) -> Scenario:
     ------
     InputError
         Naming file, key, value, and what would be right.
+
+    Examples
+    --------
+    >>> import egvs
+    >>> scenario = egvs.load("scenarios/roundabout", ["traffic.frames=100"])
+    >>> scenario.roi.size_m
+    (70.0, 70.0, 5.0)
     """
     path, overrides = Path(path), tuple(overrides)
     file = path / SCENARIO_FILE if path.is_dir() else path
