@@ -58,7 +58,7 @@ def test_an_encoding_that_is_not_read_is_refused(tmp_path: Path, declared: str) 
 
 def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
     data = b'<?xml version="1.0" encoding="Shift_JIS"?><net><e name="\x81"/></net>'
-    with pytest.raises(InputError, match=r"a.xml: cannot be read \(it is no text in cp932: byte \d+ is 0x81\)"):
+    with pytest.raises(InputError, match=r"a.xml: cannot be read \(it is no cp932 text: byte \d+ is 0x81\)"):
         names(tmp_path, data)
 
 

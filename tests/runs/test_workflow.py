@@ -265,7 +265,7 @@ def test_a_single_stage_with_other_settings_leaves_no_mixed_record(done: tuple[P
 def test_an_artefacts_name_that_is_a_folder_is_told_and_nothing_is_left(mini: Path, tmp_path: Path, run_egvs) -> None:
     (tmp_path / "out" / "scans.parquet").mkdir(parents=True)
     code, _, said = run_egvs("run", mini, "--out", tmp_path / "out")
-    assert (code, "scans.parquet: is a folder" in said) == (2, True), said
+    assert (code, "scans.parquet: expected a file, got a folder" in said) == (2, True), said
     assert not list((tmp_path / "out").glob(".*.partial"))
 
 

@@ -253,8 +253,8 @@ def test_an_effect_that_periods_forbid_is_not_advised(split: Path) -> None:
     (found,) = (call for call in effect_statuses(egvs.load(split)) if call.name == "moving_occlusion")
     assert (found.state, found.why) == (
         "off",
-        'cannot act here: method = "frames" replays all periods alike, whatever their weights;'
-        ' method = "independent" takes the mix',
+        'cannot act here: method = "frames" replays all periods alike, whatever their weights.'
+        ' Use method = "independent", which weights the periods.',
     )
 
 

@@ -67,7 +67,7 @@ def test_training_without_its_libraries(run_egvs, mini, tmp_path, monkeypatch, n
     [
         ("model.pt", "--out: expected a file that ends in .onnx, got '{}'"),
         ("model", "--out: expected a file that ends in .onnx, got '{}'"),
-        ("folder.onnx", "{}: is a folder; a file"),
+        ("folder.onnx", "{}: expected a file, got a folder"),
         ("file/model.onnx", "{}: cannot be written ("),
     ],
 )

@@ -34,7 +34,7 @@ from egvs.artefacts.readers import read_accuracy, read_scores
 from egvs.artefacts.run_folder import RunFolder, RunRecord
 from egvs.artefacts.tpog import Tpog, read_tpog
 from egvs.core import files, plugins
-from egvs.core.errors import InputError, MissingBackendError
+from egvs.core.errors import InputError, MissingBackendError, format_problem
 from egvs.core.runtime import ProgressCallback, no_progress
 from egvs.effects import registry
 from egvs.effects.articulated import Articulated
@@ -316,7 +316,7 @@ def _unnamed_effect_status(kind: type[Effect[Any]], scene: Scene, trials: Effect
     if (idle := effect.why_idle(scene)) is not None:
         return call("off", f"not called for: {idle}")
     if (refusal := effect.refusal(scene)) is not None:
-        return call("off", f"cannot act here: {refusal.problem}" + (f"; {refusal.hint}" if refusal.hint else ""))
+        return call("off", format_problem("cannot act here", refusal.problem, refusal.hint))
     seen, small, change = effect.summary(scene), False, UNTRIED
     if trials is not None:
         small, change = _try_effect(effect, trials)
