@@ -130,8 +130,8 @@ class StaticsConfig(StrictModel):
 
     footprints: tuple[str, ...] = Field(
         (),
-        description="GeoJSON files that declare their crs (null: world-frame metres); features have height_m and may have"
-        " base_m, radius_m",
+        description="GeoJSON files that declare their crs (null: world-frame metres); features have height_m and may"
+        " have base_m, radius_m",
     )
     polygons: tuple[str, ...] = Field((), description="SUMO .poly.xml files; what is solid in them goes by type")
     polygon_height_m: Positive = Field(

@@ -129,7 +129,7 @@ def _add_mesh(builder: _Builder, path: Path, model: MeshConfig, world: Georefere
         bad, right = int(np.flatnonzero(~near)[0]), f"finite coordinates, at most {MAX_COORDINATE_M:g} m"
         raise InputError(f"{path}: vertex {bad}", f"{mesh.vertices[bad].tolist()}", right)
     faces = len(mesh.faces)
-    with translate_errors(path, meshes.EXPECTED_MESH, "cannot be taken apart"):
+    with translate_errors(path, meshes.MESH_HINT, "cannot be taken apart"):
         mesh.merge_vertices(merge_tex=True, merge_norm=True)
         mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
     if len(mesh.faces) == 0:

@@ -106,7 +106,7 @@ def test_a_mesh_of_the_users_is_stretched_to_the_unit_box(mini):
         (
             "points.ply",
             lambda p: trimesh.PointCloud([[0, 0, 0], [1, 1, 1]]).export(p),
-            r"points\.ply: holds no triangles; a triangle mesh",
+            r"points\.ply: the file has no triangles",
         ),
         (
             "flat.ply",
