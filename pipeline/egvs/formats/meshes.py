@@ -146,11 +146,8 @@ def mesh_digests(path: Path, name: str) -> dict[str, str]:
 
 def _existing_files(source: Path, names: Iterable[str]) -> list[Path]:
     """Return the files with these names, relative to the folder of ``source`` or directly in it; each once."""
-    paths: dict[Path, None] = {}
-    for name in names:
-        for location in (name, name.rpartition("/")[2]):
-            paths[source.parent / location] = None
-    return [path for path in paths if _is_file(path)]
+    paths = [source.parent / location for name in names for location in (name, name.rpartition("/")[2])]
+    return [path for path in dict.fromkeys(paths) if _is_file(path)]
 
 
 def _is_file(path: Path) -> bool:
@@ -207,12 +204,10 @@ def load_mesh(path: Path, where: str) -> trimesh.Trimesh:
             raise InputError(where, "the file has no triangles", MESH_HINT)
         limits.TRIANGLES.check(where, max(len(mesh.faces), len(mesh.vertices) / 3))
         if mesh.vertices.ndim != 2 or mesh.vertices.shape[1] != 3:
-            problem = f"expected x, y and z of each vertex, got an array of the shape {mesh.vertices.shape}"
-            raise InputError(where, problem, MESH_HINT)
+            raise InputError(where, f"the vertices have the shape {mesh.vertices.shape}, not (n, 3)", MESH_HINT)
         for vertex in (mesh.faces.min(), mesh.faces.max()):
             if not 0 <= vertex < len(mesh.vertices):
-                problem = f"a triangle names vertex {vertex} of {len(mesh.vertices)}"
-                raise InputError(where, problem, MESH_HINT)
+                raise InputError(where, f"a triangle names vertex {vertex} of {len(mesh.vertices)}", MESH_HINT)
     return mesh
 
 
@@ -261,8 +256,7 @@ def _quiet_trimesh(where: str) -> Iterator[None]:
     """
     log = logging.getLogger("trimesh")
     collector = _LogCollector()
-    propagates = log.propagate
-    log.propagate = False
+    propagates, log.propagate = log.propagate, False
     log.addHandler(collector)
     try:
         with warnings.catch_warnings():

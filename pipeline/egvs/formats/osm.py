@@ -141,9 +141,8 @@ def read_osm(path: Path) -> OsmExtract:
         box = objects.header.box()
         for number, o in enumerate(objects):
             if number == limit:
-                raise InputError(
-                    path, f"has more than {limit:,} objects", f"Use a part of the map. {limits.MAP_OBJECTS.hint}"
-                )
+                hint = f"Use a part of the map. {limits.MAP_OBJECTS.hint}"
+                raise InputError(path, f"has more than {limit:,} objects", hint)
             if isinstance(o, osmium.osm.Changeset) or not o.visible or (o.type_str(), o.id) in deleted:
                 continue
             match o:
@@ -151,8 +150,7 @@ def read_osm(path: Path) -> OsmExtract:
                     if not o.location.valid():
                         raise InputError(f"{path}: node {o.id}", "has no valid position", _VALUE_HINT)
                     nodes[o.id] = (o.location.lat, o.location.lon)
-                    tags = dict(o.tags)
-                    if tags:
+                    if tags := dict(o.tags):
                         node_tags[o.id] = tags
                 case osmium.osm.Way():
                     ways[o.id] = Way(o.id, tuple(node.ref for node in o.nodes), dict(o.tags))
@@ -161,14 +159,10 @@ def read_osm(path: Path) -> OsmExtract:
                     relations[o.id] = Relation(o.id, members, dict(o.tags))
     if not nodes:
         raise InputError(path, "has no nodes", _HINT)
-    return OsmExtract(
-        nodes,
-        dict(sorted(node_tags.items())),
-        dict(sorted(ways.items())),
-        tuple(relations[number] for number in sorted(relations)),
-        _bounds(box, nodes),
-        box.valid(),
-    )
+    node_tags = dict(sorted(node_tags.items()))
+    ways = dict(sorted(ways.items()))
+    ordered = tuple(relations[number] for number in sorted(relations))
+    return OsmExtract(nodes, node_tags, ways, ordered, _bounds(box, nodes), box.valid())
 
 
 def is_pbf(path: Path) -> bool:
@@ -183,8 +177,7 @@ def write_xml(path: Path, xml: Path) -> None:
 
     with _open_osm(path) as objects:
         header = osmium.io.Header()
-        box = objects.header.box()
-        if box.valid():
+        if (box := objects.header.box()).valid():
             header.add_box(box)
         with osmium.SimpleWriter(osmium.io.File(xml, "osm"), header=header, overwrite=True) as writer:
             for o in objects:
@@ -222,8 +215,7 @@ def parse_length_m(text: str) -> float | None:
     if match := _FEET_INCHES.fullmatch(text):
         value = (float(match[1]) + float(match[2]) / 12) * _FOOT_M
     elif match := _LENGTH.fullmatch(text):
-        unit = (match[2] or "m").lower()
-        unit_m = 1.0 if unit.startswith("m") else _FOOT_M
+        unit_m = 1.0 if (match[2] or "m").lower().startswith("m") else _FOOT_M
         value = float(match[1].replace(",", ".")) * unit_m
     else:
         return None

@@ -105,9 +105,7 @@ def read_points(path: Path, where: str) -> PointCloud:
     if dropped == len(points):
         problem = f"expected at least one return with finite x, y and z, got none of {len(points)}"
         raise InputError(where, problem, COMPLETE_FILE)
-    if dropped:
-        points = points[finite]
-    return PointCloud(points, dropped)
+    return PointCloud(points[finite] if dropped else points, dropped)
 
 
 def _read_with(point_format: PointFormat, path: Path, where: str, reader: str) -> FloatArray:
@@ -124,10 +122,9 @@ def _read_with(point_format: PointFormat, path: Path, where: str, reader: str) -
         raise InputError(where, f"{reader} ended with {error!r}", hint) from error
     if not isinstance(points, np.ndarray):
         raise InputError(where, f"{reader} returns {type(points).__name__}, not an array", hint)
-    if points.dtype.kind not in "fiu":
-        raise InputError(where, f"{reader} returns an array of {points.dtype}, not of numbers", hint)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(where, f"{reader} returns an array of the shape {points.shape}, not (n, 3)", hint)
+    if points.dtype.kind not in "fiu" or points.ndim != 2 or points.shape[1] != 3:
+        problem = f"{reader} returns an array of {points.dtype} of the shape {points.shape}, not numbers (n, 3)"
+        raise InputError(where, problem, hint)
     limits.POINTS.check(where, len(points))
     return points.astype(np.float64, copy=False)
 
@@ -243,15 +240,8 @@ class RecordLayout:
         columns = (0, *accumulate(counts))
         offsets = (0, *accumulate(sizes))
         xyz = [names.index(axis) for axis in AXES]
-        return cls(
-            where,
-            n,
-            columns[-1],
-            offsets[-1],
-            tuple(columns[i] for i in xyz),
-            tuple(offsets[i] for i in xyz),
-            tuple(formats[i] for i in xyz),
-        )
+        positions = [tuple(values[i] for i in xyz) for values in (columns, offsets, formats)]
+        return cls(where, n, columns[-1], offsets[-1], *positions)
 
     def from_text(self, text: bytes, line: int, skip: int = 0, last: bool = True) -> FloatArray:
         """Return points from lines of text.
@@ -293,10 +283,8 @@ class RecordLayout:
 
     def from_blocks(self, body: bytes | bytearray) -> FloatArray:
         """Return points from binary data with one block of all values per field (PCD's binary_compressed)."""
-        columns = []
-        for kind, offset in zip(self.formats, self.offsets, strict=True):
-            columns.append(np.frombuffer(body, dtype=kind, count=self.n, offset=offset * self.n))
-        return stack_xyz(columns)
+        blocks = zip(self.formats, self.offsets, strict=True)
+        return stack_xyz([np.frombuffer(body, kind, self.n, offset * self.n) for kind, offset in blocks])
 
     def _text_error(self, rows: list[tuple[int, bytes]], error: str) -> InputError:
         """Return the error for the first line that is wrong, which numpy's message does not name."""

@@ -45,7 +45,7 @@ _WHATWG_SUPERSETS = {"shift_jis": "cp932", "gb2312": "gb18030", "gbk": "gb18030"
 _ALIASES = {"windows-31j": "cp932", "x-sjis": "cp932"}
 
 _ENCODING_DECLARATION = re.compile(rb"""(?:\xef\xbb\xbf)?<\?xml[^>]*?\bencoding\s*=\s*["']([^"']{0,80})["']""")
-_DECLARATION_BYTES = 512
+_HEAD_BYTES = 512
 _UTF_16_STARTS = (b"\xff\xfe", b"\xfe\xff", b"<\x00", b"\x00<")
 
 
@@ -53,7 +53,7 @@ def detect_encoding(start: bytes) -> str | None:
     """Return Python's name of the encoding that the ``start`` of an XML file declares; None if it is unknown."""
     if start.startswith(_UTF_16_STARTS):
         return "utf-16"
-    declared = _ENCODING_DECLARATION.match(start[:_DECLARATION_BYTES])
+    declared = _ENCODING_DECLARATION.match(start[:_HEAD_BYTES])
     if declared is None:
         return "utf-8"
     try:
@@ -69,8 +69,7 @@ class Utf8Reader:
     """Reads a file in another encoding as UTF-8; UnicodeDecodeError when its bytes are no text."""
 
     def __init__(self, file: IO[bytes], encoding: str) -> None:
-        self._file = file
-        self._decoder = codecs.getincrementaldecoder(encoding)()
+        self._file, self._decoder = file, codecs.getincrementaldecoder(encoding)()
 
     def read(self, size: int) -> bytes:
         """Return at least one byte, from about ``size`` bytes of the file; none at its end."""
@@ -82,7 +81,6 @@ class Utf8Reader:
 
 
 _GZIP_MAGIC = b"\x1f\x8b"
-_HEAD_BYTES = 512
 _MAX_DEPTH = 100
 """Nesting of elements; no file that is read here needs ten levels."""
 
@@ -148,13 +146,9 @@ def iter_elements(
     where = name or path
     encoding = file_encoding(path, where)
     with open_bounded(path, name) as file, translate_errors(where):
-        source: IO[bytes] | Utf8Reader = file
-        parser_encoding = None
-        if encoding not in PARSER_ENCODINGS:
-            source = Utf8Reader(file, encoding)
-            parser_encoding = "utf-8"
-        meter = _ElementMeter(source, where)
-        parser = DefusedXMLParser(target=TreeBuilder(), encoding=parser_encoding, forbid_dtd=True)
+        is_decoded = encoding not in PARSER_ENCODINGS
+        meter = _ElementMeter(Utf8Reader(file, encoding) if is_decoded else file, where)
+        parser = DefusedXMLParser(target=TreeBuilder(), encoding="utf-8" if is_decoded else None, forbid_dtd=True)
         events: Iterator[tuple[str, Any]] = iterparse(meter, ("start", "end"), parser)
         try:
             _, top = next(events)
@@ -195,10 +189,7 @@ def scan_attribute_values(path: Path, attribute: str) -> Iterator[bytes]:
                 end = match.end()
             # A value, or the attribute's name, may continue in the next chunk.
             begin = data.rfind(start, end)
-            if begin < 0:
-                rest = data[-len(start) :]
-            else:
-                rest = data[max(begin - 1, 0) :]
+            rest = data[-len(start) :] if begin < 0 else data[max(begin - 1, 0) :]
             limits.ELEMENT.check_bytes(path, len(rest), "has a value without end")
 
 
@@ -230,9 +221,7 @@ class _BoundedReader(io.RawIOBase):
     """The content of a compressed file; InputError when it exceeds the limit."""
 
     def __init__(self, file: IO[bytes], where: object) -> None:
-        self._file = file
-        self._where = where
-        self._bytes = 0
+        self._file, self._where, self._bytes = file, where, 0
 
     def readable(self) -> bool:
         return True
@@ -240,9 +229,8 @@ class _BoundedReader(io.RawIOBase):
     def readinto(self, buffer: Any) -> int:
         chunk = self._file.read(len(buffer))
         self._bytes += len(chunk)
-        limits.UNPACKED.check_bytes(
-            self._where, self._bytes, f"holds more than {limits.UNPACKED.maximum:,} MB, unpacked"
-        )
+        problem = f"holds more than {limits.UNPACKED.maximum:,} MB, unpacked"
+        limits.UNPACKED.check_bytes(self._where, self._bytes, problem)
         buffer[: len(chunk)] = chunk
         return len(chunk)
 
@@ -251,9 +239,7 @@ class _ElementMeter:
     """Counts the bytes read since the last child; InputError when a child is too large to be held in memory."""
 
     def __init__(self, file: IO[bytes] | Utf8Reader, where: object) -> None:
-        self.bytes_since_child = 0
-        self._file = file
-        self._where = where
+        self._file, self._where, self.bytes_since_child = file, where, 0
         self._max_mb = limits.ELEMENT.maximum
 
     def read(self, size: int) -> bytes:
