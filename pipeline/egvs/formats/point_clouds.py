@@ -240,8 +240,8 @@ class RecordLayout:
         columns = (0, *accumulate(counts))
         offsets = (0, *accumulate(sizes))
         xyz = [names.index(axis) for axis in AXES]
-        positions = [tuple(values[i] for i in xyz) for values in (columns, offsets, formats)]
-        return cls(where, n, columns[-1], offsets[-1], *positions)
+        first, start = [tuple(values[i] for i in xyz) for values in (columns, offsets)]
+        return cls(where, n, columns[-1], offsets[-1], first, start, tuple(formats[i] for i in xyz))
 
     def from_text(self, text: bytes, line: int, skip: int = 0, last: bool = True) -> FloatArray:
         """Return points from lines of text.
