@@ -21,7 +21,7 @@ PACKAGE = Path(egvs.__file__).parent
 STAGES = ("check", "statics", "scan", "traffic", "tpog", "score", "report")
 
 
-def by_syntax_tree(text: str, package: str) -> set[str]:
+def imports_by_syntax_tree(text: str, package: str) -> set[str]:
     """What a module imports when it runs, from its syntax tree."""
     tree = ast.parse(text)
     never = {
@@ -48,11 +48,13 @@ def by_syntax_tree(text: str, package: str) -> set[str]:
 @pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_import_pattern_matches_syntax_tree(path: Path) -> None:
     text, package = path.read_text(encoding="utf-8"), "egvs.x"
-    assert by_syntax_tree(text, package) <= set(stages.imported_names(text, package))
-    assert set(stages.imported_names(text, package)) - by_syntax_tree(text, package) <= {"egvs"}  # in docstrings
+    assert imports_by_syntax_tree(text, package) <= set(stages.imported_names(text, package))
+    assert set(stages.imported_names(text, package)) - imports_by_syntax_tree(text, package) <= {
+        "egvs"
+    }  # in docstrings
 
 
-ODD = """
+KINDS_OF_IMPORT = """
 import a, b.c as d  # , no
 from . import e
 from ..f import (
@@ -70,8 +72,8 @@ def n():
 
 def test_finds_every_kind_of_import() -> None:
     expected = ["a", "b.c", "x.y", "x.y.e", "x.f", "x.f.g", "x.f.i", "o.p", "o.p.q", "o.p.r"]
-    assert list(stages.imported_names(ODD, "x.y")) == expected
-    assert by_syntax_tree(ODD, "x.y") == set(expected)
+    assert list(stages.imported_names(KINDS_OF_IMPORT, "x.y")) == expected
+    assert imports_by_syntax_tree(KINDS_OF_IMPORT, "x.y") == set(expected)
 
 
 ROOTS = [(stage.module, *stage.code) for stage in map(stages.stage, STAGES)]
@@ -197,5 +199,6 @@ def test_source_behind_stage_key_stays_small(name: str) -> None:
     stage = stages.stage(name)
     modules = [module for module in stages.source_modules(stage.module, *stage.code) if module.startswith("egvs")]
     paths = [stages._module_path(module) for module in modules]
-    total = sum(code_lines(path) for path in paths if path is not None)
+    # An __init__.py lists public names and computes nothing.
+    total = sum(code_lines(path) for path in paths if path is not None and path.name != "__init__.py")
     assert total <= GROWTH.get(name, 1.1) * SOURCE_BEFORE[name]

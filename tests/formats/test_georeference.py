@@ -128,7 +128,9 @@ def test_utm_epsg_of_a_location(lon: float, lat: float, code: int) -> None:
 
 @pytest.mark.parametrize("projection", ["EPSG:2053", "+proj=tmerc +lon_0=9 +axis=wsu +ellps=WGS84 +units=m +no_defs"])
 def test_rejects_projection_whose_axes_point_west_and_south(projection: str) -> None:
-    with pytest.raises(InputError, match=r"s: crs: .* counts to the west and south.* metres to the east and north"):
+    with pytest.raises(
+        InputError, match=r"s: crs: .* counts in metre to the west and south.* metres to the east and north"
+    ):
         WorldFrame.from_projection(projection, (0.0, 0.0), "s: crs")
 
 

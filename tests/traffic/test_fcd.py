@@ -130,7 +130,7 @@ BAD = {
     "truncated gzip, XML": (gzip.compress(XML.encode())[:-30], r"damaged gzip"),
     "truncated gzip, Parquet": (gzip.compress(parquet_bytes())[:-30], r"damaged gzip"),
     "truncated XML": (XML[:-40].encode(), r"not well-formed XML"),
-    "XML of another kind": (b"<net/>", r"its root is <net>; a file whose root is <fcd-export>"),
+    "XML of another kind": (b"<net/>", r"expected the root <fcd-export>, got <net>"),
     "XML without angle": (XML.replace('angle="90.00"', "").encode(), r"vehicle 'b' at time '0\.50' has no angle"),
     "XML with a bad number": (XML.replace('"-1.25"', '"west"').encode(), r"x: .*west"),
     "XML with NaN": (XML.replace('"360.00"', '"nan"').encode(), r"vehicle element 2: angle of vehicle 'a' is nan"),

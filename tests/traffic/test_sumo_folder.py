@@ -73,7 +73,7 @@ BAD = {
         write("e.xml", "<routes/>"),
         {"network": "e.xml"},
         InputError,
-        r"e\.xml: its root is <routes>",
+        r"e\.xml: expected the root <net>, got <routes>",
     ),
     "malformed network": (
         write("e.xml", "<net><edge"),

@@ -106,7 +106,7 @@ def test_scales_user_mesh_to_unit_box(mini):
         (
             "points.ply",
             lambda p: trimesh.PointCloud([[0, 0, 0], [1, 1, 1]]).export(p),
-            r"points\.ply: ",
+            r"points\.ply: the file has no triangles",
         ),
         (
             "flat.ply",

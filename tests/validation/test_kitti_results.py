@@ -75,10 +75,10 @@ def test_reads_results_beside_export_and_in_data_folder(folder):
         (CAR.replace("0.9", "sure"), ["'sure'", "a finite number"]),
         (CAR.replace("0.9", "inf"), ["'inf'", "a finite number"]),
         (CAR.replace("Car", "Horse"), ["unknown class 'Horse'", "Car, Van, Truck"]),
-        (CAR.rsplit(" ", 1)[0], ["no score", "16 values"]),
-        (CAR + " 1", ["holds 17 values", "16 (a result"]),
-        (CAR.rsplit(" ", 2)[0], ["holds 14 values"]),
-        (CAR.replace(" 1.8 ", " -1 "), ["a size of 1.5 x -1 x 4.5 m", "above 0"]),
+        (CAR.rsplit(" ", 1)[0], ["has no score", "16 values"]),
+        (CAR + " 1", ["got 17", "16 (a result"]),
+        (CAR.rsplit(" ", 2)[0], ["got 14"]),
+        (CAR.replace(" 1.8 ", " -1 "), ["got 1.5 x -1 x 4.5 m", "above 0"]),
     ],
 )
 def test_names_file_and_line_of_wrong_line(folder, line, parts):
@@ -108,8 +108,8 @@ def _calibrated(folder, text):
             lambda f: (f / "a" / "mine" / "000004.txt").touch(),
             ["000004.txt: expected results of 2 frames", "000000.txt to 000008.txt"],
         ),
-        (lambda f: (f / "a" / "mine" / "000008.txt").write_bytes(b"\xff\xfe"), ["000008.txt: is no text"]),
-        (lambda f: _calibrated(f, "P2: 1 0 0 0"), ["000000.txt: has no R0_rect"]),
+        (lambda f: (f / "a" / "mine" / "000008.txt").write_bytes(b"\xff\xfe"), ["000008.txt: the file is not text"]),
+        (lambda f: _calibrated(f, "P2: 1 0 0 0"), ["000000.txt: expected R0_rect"]),
         (lambda f: _calibrated(f, kitti.CALIBRATION.replace("0 -1 0 0 0 0 -1", "1 -1 0 0 0 0 -1")), ["Tr_velo_to_cam"]),
     ],
 )

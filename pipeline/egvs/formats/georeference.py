@@ -64,18 +64,15 @@ class WorldFrame:
     def from_projection(cls, projection: str, offset_m: tuple[float, float], where: str) -> WorldFrame:
         """Return a frame in a checked projection; InputError unless it counts metres to the east and north."""
         crs = parse_crs(projection, where)
-        axes = crs.axis_info[:2]
-        problem = ""
-        if not crs.is_projected:
-            problem = "is not a map projection"
-        elif any(axis.unit_name != "metre" for axis in axes):
-            problem = f"counts in {axes[0].unit_name}"
-        elif {axis.direction for axis in axes} != {"east", "north"}:
-            problem = f"counts to the {' and '.join(axis.direction for axis in axes)}"
-        if problem:
-            hint = "Use a projection in metres to the east and north, for example epsg = 32632 (UTM zone 32 north)."
-            raise InputError(where, f"{projection} ({crs.name}) {problem}", hint)
-        return cls(projection, offset_m)
+        units = [axis.unit_name for axis in crs.axis_info[:2]]
+        directions = [axis.direction for axis in crs.axis_info[:2]]
+        if crs.is_projected and units == ["metre", "metre"] and sorted(directions) == ["east", "north"]:
+            return cls(projection, offset_m)
+        problem = "is not a map projection"
+        if crs.is_projected:
+            problem = f"counts in {units[0]} to the {' and '.join(directions)}"
+        hint = "Use a projection in metres to the east and north, for example epsg = 32632 (UTM zone 32 north)."
+        raise InputError(where, f"{projection} ({crs.name}) {problem}", hint)
 
     def from_degrees(self, lon_lat_deg: FloatArray) -> FloatArray:
         """Convert longitude and latitude (n, 2) in degrees to world-frame x, y in metres, (n, 2) float64.
@@ -137,13 +134,9 @@ def height_unit_m(crs: Any, where: str) -> float:
     parse_crs(crs, where)
     parsed = CRS.from_user_input(crs)
     for axis in parsed.axis_info:
-        if axis.direction == "up":
-            return float(axis.unit_conversion_factor)
-        if axis.direction == "down":
-            return -float(axis.unit_conversion_factor)
-    if parsed.is_projected:
-        return float(parsed.axis_info[0].unit_conversion_factor)
-    return 1.0
+        if axis.direction in ("up", "down"):
+            return float(axis.unit_conversion_factor) * (1.0 if axis.direction == "up" else -1.0)
+    return float(parsed.axis_info[0].unit_conversion_factor) if parsed.is_projected else 1.0
 
 
 def crs_name(frame: WorldFrame, at_m: tuple[float, float]) -> str:
@@ -338,10 +331,9 @@ class Georeference:
             f" as {reading.description}"
         )
         distances_m = {words: self.distance_m(points) for words, points in self._alternatives(xy)}
-        if distances_m:
-            nearest = min(distances_m, key=lambda words: distances_m[words])
-            if distances_m[nearest] <= FAR_M:
-                hint = f"They would be near it as {nearest}. {hint}"
+        nearest = min(distances_m, key=lambda words: distances_m[words], default="")
+        if distances_m.get(nearest, np.inf) <= FAR_M:
+            hint = f"They would be near it as {nearest}. {hint}"
         raise InputError(where, problem, hint)
 
     def _alternatives(self, xy: FloatArray) -> Iterator[tuple[str, FloatArray]]:

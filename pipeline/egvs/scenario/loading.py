@@ -159,6 +159,13 @@ def load(path: str | Path, overrides: Iterable[str] = ()) -> Scenario:
     ------
     InputError
         When the scenario is invalid, naming the file, the key, the value, and what is expected.
+
+    Examples
+    --------
+    >>> import egvs
+    >>> scenario = egvs.load("scenarios/roundabout", ["traffic.frames=100"])
+    >>> scenario.roi.size_m
+    (70.0, 70.0, 5.0)
     """
     path = Path(path)
     overrides = tuple(overrides)

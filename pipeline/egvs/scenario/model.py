@@ -119,7 +119,9 @@ class StaticsConfig(StrictModel):
     """The static world: everything that does not move and that beams can hit."""
 
     footprints: tuple[str, ...] = Field(
-        (), description="GeoJSON files that declare a crs (null: world-frame metres); features have height_m"
+        (),
+        description="GeoJSON files that declare their crs (null: world-frame metres); features have height_m and may"
+        " have base_m, radius_m",
     )
     polygons: tuple[str, ...] = Field((), description="SUMO .poly.xml files; polygons are solid or not by their type")
     polygon_height_m: Positive = Field(

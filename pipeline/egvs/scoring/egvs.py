@@ -37,6 +37,11 @@ def binary_entropy(count: int, frames: int) -> float:
     ------
     ValueError
         Unless 0 <= count <= frames and frames >= 1.
+
+    Examples
+    --------
+    >>> binary_entropy(5, 10)
+    1.0
     """
     if not 0 <= count <= frames or frames < 1:
         raise ValueError(f"expected 0 <= count <= frames and frames >= 1, got count = {count} and frames = {frames}")
@@ -163,6 +168,15 @@ class EntropyField:
             Cap, 0 or above, may be fractional or infinite.
         unit
             Hits that one beam adds to a voxel.
+
+        Examples
+        --------
+        Two voxels: the first is occupied in 5 of 10 frames and crossed by 3 beams, the second is never occupied.
+
+        >>> grid = Grid(origin_m=(0.0, 0.0, 0.0), voxel_m=0.5, shape=(2, 1, 1))
+        >>> field = EntropyField.of(np.array([[[5]], [[0]]]), frames=10, grid=grid)
+        >>> field.score(np.array([3, 7], dtype=np.uint32), gamma=2.0)
+        Score(egvs=2.0, entropy_seen=1.0)
         """
         sums = sum_hits_by_class(hits, self.cells, self.classes, len(self.sizes), gamma * unit)
         egvs = self._sum(gamma, sums.capped, sums.below, unit)

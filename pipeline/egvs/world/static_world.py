@@ -155,7 +155,7 @@ def _add_mesh(builder: _Builder, path: Path, config: MeshConfig, world: Georefer
         expected = f"expected finite coordinates, at most {MAX_COORDINATE_M:g} m"
         raise InputError(f"{path}: vertex {far[0]}", f"{expected}, got {mesh.vertices[far[0]].tolist()}")
     faces = len(mesh.faces)
-    with translate_errors(path, meshes.EXPECTED_MESH, "cannot be divided into pieces"):
+    with translate_errors(path, meshes.MESH_HINT, "cannot be divided into pieces"):
         mesh.merge_vertices(merge_tex=True, merge_norm=True)
         mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
     if len(mesh.faces) == 0:
