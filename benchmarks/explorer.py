@@ -66,8 +66,8 @@ def main() -> None:
         loop = threading.Thread(target=page.run)
         loop.start()
         try:
-            page.ask(layer=asked.layer)
-            page.rest(600)
+            page.request(layer=asked.layer)
+            page.wait_until_shown(600)
             _walk(page, asked)
         finally:
             page.end()
@@ -104,16 +104,16 @@ def _walked(page: Page, moves: list[Site], sensors: int, periods: int) -> list[f
     shown_ms(page, moves[-1])
     names = ("", *page.session.periods)
     for number in range(periods if page.session.periods else 0):
-        page.ask(period=names[(number + 1) % len(names)])
-        page.rest(600)
+        page.request(period=names[(number + 1) % len(names)])
+        page.wait_until_shown(600)
     return taken_ms
 
 
 def shown_ms(page: Page, site: Site) -> float:
     """From the end of a move until all is shown."""
     begin = time.perf_counter()
-    page.ask(site=site)
-    page.rest(600)
+    page.request(site=site)
+    page.wait_until_shown(600)
     return 1000.0 * (time.perf_counter() - begin)
 
 

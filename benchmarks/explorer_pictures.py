@@ -91,9 +91,9 @@ def _draw(page: Page, tab: Any, camera: Camera, view: dict[str, Any], path: Path
     pose = view.get("pose", site.pose)
     changes = {key: value for key, value in view.items() if key != "pose"}
     blank = {"layer": "none", "beside": "", "frame": 0, "is_dark": False}
-    page.ask(site=replace(site, pose=pose), **{**blank, **changes})
-    assert page.rest(120)
-    (client,) = page._server.get_clients().values()
+    page.request(site=replace(site, pose=pose), **{**blank, **changes})
+    assert page.wait_until_shown(120)
+    (client,) = page.server.get_clients().values()
     client.camera.position = np.subtract(camera.from_m, page.zero_m)
     client.camera.look_at = np.subtract(camera.at_m, page.zero_m)
     tab.wait_for_timeout(15_000)  # drawn in software

@@ -33,7 +33,7 @@ def trial(step_s: float, seed: int) -> tuple[list[str], list[float], float]:
     with tempfile.TemporaryDirectory() as folder:
         runner = SettingRunner(SCENARIO, WATCHED, Path(folder), 1, no_progress)
         found = runner.run(Setting("run", "seed", "seed", (f"seed={seed}", f"traffic.step_s={step_s}")))
-        return found.sites, found.shares, runner.times("traffic", found.stages["traffic"]).seconds[0]
+        return found.sites, found.shares, runner.stage_times("traffic", found.stages["traffic"]).seconds[0]
 
 
 def change(shares: Any, against: Any) -> tuple[Any, Any]:

@@ -37,7 +37,7 @@ from egvs.scoring.scorer import Scorer
 from egvs.stages import scan, score
 from egvs.stages.inputs import get_scene, open_folder
 from egvs.stages.site_scoring import empty_scans
-from egvs.studies import accuracy, score_errors, study_settings
+from egvs.studies import score_errors, study_settings
 from egvs.world.mesh import World, write_ply
 from tests.stages import inputs_of, run_stage
 
@@ -585,10 +585,9 @@ def test_ticks_are_round(low, high, texts):
 def test_the_accuracy_study_is_shown_where_there_is_one(mini, tmp_path, run_egvs, monkeypatch):
     """Its recommendation, the front, the figure; not of another scenario or other files; the run is verified in each
     case."""
-    monkeypatch.setattr(study_settings, "VOXELS_M", (1.0,))
-    monkeypatch.setattr(study_settings, "GAMMAS", (2.0,))
-    monkeypatch.setattr(study_settings, "_others", lambda _: iter(()))
-    monkeypatch.setattr(accuracy, "REPEATS", 1)
+    few = study_settings.SettingValues(voxels_m=(1.0,), gammas=(2.0,), unnamed_effects=False)
+    list_settings = study_settings.list_settings
+    monkeypatch.setattr(study_settings, "list_settings", lambda scenario, _: list_settings(scenario, few))
     own = score_errors.mark_pareto_front
 
     def thinned(rows, tolerance):

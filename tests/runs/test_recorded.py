@@ -136,6 +136,6 @@ def test_the_report_of_a_run_is_not_drawn_anew_of_altered_artefacts(runs, out: P
 @pytest.mark.parametrize("name", ["trajectories.parquet", "tpog.parquet", "statics.ply"])
 def test_effects_are_tried_on_no_altered_traffic(runs, out: Path, name: str) -> None:
     scene = inputs.resolve_scene(runs[0], static_world(open_folder(runs[0], out)))
-    assert EffectTrials.of(scene, out) is not None
+    assert EffectTrials.from_run(scene, out) is not None
     shutil.copyfile(runs[2] / name, out / name)
-    assert EffectTrials.of(scene, out) is None
+    assert EffectTrials.from_run(scene, out) is None

@@ -205,7 +205,7 @@ def test_single_candidates_need_no_table_of_poles(mini: Path, tmp_path: Path, ru
 def test_a_study_tries_the_first_candidate_alone(mini: Path) -> None:
     (mini / "sites.csv").write_text("site,x_m,y_m\nc01,10,12\nc02,30.5,-12\n")
     scenario = egvs.load(mini, ["sites.heights_m=[3, 4.5]", 'sites.pitch_deg=["aim", 0]', "sites.aim=roi"])
-    first, (alone,) = sites.candidate_sites(scenario)[0], sites.candidate_sites(measurement._with_one_site(scenario))
+    first, (alone,) = sites.candidate_sites(scenario)[0], sites.candidate_sites(measurement.with_one_site(scenario))
     assert alone.pose == first.pose
 
 

@@ -28,7 +28,7 @@ def settings(seconds: float, judged: float) -> list[SettingResult]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("seconds", "judged"), [(0.8, 0.3), (40.0, 0.3), (40.0, 0.0), (5.0, 0.01)])
-def test_the_legend_covers_no_setting_wherever_the_scenario_lies(seconds: float, judged: float) -> None:
+def test_legend_and_labels_cover_no_marker(seconds: float, judged: float) -> None:
     figure = make_figure(settings(seconds, judged), 0.02, "trial")
     panel = figure.axes[0]
     legend = panel.get_legend().get_window_extent(figure.canvas.get_renderer())
