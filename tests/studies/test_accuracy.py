@@ -138,7 +138,7 @@ def test_interrupted_study_continues(mini: Path, tmp_path: Path) -> None:
         run_study(mini, [], tmp_path / "out", listener=interrupt)
     reported: list[tuple[str, str]] = []
     rest = run_study(mini, [], tmp_path / "out", listener=lambda name, state, _: reported.append((name, state)))
-    assert {name for name, state in reported if state == "kept"} == set(finished)
+    assert {name for name, state in reported if state == "kept"} == {"scenario", *finished}
     assert {state for _, state in reported} == {"kept", "done"}
     assert compared(rest) == compared(complete)
     assert not list((tmp_path / "out" / "accuracy").glob(".work-*"))
@@ -158,7 +158,7 @@ def test_settings_beyond_the_budget_are_skipped_and_listed(mini: Path, tmp_path:
 def test_standard_error_is_the_error_without_longer_reference(junction: Path, tmp_path: Path) -> None:
     study = run_study(junction, [], tmp_path / "out", budget_s=0.001)
     assert [row.setting for row in study.rows] == ["scenario"]
-    assert (study.times, study.best) == (1, None)
+    assert (study.reference_factor, study.best) == (1, None)
     assert study.rows[0].judged == study.rows[0].error_se > study.tolerance
 
 
