@@ -67,7 +67,7 @@ def main() -> None:
         loop.start()
         try:
             page.request(layer=options.layer)
-            page.wait_until_shown(600)
+            page.wait_until_idle(600)
             _measure(page, options)
         finally:
             page.end()
@@ -105,7 +105,7 @@ def _time_moves(page: Page, moves: list[Site], sensors: int, periods: int) -> li
     names = ("", *page.session.periods)
     for number in range(periods if page.session.periods else 0):
         page.request(period=names[(number + 1) % len(names)])
-        page.wait_until_shown(600)
+        page.wait_until_idle(600)
     return times_ms
 
 
@@ -113,7 +113,7 @@ def time_move_ms(page: Page, site: Site) -> float:
     """Return the time from the end of a move until everything is shown."""
     begin = time.perf_counter()
     page.request(site=site)
-    page.wait_until_shown(600)
+    page.wait_until_idle(600)
     return 1000.0 * (time.perf_counter() - begin)
 
 

@@ -92,7 +92,7 @@ def _draw(page: Page, tab: Any, camera: Camera, view: dict[str, Any], path: Path
     changes = {key: value for key, value in view.items() if key != "pose"}
     blank = {"layer": "none", "beside": "", "frame": 0, "is_dark": False}
     page.request(site=replace(site, pose=pose), **{**blank, **changes})
-    assert page.wait_until_shown(120)
+    assert page.wait_until_idle(120)
     (client,) = page.server.get_clients().values()
     client.camera.position = np.subtract(camera.from_m, page.zero_m)
     client.camera.look_at = np.subtract(camera.at_m, page.zero_m)

@@ -1,4 +1,4 @@
-"""Nobody uses the page who was not given its address: no other user, no page of another origin, no rebound name."""
+"""Only browsers with the address may use the page: no other user, no page of another origin, no rebound host name."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ HOST = f"127.0.0.1:{PORT}"
 
 @pytest.fixture
 def opened() -> list[dict[str, str]]:
-    """The queries that were opened."""
+    """Queries that were opened."""
     return []
 
 
 @pytest.fixture
 def guard(opened: list[dict[str, str]]) -> AccessGuard:
-    """Sends browsers on to a camera of their own."""
+    """A guard that redirects browsers to a camera."""
 
     def open_(query: dict[str, str]) -> dict[str, str]:
         opened.append(query)
@@ -36,7 +36,7 @@ def guard(opened: list[dict[str, str]]) -> AccessGuard:
 
 
 def status(guard: AccessGuard, path: str = "/", *more: tuple[str, str], host: str = HOST) -> http.HTTPStatus | None:
-    """What becomes of a request: a status, or None where it is let through."""
+    """Return the status of a request, or None if it passes."""
     response = guard.check_request(PORT, Request(path, Headers([("Host", host), *more])))
     return None if response is None else http.HTTPStatus(response.status_code)
 

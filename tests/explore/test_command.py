@@ -1,4 +1,4 @@
-"""`egvs explore` on the command line: what it prints, how it ends, what it refuses."""
+"""`egvs explore` on the command line: output, end, and invalid options."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ def test_serves_until_interrupt_and_cleans_up(mini: Path, tmp_path: Path) -> Non
     os.kill(started.pid, signal.SIGINT)
     printed, errors = started.communicate()
     assert (started.returncode, printed.strip()) == (0, "")
-    assert errors.splitlines()[-1].startswith("score")  # no word of an interrupt
+    assert errors.splitlines()[-1].startswith("score")  # no message about the interrupt
     with pytest.raises(ProcessLookupError):
-        os.killpg(started.pid, 0)  # nobody is left of all that it started
+        os.killpg(started.pid, 0)  # no process is left
     with pytest.raises(urllib.error.URLError, match="refused"):
         opener.open(address)
-    assert not any(tmp_path.glob("tmp/egvs-work-*"))  # where runs with other settings are made
+    assert not any(tmp_path.glob("tmp/egvs-work-*"))  # temporary runs with other settings
     assert {path: path.read_bytes() for path in out.iterdir()} == before
 
 
@@ -66,7 +66,7 @@ def test_starts_with_the_view_of_a_link(run_egvs, mini: Path, tmp_path: Path, mo
     def run(page: page.Page) -> None:
         loop = threading.Thread(target=real_run, args=(page,))
         loop.start()
-        assert page.wait_until_shown(60)
+        assert page.wait_until_idle(60)
         shown.append((page.view.site.name, page.view.site.pose.z_m, page.view.layer))
         page.end()
         loop.join()

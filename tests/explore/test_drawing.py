@@ -125,7 +125,7 @@ ANGLES = st.tuples(st.floats(-180, 180), st.floats(-89.9, 89.9), st.floats(-180,
 
 
 def matrix(wxyz: tuple[float, float, float, float]) -> np.ndarray:
-    """The matrix of a quaternion, by turning each axis: q v q*."""
+    """Return the rotation matrix of a quaternion, by rotating each axis: q v q*."""
     w, u = wxyz[0], np.array(wxyz[1:])
     return np.column_stack([v + 2 * np.cross(u, np.cross(u, v) + w * v) for v in np.eye(3)])
 

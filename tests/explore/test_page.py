@@ -1,4 +1,4 @@
-"""The page: served to this machine alone, shows what `Session` says, and ends when it is told to."""
+"""The page serves only this machine, shows the scores of `Session`, and stops on request."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ from tests.explore.serving import serving  # noqa: E402
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
-    """Over the small scenario."""
+    """A session over the small scenario."""
     folder = tmp_path_factory.mktemp("page")
     return open_session(write_mini(folder / "mini"), (), folder / "run")
 
 
 def with_key(served: Page) -> Any:
-    """What opens the page as a browser does: it keeps the cookie."""
+    """Open the page as a browser does, with its cookie."""
     opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
     assert opener.open(served.address).status == 200
     return opener
@@ -51,7 +51,7 @@ def with_key(served: Page) -> Any:
 
 @pytest.fixture
 def page(session: Session, tmp_path: Path) -> Iterator[Page]:
-    """Served."""
+    """A served page."""
     with serving(Page(session, tmp_path / "scratch")) as served:
         yield served
 
@@ -59,7 +59,7 @@ def page(session: Session, tmp_path: Path) -> Iterator[Page]:
 def move_and_wait(page: Page, name: str, pose: Pose, sensor: str = "small") -> None:
     """Wait until a pose is shown."""
     page.request(site=replace(page.session.candidates[name].site, pose=pose, sensor=sensor))
-    assert page.wait_until_shown(30)
+    assert page.wait_until_idle(30)
 
 
 def test_serves_only_this_machine(page: Page) -> None:
@@ -117,11 +117,11 @@ def test_controls_and_gizmo_show_the_pose(page: Page) -> None:
 def test_dark_page_has_dark_world(page: Page) -> None:
     by_day = {kind: mesh.color for kind, mesh in page.world.meshes.items()}
     page.request(is_dark=True)
-    assert page.wait_until_shown(30)
+    assert page.wait_until_idle(30)
     assert page.controls.dark.value
     assert all(sum(mesh.color) < sum(by_day[kind]) for kind, mesh in page.world.meshes.items())
     page.request(is_dark=False)
-    assert page.wait_until_shown(30)
+    assert page.wait_until_idle(30)
     assert {kind: mesh.color for kind, mesh in page.world.meshes.items()} == by_day
 
 
@@ -189,7 +189,7 @@ def test_settings_give_the_scores_of_a_run(page: Page, session: Session, tmp_pat
     move_and_wait(page, "pole_a", pose)
     with_them = Settings(2.0, "points_on_target", frozenset({"moving_occlusion"}))
     page.request(settings=with_them)
-    assert page.wait_until_shown(60)
+    assert page.wait_until_idle(60)
     expected = SessionFactory(session, tmp_path / "other").session(with_them)
     assert page.session is not session
     assert page.rating == expected.rate("pole_a", pose)
@@ -200,11 +200,11 @@ def test_settings_give_the_scores_of_a_run(page: Page, session: Session, tmp_pat
     assert page.controls.effects["moving_occlusion"].value
     assert controls.ranking_table(expected.ranked, "points_on_target") == page.controls.ranking.content
     page.request(settings=replace(with_them, gamma=-1.0))
-    assert page.wait_until_shown(60)
+    assert page.wait_until_idle(60)
     assert "input should be greater than or equal to 0" in page.controls.status.content
     assert page.view.settings == with_them
     page.request(settings=Settings.from_scenario(session.scenario))
-    assert page.wait_until_shown(60)
+    assert page.wait_until_idle(60)
     assert page.session is session
     assert page.rating == session.rate("pole_a", pose)
 
@@ -215,7 +215,7 @@ def test_requests_during_a_run_are_not_lost(page: Page, session: Session) -> Non
     page.request(settings=Settings(2.0, "egvs", frozenset()))
     page.request(site=replace(session.candidates["pole_a"].site, pose=pose))
     page.request(layer="missed")
-    assert page.wait_until_shown(60)
+    assert page.wait_until_idle(60)
     assert (page.view.settings.gamma, page.view.site.pose, page.view.layer) == (2.0, pose, "missed")
     assert page.session.scenario.gamma == 2.0
 
@@ -236,10 +236,10 @@ def test_memory_for_earlier_poses_sensors_and_sessions_is_freed(page: Page, sess
             move_and_wait(page, "pole_a", Pose(10 + step / 8, 12, 3, 3.0 * step), ("VLP-16", "small")[step % 2])
         for gamma in (1.0, 2.0, None):
             page.request(settings=Settings(gamma, "egvs", frozenset()))
-            assert page.wait_until_shown(60)
+            assert page.wait_until_idle(60)
 
     page.request(settings=Settings(3.0, "egvs", frozenset()))
-    assert page.wait_until_shown(60)
+    assert page.wait_until_idle(60)
     earlier_sessions = weakref.WeakSet([page.session])
     visit_everything()
     first = count_cached()
@@ -255,33 +255,33 @@ def test_opened_link_shows_its_view(page: Page, session: Session) -> None:
     opener = with_key(page)
     link = f"{page.address}&site=pole_a&pose=10.5,12,4,0,0,0&layer=seen&camera=20,-30,40,20,0,2.5"
     assert opener.open(link).url == f"{page.origin}/?initialCameraPosition=0,-30,40&initialCameraLookAt=0,0,2.5"
-    assert page.wait_until_shown(30)
+    assert page.wait_until_idle(30)
     assert (page.view.site.pose, page.view.layer) == (Pose(10.5, 12, 4), "seen")
     assert opener.open(f"{page.address}&site=nobody").url == f"{page.origin}/"
-    assert page.wait_until_shown(30)
+    assert page.wait_until_idle(30)
     assert "nobody" in page.controls.status.content
     assert page.view.site.pose == Pose(10.5, 12, 4)
 
 
 def test_gizmo_follows_when_dragging_browser_disconnects(page: Page) -> None:
     page.request(site=page.session.candidates["pole_a"].site)
-    assert page.wait_until_shown(30)
+    assert page.wait_until_idle(30)
     page.drag(7, Pose(10.5, 12, 4), is_finished=False)
-    assert page.wait_until_shown(30)
+    assert page.wait_until_idle(30)
     assert page.rating.site.pose == Pose(10.5, 12, 4)
     assert (page.gizmo.position + page.zero_m).tolist() == [10, 12, 3]  # it must not move under the mouse
     page.disconnect(8)
-    assert page.wait_until_shown(30)
+    assert page.wait_until_idle(30)
     assert (page.gizmo.position + page.zero_m).tolist() == [10, 12, 3]
     page.disconnect(7)
-    assert page.wait_until_shown(30)
+    assert page.wait_until_idle(30)
     assert (page.gizmo.position + page.zero_m).tolist() == [10.5, 12, 4]
 
 
 def test_gizmo_follows_at_the_end_of_a_drag(page: Page) -> None:
     page.drag(7, Pose(30.5, -12, 4), is_finished=False)
     page.drag(7, Pose(30.5, -12, 5), is_finished=True)
-    assert page.wait_until_shown(30)
+    assert page.wait_until_idle(30)
     assert (page.gizmo.position + page.zero_m).tolist() == [30.5, -12, 5]
 
 
@@ -297,20 +297,20 @@ def test_plan_follows_its_sensors(mini: Path, tmp_path: Path) -> None:
         assert scene.get_handle_by_name("/plan/label1").text == "pole_a: best additional sensor"
         moved = replace(site, pose=replace(site.pose, z_m=4.5))
         served.request(site=moved)
-        assert served.wait_until_shown(60)
+        assert served.wait_until_idle(60)
         assert served.plan is not None
         assert served.plan.sites["pole_b"] == moved
         assert served.plan.joint == served.rating.scores["egvs"]  # with one sensor, the joint score is its score
         balls = scene.get_handle_by_name("/plan/balls")
         assert (balls.batched_positions[0] + served.zero_m).tolist() == [*moved.pose.position_m]
         served.request(site=served.session.candidates["pole_a"].site)
-        assert served.wait_until_shown(60)
+        assert served.wait_until_idle(60)
         assert scene.get_handle_by_name("/plan/label0").text == "pole_b: in the plan"
         assert scene.get_handle_by_name("/plan/label1") is None
         assert served.plan.sites["pole_b"] == moved
         assert served.current_site(served.session.candidates["pole_b"].site) == moved
         served.request(settings=Settings(1.0, "egvs", frozenset()))
-        assert served.wait_until_shown(60)
+        assert served.wait_until_idle(60)
         assert served.plan.sites["pole_b"] == moved
         assert served.plan.joint == served.session.rate("pole_b", moved.pose).scores["egvs"]
 

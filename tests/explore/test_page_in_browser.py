@@ -1,6 +1,6 @@
-"""The page in a real browser: it loads without errors, and a drag ends with the score of where it ends.
+"""The page in a real browser loads without errors, and a drag ends with the score of the final pose.
 
-One browser and one page serve all tests of this module: with software rendering each load takes seconds.
+One browser and one page serve all tests of this module, because loading takes seconds with software rendering.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    """Over the small scenario, served."""
+    """A served page over the small scenario."""
     folder = tmp_path_factory.mktemp("browser")
     made = Page(open_session(write_mini(folder / "mini"), (), folder / "run"), folder / "scratch")
     made.set_camera(Camera((30.0, -34.0, 18.0), (30.0, -10.0, 3.0)))  # at the sensor that is dragged
@@ -58,7 +58,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """What one user has open: Chromium, with software rendering."""
+    """Chromium with software rendering."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
@@ -68,7 +68,7 @@ def browser() -> Iterator[Any]:
 
 
 def look(browser: Any, address: str, errors: list[str]) -> Any:
-    """Open an address; what goes wrong in it is added to ``errors``."""
+    """Open an address; errors are added to ``errors``."""
     tab = browser.new_page()
     tab.on("pageerror", lambda error: errors.append(str(error)))
     tab.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
@@ -79,7 +79,7 @@ def look(browser: Any, address: str, errors: list[str]) -> Any:
 
 @pytest.fixture(scope="module")
 def errors() -> list[str]:
-    """What went wrong in the tab."""
+    """Errors in the tab."""
     return []
 
 
@@ -90,7 +90,7 @@ def tab(browser: Any, page: Page, errors: list[str]) -> Any:
 
 
 def looks_at_it(page: Page) -> None:
-    """Wait until the browser tells that it looks from where it was told to; it begins elsewhere."""
+    """Wait until the browser reports the requested camera; it starts with another one."""
     (client,) = page.server.get_clients().values()
     there = threading.Event()
 
@@ -104,7 +104,7 @@ def looks_at_it(page: Page) -> None:
 
 
 def on_screen(page: Page, tab: Any, at_m: np.ndarray) -> tuple[float, float]:
-    """Where a point of the page's frame is drawn, in pixels, by the camera that the browser tells of."""
+    """Return the pixel of a point of the page's frame, with the camera that the browser reports."""
     (client,) = page.server.get_clients().values()
     w, x, y, z = client.camera.wxyz
     columns = [
@@ -139,7 +139,7 @@ def test_drag_ends_with_score_of_final_pose(tab: Any, page: Page, errors: list[s
         tab.mouse.move(x, y - 10 * step)
     tab.mouse.up()
     assert ended.wait(READY_S)
-    assert page.wait_until_shown(READY_S)
+    assert page.wait_until_idle(READY_S)
     moved = page.rating.site.pose
     assert (moved.x_m, moved.y_m, moved.angles_deg) == (start.pose.x_m, start.pose.y_m, start.pose.angles_deg)
     assert moved.z_m > start.pose.z_m + 0.2
@@ -202,7 +202,7 @@ def test_link_and_picture_show_the_current_view(browser: Any, tab: Any, page: Pa
     assert download.value.suggested_filename == "mini.png"
     assert Path(download.value.path()).read_bytes().startswith(b"\x89PNG")
     page.request(site=page.session.candidates["pole_b"].site, layer="traffic")
-    assert page.wait_until_shown(READY_S)
+    assert page.wait_until_idle(READY_S)
     tab.goto(link)
     tab.get_by_role("heading", name=f"{page.session.candidates['pole_a'].scores['egvs']:,.1f}").wait_for(
         timeout=READY_MS
@@ -234,4 +234,4 @@ def test_page_of_other_origin_cannot_connect(browser: Any, tab: Any, page: Page,
 
 class _Quiet(http.server.SimpleHTTPRequestHandler):
     def log_message(self, *_: Any) -> None:
-        """Nothing is printed."""
+        """Print nothing."""

@@ -33,7 +33,7 @@ def opened(tmp_path_factory: pytest.TempPathFactory) -> Session:
 
 
 def scored(folder: Path, *settings: str) -> dict[str, dict]:
-    """What `egvs run` makes of a scenario, by site."""
+    """Return the scores of `egvs run`, by site."""
     out = folder / "scored"
     egvs.run(egvs.load(folder, list(settings)), out)
     return {row["site"]: row for row in read_scores(out / "scores.parquet").to_pylist()}
@@ -240,14 +240,14 @@ SITES = "site,x_m,y_m,z_m\na,10,12,3\nb,30.5,-12,3\nc,2,-12,4\nd,38,12,4\n"
 
 
 def joint_egvs(session: Session, *sites: Site) -> float:
-    """E(S) by its definition."""
+    """Return E(S) by its definition."""
     hits = sum(session.hits(site) for site in sites)
     return math.fsum((session.entropy_bit * np.minimum(session.scenario.gamma, hits)).ravel())
 
 
 @pytest.fixture
 def planned(mini: Path, tmp_path: Path) -> tuple[Session, float]:
-    """A session over a run that holds a plan of two, and the joint score that `egvs place` wrote."""
+    """A session over a run with a plan of two, and the joint score of `egvs place`."""
     (mini / "sites.csv").write_text(SITES)
     placed = egvs.place(egvs.load(mini, ["placement.count=2"]), tmp_path / "run")
     return open_session(mini, (), tmp_path / "run"), placed.joint
@@ -307,7 +307,7 @@ def test_plan_of_other_settings_is_ignored(mini: Path, tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Session:
-    """Over the small scenario."""
+    """A session over the small scenario."""
     folder = tmp_path_factory.mktemp("playback")
     return open_session(write_mini(folder / "mini"), ["sites.sensor='VLP-32C'"], folder / "run")
 

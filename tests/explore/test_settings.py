@@ -1,4 +1,4 @@
-"""What a setting shows is what ``egvs run --set`` gives; the run that is explored stays as it is."""
+"""Settings give the scores of ``egvs run --set``; the explored run does not change."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ANOTHER = {
 
 @pytest.fixture
 def session(mini: Path, tmp_path: Path) -> Session:
-    """Over the small scenario."""
+    """A session over the small scenario."""
     return open_session(mini, (), tmp_path / "run")
 
 

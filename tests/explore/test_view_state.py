@@ -31,7 +31,7 @@ from tests.explore.test_session import in_periods
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
-    """Over the small scenario, with two periods."""
+    """A session over the small scenario with two periods."""
     folder = tmp_path_factory.mktemp("view")
     return open_session(in_periods(write_mini(folder / "mini")), (), folder / "run")
 

@@ -1,4 +1,4 @@
-"""Short studies, and what tests ask of them."""
+"""Short studies, and helpers for tests of them."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ FEW_VALUES = SettingValues(voxels_m=(1.0,), gammas=(2.0,), frame_periods_s=(1.0,
 def run_study(
     path: Path, sets: list[str], out: Path, *, budget_s: float = 600.0, listener: Any = None, **options: Any
 ) -> AccuracyStudy:
-    """A study of a few settings."""
+    """Run a study of a few settings."""
     values = {"tolerance": 0.02, "repeats": 2, "values": FEW_VALUES, **options}
     return accuracy.run_accuracy_study(
         path, sets, out, StudyOptions(budget_s=budget_s, **values), listener=listener or accuracy.ignore_setting
@@ -55,17 +55,17 @@ def settings_by_name(path: Path, *sets: str) -> dict[str, Setting]:
 
 
 def count_progress(calls: list[str]) -> Callable[[str, int, int], None]:
-    """Notes each call of a stage's progress callback."""
+    """Return a progress callback that notes its calls."""
     return lambda what, _done, _total: calls.append(what)
 
 
 def override_values(row: SettingResult) -> list[str]:
-    """The values after each ``--set``."""
+    """Return the values after each ``--set``."""
     return shlex.split(row.overrides)[1::2]
 
 
 def shares(path: Path, sets: list[str], out: Path, weight: float = 1.0) -> np.ndarray:
-    """Scores as shares of their limit, from an ordinary run."""
+    """Return scores as shares of their limit, from an ordinary run."""
     egvs.run(egvs.load(path, sets), out)
     table = egvs.read_scores(out / "scores.parquet")
     return table["egvs"].to_numpy() / table["egvs_limit"].to_numpy()

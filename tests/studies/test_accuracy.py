@@ -58,8 +58,8 @@ def test_study_of_a_finished_file(mini: Path, tmp_path: Path) -> None:
     assert metadata["reference_times"] == 1
     assert (tmp_path / "out" / "accuracy.png").read_bytes()[:4] == b"\x89PNG"
     assert all(row.repeats == 2 for row in study.rows)
-    own_scores = study.rows[0]
-    assert (own_scores.error, own_scores.tau, own_scores.regret, own_scores.best_kept, own_scores.best_three_kept) == (
+    unchanged = study.rows[0]
+    assert (unchanged.error, unchanged.tau, unchanged.regret, unchanged.best_kept, unchanged.best_three_kept) == (
         0.0,
         1.0,
         0.0,
@@ -182,11 +182,11 @@ def test_study_uses_the_score_that_ranks(mini: Path, tmp_path: Path, standard_er
     assert {row.knob for row in study.rows} == {"", "period"}  # no gamma, no voxels, no beams that are weighted up
     egvs.run(egvs.load(mini, sets[:1]), tmp_path / "run")
     rows = egvs.read_scores(tmp_path / "run" / "scores.parquet").to_pydict()
-    own_scores = make_runner(mini, tmp_path / "out", *sets).saved_scores(SCENARIO_AS_IS)
-    assert own_scores is not None
-    assert own_scores.shares == own_scores.scores == rows["seen_well"]
-    assert own_scores.ses == pytest.approx(rows["seen_well_se"])
-    assert own_scores.neighbours[0][2] == pytest.approx(rows["beats_next"][rows["rank"].index(1)])
+    unchanged = make_runner(mini, tmp_path / "out", *sets).saved_scores(SCENARIO_AS_IS)
+    assert unchanged is not None
+    assert unchanged.shares == unchanged.scores == rows["seen_well"]
+    assert unchanged.ses == pytest.approx(rows["seen_well_se"])
+    assert unchanged.neighbours[0][2] == pytest.approx(rows["beats_next"][rows["rank"].index(1)])
     other = next(row for row in study.rows if row.knob == "period")
     egvs.run(egvs.load(mini, [*sets, *override_values(other)]), tmp_path / "other")
     settings = egvs.read_scores(tmp_path / "other" / "scores.parquet")["seen_well"].to_numpy()
@@ -206,7 +206,7 @@ def test_invalid_setting_is_skipped_with_its_message(mini: Path, tmp_path: Path)
 
 
 class FastRunner(SettingRunner):
-    """Claims that each stage takes 0.1 s."""
+    """Reports 0.1 s for each stage."""
 
     def stage_times(self, name: str, key: str) -> measurement.StageTimes:
         return measurement.StageTimes((0.1,), (0.1,), 1.0, 1, 1)
@@ -235,7 +235,7 @@ def test_settings_beyond_the_budget_are_not_warmed_up(mini: Path, tmp_path: Path
 
 @pytest.mark.slow
 def test_effects_command_prints_costs_and_changes_of_a_study(mini: Path, tmp_path: Path, run_egvs) -> None:
-    """As a plain run with and without the effect says."""
+    """The change equals that of runs with and without the effect."""
     sets = ["--set", "effects.rain.rate_mm_h=90"]
     code, printed, _ = run_egvs("effects", mini, "--out", tmp_path / "out", *sets)
     assert code == 0
@@ -259,7 +259,7 @@ def test_second_study_in_the_same_folder_is_rejected(mini: Path, tmp_path: Path)
         run_study(mini, [], tmp_path / "out")
 
 
-KEPT = {
+DAMAGED_FILES = {
     "the study's note": ("study.json", "{}x"),
     "a list for the note": ("study.json", "[1]"),
     "a setting's result": ("[0-9a-f]*.json", '{"scores": {"sites": 3}}'),
@@ -272,9 +272,9 @@ KEPT = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", KEPT)
+@pytest.mark.parametrize("case", DAMAGED_FILES)
 def test_damaged_intermediate_file_is_named(mini: Path, junction: Path, tmp_path: Path, run_egvs, case: str) -> None:
-    pattern, content = KEPT[case]
+    pattern, content = DAMAGED_FILES[case]
     scenario = junction if pattern == "study.json" else mini  # a study whose traffic is simulated keeps a note
     words = ("accuracy", scenario, "--out", tmp_path / "out", "--budget", "0.001s")
     assert run_egvs(*words)[0] == 0
@@ -292,7 +292,7 @@ def shares_are(text: str) -> Callable[[str], str]:
     return lambda comparable: re.sub(r'"shares": \[[^\]]*\]', f'"shares": {text}', comparable)
 
 
-SHARED = {
+ALTERED_SCORES = {
     "too few shares": ("[0-9a-f]*.json", shares_are("[0.5]")),
     "words for shares": ("[0-9a-f]*.json", shares_are('["a", null]')),
     "another share": (
@@ -303,9 +303,9 @@ SHARED = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", SHARED)
+@pytest.mark.parametrize("case", ALTERED_SCORES)
 def test_altered_intermediate_scores_are_rejected(mini: Path, tmp_path: Path, run_egvs, case: str) -> None:
-    pattern, change = SHARED[case]
+    pattern, change = ALTERED_SCORES[case]
     words = ("accuracy", mini, "--out", tmp_path / "out", "--budget", "0.001s")
     assert run_egvs(*words)[0] == 0
     for path in (tmp_path / "out" / "accuracy").glob(pattern):
@@ -324,7 +324,7 @@ def test_study_with_another_seed_continues_in_the_same_folder(mini: Path, tmp_pa
 
 @pytest.mark.slow
 def test_recommended_command_can_be_typed(mini: Path, tmp_path: Path, run_egvs) -> None:
-    """With the user's own ``--set``, and quoted."""
+    """It contains the user's ``--set`` options, quoted."""
     folder = tmp_path / "a place with späce"
     shutil.copytree(mini, folder)
     sets = ("--set", "traffic.frames=20", "--set", "description=it's")
@@ -404,7 +404,7 @@ def test_front_contains_no_setting_that_another_dominates(mini: Path, tmp_path: 
 
 @pytest.mark.slow
 def test_one_block_gives_no_standard_errors(junction: Path, mini: Path, tmp_path: Path, run_egvs, capsys) -> None:
-    """Refused where SUMO could watch longer; of a finished file the errors are unknown, not 0."""
+    """It is rejected if SUMO runs; for a finished file the errors are unknown, not 0."""
     code, _, errors = run_egvs("accuracy", junction, "--out", tmp_path / "out", "--set", "tpog.blocks=1")
     assert code == 2
     assert "tpog.blocks: standard errors need at least 2 blocks" in errors

@@ -1,4 +1,4 @@
-"""``egvs effects`` tells which effects a scene calls for, and what each changes."""
+"""``egvs effects`` says which effects a scene calls for, and what each changes."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ def test_all_effects_are_listed_with_their_source(run_egvs) -> None:
     for call in effect_study.effect_catalogue():
         assert call.name in printed
         assert call.source
-        assert call.why.endswith((".", "?"))  # the sentence that its module opens with
+        assert call.why.endswith((".", "?"))  # the first sentence of its module
 
 
 def tried_statuses(folder: Path, out: Path, *overrides: str) -> dict[str, effect_study.EffectStatus]:
-    """What is said of each effect, tried on the run in ``out``."""
+    """Return the status of each effect, tried with the run in ``out``."""
     return {call.name: call for call in effect_study.effect_statuses(egvs.load(folder, overrides), out)}
 
 
@@ -55,7 +55,7 @@ def test_statuses_of_effects_in_plain_scene(mini: Path) -> None:
 
 
 def test_range_limit_beyond_region_has_little_effect_before_a_run(mini: Path) -> None:
-    """Noticed to 3000 m and to 30 m, the region being 50 m wide."""
+    """Ranges of 3000 m and 30 m; the region is 50 m wide."""
     for rated_m, state in ((3000, "little"), (30, "called for")):
         statuses = states(mini, f"sensors.small.rated_range_m={rated_m}")["range_limit"]
         assert statuses[0] == state
@@ -184,7 +184,7 @@ def test_scenario_can_extend_another(mini: Path, tmp_path: Path, run_egvs) -> No
 def test_cost_of_effect_is_difference_with_and_without_it(
     mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where it is named, the scenario's seconds less those without it; else those with it less the scenario's."""
+    """For named effects: the scenario less without it; for others: with it less the scenario."""
     scenario = egvs.load(mini, ["effects.rain.rate_mm_h=20"])
     rows = [
         {"setting": name, "seconds": seconds, "error": 0.1, "tau": 0.9, "regret": 0.0}

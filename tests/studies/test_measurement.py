@@ -92,7 +92,7 @@ def test_result_of_another_program_version_is_ignored(
 
 
 def test_results_with_different_weights_are_saved_separately(mini: Path, tmp_path: Path) -> None:
-    """With an endless gamma, the same overrides mean half as much where beams are not weighted up."""
+    """With infinite gamma, unweighted scores of every second beam are half as large."""
     runner = make_runner(mini, tmp_path, "score.gamma=inf")
     thin = next(
         s for s in study_settings.list_settings(runner.scenario(SCENARIO_AS_IS)) if s.name == "every 2nd azimuth"
@@ -105,7 +105,7 @@ def test_memory_is_freed_before_a_stage_is_measured(
     mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     done: list[str] = []
-    monkeypatch.setattr(measurement, "release_memory", lambda: done.append("let go"))
+    monkeypatch.setattr(measurement, "release_memory", lambda: done.append("freed"))
     original = runtime.measure_usage
 
     def noted() -> object:
@@ -114,7 +114,7 @@ def test_memory_is_freed_before_a_stage_is_measured(
 
     monkeypatch.setattr(stages, "measure_usage", noted)
     make_runner(mini, tmp_path).run(SCENARIO_AS_IS)
-    assert done == ["let go", "measured"] * len(stages.RANKING_STAGES)
+    assert done == ["freed", "measured"] * len(stages.RANKING_STAGES)
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""The picture of an accuracy study: nothing in it covers anything else."""
+"""The figure of an accuracy study: no legend or label covers a marker."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def row(setting: str, kind: str, knob: str, seconds: float, judged: float, **mor
 
 
 def settings(seconds: float, judged: float) -> list[SettingResult]:
-    """Settings on a front from 1 s and 10 % to 32 s and 0.3 %, and the scenario's own somewhere."""
+    """Settings on a front from 1 s and 10 % to 32 s and 0.3 %, and the scenario's own anywhere."""
     knobs = ("frames", "step", "grid", "period", "azimuth", "channels")
     front = [row(f"{250 << i} frames", APPROXIMATES, knobs[i], 2.0**i, 0.1 / 2**i, front=True) for i in range(6)]
     measures = [row(f"gamma {i}", MEASURES, "gamma", 1.0, 0.5) for i in range(5)]

@@ -1,6 +1,7 @@
-"""Are runs put side by side as they are: scores, ranks, agreement, and what differs?
+"""Comparisons of runs: scores, ranks, agreement, differences, and messages.
 
-Evidence: small runs of known settings, numbers taken from their artefacts, and each wrong use with its message."""
+The expected numbers are read from the artefacts of small runs.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +23,7 @@ from egvs.studies.run_comparison import SiteResult, compare_runs
 
 @pytest.fixture
 def two(mini: Path, tmp_path: Path) -> tuple[Path, Path]:
-    """The small scenario, and the same with another gamma and a third site in the place of the second."""
+    """The small scenario, and the same with another gamma and a third site instead of the second."""
     first, second = tmp_path / "first", tmp_path / "second"
     egvs.run(egvs.load(mini), first)
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m\npole_a,10,12,3.5\npole_c,12,12,3\n")

@@ -29,7 +29,7 @@ length_s = 800
 
 @pytest.fixture
 def split(mini: Path) -> Path:
-    """The small scenario with two periods on a network: 400 frames, and 800 of its own."""
+    """The small scenario with two periods on a network: 400 frames, and a length of its own of 800 frames."""
     file, text = mini / "scenario.toml", (mini / "scenario.toml").read_text()
     head, rest = text.split("[traffic]", 1)
     file.write_text(head + TRAFFIC.replace("7.30 h", "7.30h") + "\n[statics]" + rest.split("[statics]", 1)[1])
@@ -112,7 +112,7 @@ def test_effects_are_left_out_and_their_quality_is_varied(mini: Path, tmp_path: 
 
 
 def test_tries_unnamed_effects_that_act_in_the_scene(mini: Path) -> None:
-    """Divergence needs no number of the user's; rain does, articulated has nothing to act on."""
+    """Divergence needs no parameter; rain does; articulated vehicles do not occur."""
     with_ = {
         s.name: s
         for s in study_settings.list_settings(egvs.load(mini))
@@ -122,7 +122,7 @@ def test_tries_unnamed_effects_that_act_in_the_scene(mini: Path) -> None:
     assert not {"with rain", "with articulated", "with slope", "with range_limit"} & with_.keys()
     rated = study_settings.list_settings(
         egvs.load(mini, ["sites.sensor=VLP-16"])
-    )  # its range is rated, the scenario's own sensor's is not
+    )  # it has a rated range, the scenario's sensor has none
     assert "with range_limit" in {s.name for s in rated}
     assert all(
         egvs.load(mini, s.overrides).effects.named.keys() == {s.name.removeprefix(study_settings.WITH_PREFIX)}
@@ -150,7 +150,7 @@ def test_settings_are_valid_scenarios(name: str) -> None:
 
 
 def test_default_setting_has_default_frames_period_and_step() -> None:
-    """The shipped junction names the paper's period of 0.25 s; a second apart is the program's own."""
+    """The shipped junction has a frame period of 0.25 s; the default is 1 s."""
     folder = ROOT / "scenarios" / "nishishinjuku"
     scenario = egvs.load(folder)
     settings = [

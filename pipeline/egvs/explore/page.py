@@ -163,7 +163,7 @@ class Page:
                 self._is_busy = False
                 self._changed.notify_all()
 
-    def wait_until_shown(self, timeout_s: float) -> bool:
+    def wait_until_idle(self, timeout_s: float) -> bool:
         """Wait until all requests are shown; False after a timeout."""
         with self._changed:
             return self._changed.wait_for(lambda: not self._has_request and not self._is_busy, timeout_s)
