@@ -14,7 +14,7 @@ import pytest
 
 from egvs.artefacts import parquet
 from egvs.report.sections import RHO, DetectorSummary, SiteDetection, Tau, egvs_setting, ranking_disagreement
-from egvs.studies import accuracy, score_errors, study_settings
+from egvs.studies import score_errors, study_settings
 from tests.report.test_ranking import by_vehicles, ranking
 
 NAN = float("nan")
@@ -174,10 +174,9 @@ def test_is_silent_if_scores_agree() -> None:
 def test_shows_the_accuracy_study_of_the_same_run(mini, tmp_path, run_egvs, monkeypatch):
     """Its recommendation, the front, the figure; not of another scenario or other files; the run is verified in each
     case."""
-    monkeypatch.setattr(study_settings, "VOXELS_M", (1.0,))
-    monkeypatch.setattr(study_settings, "GAMMAS", (2.0,))
-    monkeypatch.setattr(study_settings, "_others", lambda _: iter(()))
-    monkeypatch.setattr(accuracy, "REPEATS", 1)
+    few = study_settings.SettingValues(voxels_m=(1.0,), gammas=(2.0,), unnamed_effects=False)
+    list_settings = study_settings.list_settings
+    monkeypatch.setattr(study_settings, "list_settings", lambda scenario, _: list_settings(scenario, few))
     expected = score_errors.mark_pareto_front
 
     def thinned(rows, tolerance):

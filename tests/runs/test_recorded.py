@@ -135,6 +135,6 @@ def test_report_is_not_refreshed_from_altered_artefacts(runs, out: Path) -> None
 @pytest.mark.parametrize("name", ["trajectories.parquet", "tpog.parquet", "statics.ply"])
 def test_effect_study_rejects_altered_traffic(runs, out: Path, name: str) -> None:
     scene = inputs.resolve_scene(runs[0], open_folder(runs[0], out).world)
-    assert EffectTrials.of(scene, out) is not None
+    assert EffectTrials.from_run(scene, out) is not None
     shutil.copyfile(runs[2] / name, out / name)
-    assert EffectTrials.of(scene, out) is None
+    assert EffectTrials.from_run(scene, out) is None

@@ -179,7 +179,7 @@ def test_no_table_of_poles_with_one_candidate_each(mini: Path, tmp_path: Path, r
 def test_study_uses_the_first_candidate(mini: Path) -> None:
     (mini / "sites.csv").write_text("site,x_m,y_m\nc01,10,12\nc02,30.5,-12\n")
     scenario = egvs.load(mini, ["sites.heights_m=[3, 4.5]", 'sites.pitch_deg=["aim", 0]', "sites.aim=roi"])
-    first, (alone,) = sites.candidate_sites(scenario)[0], sites.candidate_sites(measurement._with_one_site(scenario))
+    first, (alone,) = sites.candidate_sites(scenario)[0], sites.candidate_sites(measurement.with_one_site(scenario))
     assert alone.pose == first.pose
 
 

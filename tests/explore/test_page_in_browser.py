@@ -1,6 +1,6 @@
-"""The page in a real browser: it loads without errors, and a drag ends with the score of where it ends.
+"""The page in a real browser loads without errors, and a drag ends with the score of the final pose.
 
-One browser and one page serve all tests of this module: with software rendering each load takes seconds.
+One browser and one page serve all tests of this module, because loading takes seconds with software rendering.
 """
 
 from __future__ import annotations
@@ -48,17 +48,17 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    """Over the small scenario, served."""
+    """A served page over the small scenario."""
     folder = tmp_path_factory.mktemp("browser")
     made = Page(open_session(write_mini(folder / "mini"), (), folder / "run"), folder / "scratch")
-    made.look_from(Camera((30.0, -34.0, 18.0), (30.0, -10.0, 3.0)))  # at the sensor that is dragged
+    made.set_camera(Camera((30.0, -34.0, 18.0), (30.0, -10.0, 3.0)))  # at the sensor that is dragged
     with serving(made) as served:
         yield served
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """What one user has open: Chromium, with software rendering."""
+    """Chromium with software rendering."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
@@ -68,7 +68,7 @@ def browser() -> Iterator[Any]:
 
 
 def look(browser: Any, address: str, errors: list[str]) -> Any:
-    """Open an address; what goes wrong in it is added to ``errors``."""
+    """Open an address; errors are added to ``errors``."""
     tab = browser.new_page()
     tab.on("pageerror", lambda error: errors.append(str(error)))
     tab.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
@@ -79,7 +79,7 @@ def look(browser: Any, address: str, errors: list[str]) -> Any:
 
 @pytest.fixture(scope="module")
 def errors() -> list[str]:
-    """What went wrong in the tab."""
+    """Errors in the tab."""
     return []
 
 
@@ -90,22 +90,22 @@ def tab(browser: Any, page: Page, errors: list[str]) -> Any:
 
 
 def looks_at_it(page: Page) -> None:
-    """Wait until the browser tells that it looks from where it was told to; it begins elsewhere."""
-    (client,) = page._server.get_clients().values()
+    """Wait until the browser reports the requested camera; it starts with another one."""
+    (client,) = page.server.get_clients().values()
     there = threading.Event()
 
-    def told(camera: Any) -> None:
-        if np.allclose(camera.position, page._server.initial_camera.position, atol=1e-3):
+    def check(camera: Any) -> None:
+        if np.allclose(camera.position, page.server.initial_camera.position, atol=1e-3):
             there.set()
 
-    client.camera.on_update(told)
-    told(client.camera)
+    client.camera.on_update(check)
+    check(client.camera)
     assert there.wait(READY_S)
 
 
 def on_screen(page: Page, tab: Any, at_m: np.ndarray) -> tuple[float, float]:
-    """Where a point of the page's frame is drawn, in pixels, by the camera that the browser tells of."""
-    (client,) = page._server.get_clients().values()
+    """Return the pixel of a point of the page's frame, with the camera that the browser reports."""
+    (client,) = page.server.get_clients().values()
     w, x, y, z = client.camera.wxyz
     columns = [
         [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
@@ -121,14 +121,14 @@ def on_screen(page: Page, tab: Any, at_m: np.ndarray) -> tuple[float, float]:
     )
 
 
-def test_a_drag_ends_with_the_score_of_where_it_ends(tab: Any, page: Page, errors: list[str]) -> None:
+def test_drag_ends_with_score_of_final_pose(tab: Any, page: Page, errors: list[str]) -> None:
     looks_at_it(page)
     start = page.rating.site
     at_m = np.subtract(start.pose.position_m, page.zero_m)
     x, y = on_screen(page, tab, at_m + np.array([0.0, 0.0, 0.85 * GIZMO_M]))
     ended = threading.Event()
 
-    @page._gizmo.on_update
+    @page.gizmo.on_update
     def _(event: Any) -> None:
         if event.phase == "end":
             ended.set()
@@ -139,19 +139,17 @@ def test_a_drag_ends_with_the_score_of_where_it_ends(tab: Any, page: Page, error
         tab.mouse.move(x, y - 10 * step)
     tab.mouse.up()
     assert ended.wait(READY_S)
-    assert page.rest(READY_S)
+    assert page.wait_until_idle(READY_S)
     moved = page.rating.site.pose
     assert (moved.x_m, moved.y_m, moved.angles_deg) == (start.pose.x_m, start.pose.y_m, start.pose.angles_deg)
     assert moved.z_m > start.pose.z_m + 0.2
     assert page.rating == page.session.rate(start.name, moved)
     tab.get_by_text(f"{page.rating.scores['egvs']:,.1f}").first.wait_for(timeout=READY_MS)
-    assert (page._gizmo.position + page.zero_m).tolist() == list(moved.position_m)
+    assert (page.gizmo.position + page.zero_m).tolist() == list(moved.position_m)
     assert errors == []
 
 
-def test_another_browser_sees_it_too_and_a_reload_keeps_it(
-    browser: Any, tab: Any, page: Page, errors: list[str]
-) -> None:
+def test_other_browsers_and_reload_show_the_same(browser: Any, tab: Any, page: Page, errors: list[str]) -> None:
     field = tab.get_by_label("z m")
     field.fill("4.5")
     field.press("Enter")
@@ -168,55 +166,55 @@ def test_another_browser_sees_it_too_and_a_reload_keeps_it(
     assert errors == []
 
 
-def test_a_lost_connection_comes_back_with_what_changed(tab: Any, page: Page) -> None:
-    server = page._server._websock_server
+def test_reconnected_browser_shows_changes(tab: Any, page: Page) -> None:
+    server = page.server._websock_server
     (lost,) = server._live_connections
     back = threading.Event()
-    page._server.on_client_connect(lambda client: back.set() if client.client_id != lost else None)
+    page.server.on_client_connect(lambda client: back.set() if client.client_id != lost else None)
     closing = server._live_connections[lost].close()
-    asyncio.run_coroutine_threadsafe(closing, page._server.get_event_loop()).result(READY_S)
+    asyncio.run_coroutine_threadsafe(closing, page.server.get_event_loop()).result(READY_S)
     site = page.session.candidates["pole_a"].site
-    page.ask(site=site)
+    page.request(site=site)
     assert back.wait(READY_S)
     score = page.session.rate(site.name, site.pose).scores["egvs"]
     tab.get_by_role("heading", name=f"{score:,.1f}").wait_for(timeout=READY_MS)
 
 
-def test_a_users_file_is_not_written_over_before_he_says_so(tab: Any, page: Page) -> None:
+def test_users_file_is_not_overwritten_when_saving_a_pose(tab: Any, page: Page) -> None:
     folder = page.session.scenario.folder
     (folder / SAVED_SITES).write_text("mine")
-    tab.get_by_role("button", name="Keep this pose").click()
+    tab.get_by_role("button", name="Save this pose").click()
     tab.get_by_text("was not written by egvs explore").wait_for(timeout=READY_MS)
-    tab.get_by_role("button", name="Keep in kept_sites-2.csv").click()
-    tab.get_by_text("kept as pole_a-1").wait_for(timeout=READY_MS)
+    tab.get_by_role("button", name="Save to kept_sites-2.csv").click()
+    tab.get_by_text("saved as pole_a-1").wait_for(timeout=READY_MS)
     assert (folder / SAVED_SITES).read_text() == "mine"
     assert (folder / "kept_sites-2.csv").read_text().splitlines()[1].startswith("pole_a-1,10.0,12.0,3.0")
 
 
-def test_a_link_and_a_picture_are_of_what_is_shown(browser: Any, tab: Any, page: Page, errors: list[str]) -> None:
+def test_link_and_picture_show_the_current_view(browser: Any, tab: Any, page: Page, errors: list[str]) -> None:
     tab.get_by_role("button", name="Link to this view").click()
     link = tab.get_by_text(re.compile("^http://")).first.inner_text(timeout=READY_MS).strip()
     tab.get_by_role("button", name="Close").last.click()
-    (client,) = page._server.get_clients().values()
+    (client,) = page.server.get_clients().values()
     before = client.camera.position, page.view
     with tab.expect_download(timeout=READY_MS) as download:
         tab.get_by_role("button", name="Picture (PNG)").click()
     assert download.value.suggested_filename == "mini.png"
     assert Path(download.value.path()).read_bytes().startswith(b"\x89PNG")
-    page.ask(site=page.session.candidates["pole_b"].site, layer="traffic")
-    assert page.rest(READY_S)
+    page.request(site=page.session.candidates["pole_b"].site, layer="traffic")
+    assert page.wait_until_idle(READY_S)
     tab.goto(link)
     tab.get_by_role("heading", name=f"{page.session.candidates['pole_a'].scores['egvs']:,.1f}").wait_for(
         timeout=READY_MS
     )
     assert page.view == before[1]
-    (client,) = page._server.get_clients().values()
+    (client,) = page.server.get_clients().values()
     assert np.allclose(client.camera.position, before[0], rtol=1e-4)
     assert "key=" not in tab.url
     assert errors == []
 
 
-def test_a_page_of_another_origin_cannot_connect(browser: Any, tab: Any, page: Page, tmp_path: Path) -> None:
+def test_page_of_other_origin_cannot_connect(browser: Any, tab: Any, page: Page, tmp_path: Path) -> None:
     (tmp_path / "evil.html").write_text("<p>evil</p>")
     handler = functools.partial(_Quiet, directory=str(tmp_path))
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as evil:
@@ -225,15 +223,15 @@ def test_a_page_of_another_origin_cannot_connect(browser: Any, tab: Any, page: P
         try:
             other = browser.new_page()
             other.goto(f"http://127.0.0.1:{evil.server_address[1]}/evil.html")
-            told = other.evaluate(CONNECT, [page._origin.replace("http", "ws"), f"viser-v{viser.__version__}"])
-            fetched = other.evaluate("address => fetch(address).then(() => 'read', () => 'refused')", page._origin)
+            connected = other.evaluate(CONNECT, [page.origin.replace("http", "ws"), f"viser-v{viser.__version__}"])
+            fetched = other.evaluate("address => fetch(address).then(() => 'read', () => 'refused')", page.origin)
         finally:
             evil.shutdown()
             serving.join()
     other.close()
-    assert (told, fetched) == ("refused", "refused")
+    assert (connected, fetched) == ("refused", "refused")
 
 
 class _Quiet(http.server.SimpleHTTPRequestHandler):
     def log_message(self, *_: Any) -> None:
-        """Nothing is printed."""
+        """Print nothing."""

@@ -1,4 +1,4 @@
-"""`egvs explore` on the command line: what it prints, how it ends, what it refuses."""
+"""`egvs explore` on the command line: output, end, and invalid options."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import urllib.error
 import urllib.request
 import webbrowser
@@ -20,7 +21,7 @@ from tests.processes import EGVS
 
 @pytest.mark.system
 @pytest.mark.slow
-def test_it_serves_until_an_interrupt_and_leaves_nothing(mini: Path, tmp_path: Path) -> None:
+def test_serves_until_interrupt_and_cleans_up(mini: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     command = [sys.executable, "-c", EGVS, "explore", mini, "--no-browser", "--out", out]
     (tmp_path / "tmp").mkdir()
@@ -34,20 +35,18 @@ def test_it_serves_until_an_interrupt_and_leaves_nothing(mini: Path, tmp_path: P
     opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
     assert opener.open(address).status == 200
     os.kill(started.pid, signal.SIGINT)
-    printed, said = started.communicate()
+    printed, errors = started.communicate()
     assert (started.returncode, printed.strip()) == (0, "")
-    assert said.splitlines()[-1].startswith("score")  # no word of an interrupt
+    assert errors.splitlines()[-1].startswith("score")  # no message about the interrupt
     with pytest.raises(ProcessLookupError):
-        os.killpg(started.pid, 0)  # nobody is left of all that it started
+        os.killpg(started.pid, 0)  # no process is left
     with pytest.raises(urllib.error.URLError, match="refused"):
         opener.open(address)
-    assert not any(tmp_path.glob("tmp/egvs-work-*"))  # where runs with other settings are made
+    assert not any(tmp_path.glob("tmp/egvs-work-*"))  # temporary runs with other settings
     assert {path: path.read_bytes() for path in out.iterdir()} == before
 
 
-def test_the_address_is_printed_and_opened(
-    run_egvs, mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_address_is_printed_and_opened(run_egvs, mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[str] = []
     monkeypatch.setattr(webbrowser, "open", opened.append)
     monkeypatch.setattr(page.Page, "run", lambda page: opened.append(page.address))
@@ -59,24 +58,28 @@ def test_the_address_is_printed_and_opened(
     assert len(opened) == 3
 
 
-def test_it_begins_with_the_view_of_a_link(
-    run_egvs, mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_starts_with_the_view_of_a_link(run_egvs, mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shown: list[tuple] = []
 
+    real_run = page.Page.run
+
     def run(page: page.Page) -> None:
-        page._show(page._latest)
+        loop = threading.Thread(target=real_run, args=(page,))
+        loop.start()
+        assert page.wait_until_idle(60)
         shown.append((page.view.site.name, page.view.site.pose.z_m, page.view.layer))
+        page.end()
+        loop.join()
 
     monkeypatch.setattr(page.Page, "run", run)
     explore = ("explore", mini, "--no-browser", "--out", tmp_path / "run", "--view")
     assert run_egvs(*explore, "site=pole_a&pose=10,12,4.5,0,0,0&layer=seen")[0] == 0
     assert shown == [("pole_a", 4.5, "seen")]
     code, _, err = run_egvs(*explore, "site=nobody")
-    assert (code, err.splitlines()[-1]) == (2, "egvs: --view: site: 'nobody'; one of pole_a, pole_b")
+    assert (code, err.splitlines()[-1]) == (2, "egvs: --view: site: expected one of pole_a, pole_b, got 'nobody'")
 
 
-def test_without_the_extra_it_says_how_to_install_it(run_egvs, mini: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_says_how_to_install_viser(run_egvs, mini: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(mini.parent)
     monkeypatch.setitem(sys.modules, "viser", None)
     code, out, err = run_egvs("explore", mini)
@@ -85,9 +88,7 @@ def test_without_the_extra_it_says_how_to_install_it(run_egvs, mini: Path, monke
     assert not Path("runs").exists()
 
 
-def test_a_port_that_is_taken_is_one_message_before_any_work(
-    run_egvs, mini: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_port_in_use_is_reported_before_any_work(run_egvs, mini: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(mini.parent)
     with socket.socket() as other:
         other.bind((page.HOST, 0))
@@ -95,7 +96,7 @@ def test_a_port_that_is_taken_is_one_message_before_any_work(
         port = other.getsockname()[1]
         code, out, err = run_egvs("explore", mini, "--port", port)
     assert (code, out) == (2, "")
-    assert err == f"egvs: --port: {port} is taken; another one, or 0 for any that is free\n"
+    assert err == f"egvs: --port: port {port} is in use. Use another port, or 0 for any free one.\n"
     assert not Path("runs").exists()
 
 
@@ -107,7 +108,7 @@ def test_a_port_that_is_taken_is_one_message_before_any_work(
         (("mini", "--set", "score.gamma=-1"), "score.gamma"),
     ],
 )
-def test_what_is_wrong_is_one_message(
+def test_invalid_options_give_one_message(
     run_egvs, mini: Path, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], message: str
 ) -> None:
     monkeypatch.chdir(mini.parent)

@@ -1,8 +1,8 @@
-"""Does the score that is recommended foretell detection where nothing was learnt or chosen? The tables of F.
+"""Tables F: how well the recommended score predicts detection at junctions that were not used for training or choices.
 
-It came after A to E: learnt on the training junctions (``benchmarks/detectability``), so nothing is quoted for them. It
-is compared with the EGVS at every setting that was tried, also with the one that is best at the very same sites, which
-nobody can know beforehand.
+The score came after the tables A to E: it was trained on the training junctions (``benchmarks/detectability``), so
+nothing is reported for them. It is compared with EGVS at every setting that was tried, also with the one that is best
+at the very same sites, which nobody can know in advance.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 from benchmarks.validity import low_models
-from benchmarks.validity.agreement import HELD_OUT, TRAINING, WORDS, told
+from benchmarks.validity.agreement import HELD_OUT, TRAINING, WORDS, coefficient_cell
 from benchmarks.validity.failures import COLUMNS, worst
 from benchmarks.validity.pools import DEFAULT, Pools, Setting
 from benchmarks.validity.record import Record, StudySite, measures_of
@@ -22,13 +22,13 @@ from egvs.validation.results import ScoreName
 from egvs.validation.sweeps import POINT_COUNTS_NAME
 
 RECOMMENDED = str(ScoreName("expected_detections", f'{{"detectors": "{"+".join(DETECTORS)}"}}'))
-"""What is recommended: the mean chance over the detectors that have a model."""
+"""The recommended score: the mean probability over the detectors that have a model."""
 
 LATER = ("seen_well", "expected_detections")
-"""Scores that came after A to E were answered; they have no part in these."""
+"""Scores that were added after A to E; these tables do not contain them."""
 
 BETTER = Setting(2.0, DEFAULT.voxel_m, False)
-"""What ``gamma = "auto"`` has at the default's voxels, chosen on training junctions."""
+"""The value of ``gamma = "auto"`` with default voxels, chosen on training junctions."""
 
 _KINDS: dict[str, Callable[[StudySite], bool]] = {
     "all": lambda site: True,
@@ -37,26 +37,27 @@ _KINDS: dict[str, Callable[[StudySite], bool]] = {
 }
 
 
-def before(records: Sequence[Record]) -> list[Record]:
-    """What A to E rest on: the junctions and scores that were there then."""
-    kept = [record for record in records if record.role in (TRAINING, HELD_OUT)]
+def without_later_scores(records: Sequence[Record]) -> list[Record]:
+    """Return what A to E are based on: junctions and scores that existed then."""
+    known = [record for record in records if record.role in (TRAINING, HELD_OUT)]
     return [
-        replace(its, scores={name: v for name, v in its.scores.items() if not name.startswith(LATER)}) for its in kept
+        replace(record, scores={name: v for name, v in record.scores.items() if not name.startswith(LATER)})
+        for record in known
     ]
 
 
 def tables(records: Sequence[Record], detectors: Sequence[str]) -> Iterator[Table]:
-    """F: a table of coefficients a detector, and the sites that the score ranks worst; nothing without that score."""
-    held = [its for its in records if its.role != TRAINING and RECOMMENDED in its.scores]
+    """Yield tables F: coefficients for each detector, and the sites that the score ranks worst."""
+    others = [record for record in records if record.role != TRAINING and RECOMMENDED in record.scores]
     named = [name for name in detectors if name not in low_models.NAMES]
-    pairs = [(name, [its for its in held if name in its.detections]) for name in named]
-    for name, mine in ((name, its) for name, its in pairs if its):
-        yield from (_coefficients(mine, name, measure) for measure in measures_of(name))
-    if boxed := [(name, its) for name, its in pairs if its and name != POINT_COUNTS_NAME]:
+    pairs = [(name, [record for record in others if name in record.detections]) for name in named]
+    for name, with_detector in ((name, record) for name, record in pairs if record):
+        yield from (_coefficients(with_detector, name, measure) for measure in measures_of(name))
+    if boxed := [(name, record) for name, record in pairs if record and name != POINT_COUNTS_NAME]:
         yield _every_score(boxed)
-    for name, mine in ((name, its) for name, its in pairs if its):
+    for name, with_detector in ((name, record) for name, record in pairs if record):
         measure = measures_of(name)[0]
-        rows = [row for record in mine for row in worst(record, name, measure, RECOMMENDED)]
+        rows = [row for record in with_detector for row in worst(record, name, measure, RECOMMENDED)]
         caption = (
             f"The sites whose rank by {RECOMMENDED} differs most from their rank by {WORDS[measure]} ({name}); columns"
             " as in E."
@@ -66,14 +67,15 @@ def tables(records: Sequence[Record], detectors: Sequence[str]) -> Iterator[Tabl
 
 def _coefficients(records: Sequence[Record], detector: str, measure: str) -> Table:
     rows: list[list[Cell]] = []
-    for kind, wanted in _KINDS.items():
-        some = [replace(record.only(wanted), role=HELD_OUT) for record in records]
-        pools = Pools([its for its in some if its.detections[detector][measure].sites], detector)
+    for kind, is_selected in _KINDS.items():
+        some = [replace(record.only(is_selected), role=HELD_OUT) for record in records]
+        pools = Pools([record for record in some if record.detections[detector][measure].sites], detector)
         names = [name for name in pools.studies if name != HELD_OUT or len(pools.records) > 1]
         rows += [_row(pools, name, kind, measure) for name in names]
     head = [Column("junction"), Column("sites"), Column("number of sites", "whole")]
     head += [
-        Column(its, "two") for its in ("recommended", "EGVS, gamma 10", "recommended minus gamma 10", "EGVS, gamma 2")
+        Column(record, "two")
+        for record in ("recommended", "EGVS, gamma 10", "recommended minus gamma 10", "EGVS, gamma 2")
     ]
     head += [
         Column("best EGVS setting here"),
@@ -89,17 +91,17 @@ def _coefficients(records: Sequence[Record], detector: str, measure: str) -> Tab
 
 
 def _every_score(boxed: Sequence[tuple[str, Sequence[Record]]]) -> Table:
-    """What the program quotes where scores disagree: every score, over all these junctions together."""
-    together = [Pools([replace(its, role=HELD_OUT) for its in records], name) for name, records in boxed]
+    """Return all scores over all these junctions together; the program refers to it when scores disagree."""
+    together = [Pools([replace(record, role=HELD_OUT) for record in records], name) for name, records in boxed]
     measures = [measures_of(pools.detector)[0] for pools in together]
     rho = [
         {score: pools.rho(HELD_OUT, score, measure) for score in pools.scores}
         for pools, measure in zip(together, measures, strict=True)
     ]
-    names = [name for name in rho[0] if all(name in its for its in rho)]
-    total = {name: sum(its[name].value for its in rho) for name in names}
+    names = [name for name in rho[0] if all(name in record for record in rho)]
+    total = {name: sum(record[name].value for record in rho) for name in names}
     order = sorted(names, key=lambda name: math.inf if math.isnan(total[name]) else -total[name])
-    rows: list[list[Cell]] = [[name, *(told(its[name]) for its in rho)] for name in order]
+    rows: list[list[Cell]] = [[name, *(coefficient_cell(record[name]) for record in rho)] for name in order]
     head = [Column("score"), *(Column(pools.detector, "two") for pools in together)]
     caption = (
         f"Rho of every score with {WORDS[measures[0]]}, over all junctions that were not used for training, given and"
@@ -110,16 +112,22 @@ def _every_score(boxed: Sequence[tuple[str, Sequence[Record]]]) -> Table:
 
 def _row(pools: Pools, name: str, kind: str, measure: str) -> list[Cell]:
     sites = sum(
-        len(its.detections[pools.detector][measure].sites) for its in pools.records if name in (HELD_OUT, its.junction)
+        len(record.detections[pools.detector][measure].sites)
+        for record in pools.records
+        if name in (HELD_OUT, record.junction)
     )
     best = pools.best(name, [str(setting) for setting in pools.settings()], measure)
     cells = [
-        told(pools.rho(name, score, measure)) if score in pools.scores else None
+        coefficient_cell(pools.rho(name, score, measure)) if score in pools.scores else None
         for score in (RECOMMENDED, str(DEFAULT), str(BETTER))
     ]
-    cells.insert(2, told(pools.difference(name, RECOMMENDED, str(DEFAULT), measure)))
-    beside: list[Cell] = [None, None, None]
+    cells.insert(2, coefficient_cell(pools.difference(name, RECOMMENDED, str(DEFAULT), measure)))
+    best_cells: list[Cell] = [None, None, None]
     if best is not None:
         gap = pools.difference(name, RECOMMENDED, best, measure)
-        beside = [best.removeprefix("egvs "), told(pools.rho(name, best, measure)), told(gap)]
-    return ["together" if name == HELD_OUT else name, kind, sites, *cells, *beside]
+        best_cells = [
+            best.removeprefix("egvs "),
+            coefficient_cell(pools.rho(name, best, measure)),
+            coefficient_cell(gap),
+        ]
+    return ["together" if name == HELD_OUT else name, kind, sites, *cells, *best_cells]

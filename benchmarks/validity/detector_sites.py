@@ -1,4 +1,4 @@
-"""Where each detector looks from at a junction: quick ones from all sites, others from some, chosen by order alone."""
+"""Sites where each detector runs: fast ones at all sites, others at some, chosen only by their order."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from egvs.sensors.sites import Site
 from egvs.validation.sweeps import POINT_COUNTS_NAME
 
 FAST = (POINT_COUNTS_NAME, "cluster")
-"""Detectors that look from every site, and with every sensor; others look from some."""
+"""Detectors that run at every site, with every sensor; others run at some."""
 
 FEW_PLACES = 5
 FEW_GIVEN: dict[Role, int] = {"training": 6, "held out": 13, "unseen": 13}
-"""Where other detectors look from: the first places of the grid at all heights, and so many of the given sites."""
+"""Sites of other detectors: the first locations of the grid at all heights, and this many given sites."""
 
 
 def sites_of(detector: str, junction: StudyJunction) -> tuple[Site, ...]:
-    """Where a detector looks from at a junction; those that are there for mounting heights at held-out ones alone."""
+    """Return the sites of a detector at a junction; detectors for mounting heights run at held-out junctions only."""
     if detector in FAST:
         return (*junction.given, *junction.grid)
     if detector in low_models.NAMES:
         return first_places(junction.grid) if junction.role == "held out" else ()
-    return (*some(junction.given, FEW_GIVEN[junction.role]), *first_places(junction.grid))
+    return (*evenly_chosen(junction.given, FEW_GIVEN[junction.role]), *first_places(junction.grid))
 
 
 def first_places(grid: tuple[Site, ...]) -> tuple[Site, ...]:
-    """The sites at the first places of the grid."""
+    """Return the sites at the first locations of the grid."""
     return grid[: FEW_PLACES * len(poses.HEIGHTS_M)]
 
 
-def some(sites: Sequence[Site], most: int) -> list[Site]:
-    """Not more than so many: of poles evenly over the list one each, the next height with each pole; then a second."""
+def evenly_chosen(sites: Sequence[Site], most: int) -> list[Site]:
+    """Return at most ``most`` sites: one of each pole, evenly over the list, at alternating heights; then a second."""
     if len(sites) <= most:
         return list(sites)
     at: dict[str, list[Site]] = {}
@@ -42,9 +42,9 @@ def some(sites: Sequence[Site], most: int) -> list[Site]:
         at.setdefault(site.pole, []).append(site)
     poles, chosen = list(at.values()), list[Site]()
     while len(chosen) < most:
-        wanted = min(most - len(chosen), len(poles))
-        for turn, number in enumerate((np.arange(wanted) * len(poles) // wanted).tolist()):
-            left = [site for site in poles[number] if site not in chosen]
-            chosen += left[turn % len(left) : turn % len(left) + 1] if left else []
+        count = min(most - len(chosen), len(poles))
+        for turn, number in enumerate((np.arange(count) * len(poles) // count).tolist()):
+            remaining = [site for site in poles[number] if site not in chosen]
+            chosen += remaining[turn % len(remaining) : turn % len(remaining) + 1] if remaining else []
         poles = [pole for pole in poles if any(site not in chosen for site in pole)]
     return [site for site in sites if site in chosen]

@@ -1,4 +1,4 @@
-"""``egvs effects`` tells which effects a scene calls for, and what each changes."""
+"""``egvs effects`` says which effects a scene calls for, and what each changes."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ def states(mini: Path, *overrides: str) -> dict[str, tuple[str, str]]:
     return {call.name: (call.state, call.why) for call in effect_study.effect_statuses(egvs.load(mini, overrides))}
 
 
-def test_every_effect_is_listed_with_its_source(run_egvs) -> None:
+def test_all_effects_are_listed_with_their_source(run_egvs) -> None:
     code, printed, _ = run_egvs("effects")
     assert code == 0
     for call in effect_study.effect_catalogue():
         assert call.name in printed
         assert call.source
-        assert call.why.endswith((".", "?"))  # the sentence that its module opens with
+        assert call.why.endswith((".", "?"))  # the first sentence of its module
 
 
-def advice(folder: Path, out: Path, *overrides: str) -> dict[str, effect_study.EffectStatus]:
-    """What is said of each effect, tried on the run in ``out``."""
+def tried_statuses(folder: Path, out: Path, *overrides: str) -> dict[str, effect_study.EffectStatus]:
+    """Return the status of each effect, tried with the run in ``out``."""
     return {call.name: call for call in effect_study.effect_statuses(egvs.load(folder, overrides), out)}
 
 
-def test_a_plain_scene_is_told_what_it_has_and_what_only_its_user_knows(mini: Path) -> None:
-    found = states(mini)
-    assert set(found) == set(registry.effect_names())
-    assert {name: state for name, (state, _) in found.items() if state != "off"} == {
+def test_statuses_of_effects_in_plain_scene(mini: Path) -> None:
+    statuses = states(mini)
+    assert set(statuses) == set(registry.effect_names())
+    assert {name: state for name, (state, _) in statuses.items() if state != "off"} == {
         "rain": "your choice",
         "fog": "your choice",
         "dropout": "your choice",
@@ -46,28 +46,28 @@ def test_a_plain_scene_is_told_what_it_has_and_what_only_its_user_knows(mini: Pa
         "moving_occlusion": "called for",
         "divergence": "called for",
     }
-    assert found["rain"][1].startswith("the weather decides; by its formula, ")
-    assert found["foliage"][1] == "not called for: there is no closed tree crown"
-    assert "cannot act here: rated_range_m is missing" in found["range_limit"][1]
-    assert "people cannot be added to a finished FCD file" in found["pedestrians_bicycles"][1]
-    assert "no vehicle type has more than one part" in found["articulated"][1]
-    assert "flat" in found["slope"][1] or "no network" in found["slope"][1] or "relief" in found["slope"][1]
+    assert statuses["rain"][1].startswith("the weather decides; by its formula, ")
+    assert statuses["foliage"][1] == "not called for: there is no closed tree crown"
+    assert "cannot act here: rated_range_m is missing" in statuses["range_limit"][1]
+    assert "people cannot be added to a finished FCD file" in statuses["pedestrians_bicycles"][1]
+    assert "no vehicle type has more than one part" in statuses["articulated"][1]
+    assert "flat" in statuses["slope"][1] or "no network" in statuses["slope"][1] or "relief" in statuses["slope"][1]
 
 
-def test_a_limit_beyond_the_region_is_of_little_effect_before_a_run_too(mini: Path) -> None:
-    """Noticed to 3000 m and to 30 m, the region being 50 m wide."""
+def test_range_limit_beyond_region_has_little_effect_before_a_run(mini: Path) -> None:
+    """Ranges of 3000 m and 30 m; the region is 50 m wide."""
     for rated_m, state in ((3000, "little"), (30, "called for")):
-        found = states(mini, f"sensors.small.rated_range_m={rated_m}")["range_limit"]
-        assert found[0] == state
-        assert ("100% of returns" in found[1]) == (state == "little")
+        statuses = states(mini, f"sensors.small.rated_range_m={rated_m}")["range_limit"]
+        assert statuses[0] == state
+        assert ("100% of returns" in statuses[1]) == (state == "little")
 
 
 @pytest.mark.slow
-def test_the_change_that_is_expected_is_the_one_that_a_run_finds(mini: Path, tmp_path: Path) -> None:
+def test_expected_changes_equal_those_of_runs(mini: Path, tmp_path: Path) -> None:
     plain = tmp_path / "plain"
     egvs.run(egvs.load(mini), plain)
     before = {row["site"]: row["egvs"] for row in readers.read_scores(plain / "scores.parquet").to_pylist()}
-    found = advice(mini, plain)
+    statuses = tried_statuses(mini, plain)
     for name, words in (
         ("dropout", "share=0.1"),
         ("moving_occlusion", "method='frames'"),
@@ -76,14 +76,14 @@ def test_the_change_that_is_expected_is_the_one_that_a_run_finds(mini: Path, tmp
         egvs.run(egvs.load(mini, [f"effects.{name}.{words}"]), tmp_path / name)
         rows = readers.read_scores(tmp_path / name / "scores.parquet").to_pylist()
         changes = sorted((row["egvs"] / before[row["site"]] - 1 for row in rows), key=abs)
-        assert f"scores by {changes[0]:+.1%} to {changes[-1]:+.1%}" in found[name].change, name
-        assert "measured on 2 of 2 sites, with the last run's traffic" in found[name].change
-    assert found["dropout"].why.endswith("; tried with share = 0.1")
-    assert found["foliage"].change == ""
+        assert f"scores by {changes[0]:+.1%} to {changes[-1]:+.1%}" in statuses[name].change, name
+        assert "measured on 2 of 2 sites, with the last run's traffic" in statuses[name].change
+    assert statuses["dropout"].why.endswith("; tried with share = 0.1")
+    assert statuses["foliage"].change == ""
 
 
 @pytest.mark.slow
-def test_trees_and_long_trucks_in_the_scene_are_seen(mini: Path, tmp_path: Path) -> None:
+def test_trees_and_long_trucks_call_for_their_effects(mini: Path, tmp_path: Path) -> None:
     crown = feature({"type": "Point", "coordinates": [12, 9]}, kind="tree_crown", height_m=5, base_m=1, radius_m=1.5)
     far = feature({"type": "Point", "coordinates": [900, 9]}, kind="tree_crown", height_m=5, base_m=1, radius_m=1.5)
     (mini / "statics.geojson").write_text(collection(crown, far))
@@ -93,17 +93,17 @@ def test_trees_and_long_trucks_in_the_scene_are_seen(mini: Path, tmp_path: Path)
     (mini / "scenario.toml").write_text(text.replace(kind, "").replace('fcd.csv"', "fcd.csv\"\nvtypes = ['truck.xml']"))
     assert states(mini)["articulated"] == ("your choice", "the vtypes may have articulated vehicles of 16 m and more")
     egvs.run(egvs.load(mini), tmp_path / "out")
-    found = advice(mini, tmp_path / "out")
-    assert (found["foliage"].state, found["foliage"].why) == (
+    statuses = tried_statuses(mini, tmp_path / "out")
+    assert (statuses["foliage"].state, statuses["foliage"].why) == (
         "called for",
         "1 of 2 tree crowns may stand between a site and the region",
     )
-    assert found["articulated"].state == "called for"
-    assert found["articulated"].change.startswith("100.0% of the boxes in the last run get parts")
+    assert statuses["articulated"].state == "called for"
+    assert statuses["articulated"].change.startswith("100.0% of the boxes in the last run get parts")
 
 
 @pytest.mark.slow
-def test_traffic_of_another_scenario_is_not_tried_on(mini: Path, tmp_path: Path, run_egvs) -> None:
+def test_effects_are_not_tried_with_traffic_of_another_scenario(mini: Path, tmp_path: Path, run_egvs) -> None:
     out = tmp_path / "out"
     code, printed, _ = run_egvs("effects", mini, "--out", out)
     assert (code, out.exists()) == (0, False)
@@ -116,25 +116,23 @@ def test_traffic_of_another_scenario_is_not_tried_on(mini: Path, tmp_path: Path,
     assert "to measure the expected changes" in run_egvs("effects", mini, "--out", out)[1]
 
 
-def test_a_named_effect_is_on_with_its_parameters(mini: Path) -> None:
+def test_named_effect_is_on_with_its_parameters(mini: Path) -> None:
     state, why = states(mini, "effects.rain.rate_mm_h=20")["rain"]
     assert state == "on"
     assert "rate_mm_h = 20" in why
 
 
 @pytest.mark.slow
-def test_an_effect_that_cannot_change_anything_is_skipped_and_the_run_says_so(
-    mini: Path, tmp_path: Path, run_egvs
-) -> None:
+def test_effect_without_consequence_is_skipped_and_reported(mini: Path, tmp_path: Path, run_egvs) -> None:
     named = ("effects.rain.rate_mm_h=0", "effects.foliage.leaf_area_density=1")
-    found = states(mini, *named)
-    assert found["rain"][0] == found["foliage"][0] == "skipped"
-    assert "the result is the same without it" in found["foliage"][1]
+    statuses = states(mini, *named)
+    assert statuses["rain"][0] == statuses["foliage"][0] == "skipped"
+    assert "the result is the same without it" in statuses["foliage"][1]
     plain, skipped = tmp_path / "plain", tmp_path / "skipped"
     assert run_egvs("run", mini, "--out", plain)[0] == 0
-    code, _, said = run_egvs("run", mini, "--out", skipped, *(part for name in named for part in ("--set", name)))
+    code, _, errors = run_egvs("run", mini, "--out", skipped, *(part for name in named for part in ("--set", name)))
     assert code == 0
-    assert "rain" in said and "foliage" in said
+    assert "rain" in errors and "foliage" in errors
     for name in ("scans.parquet", "scores.parquet", "tpog.parquet", "trajectories.parquet", "statics.ply"):
         assert (plain / name).read_bytes() == (skipped / name).read_bytes()
 
@@ -142,8 +140,8 @@ def test_an_effect_that_cannot_change_anything_is_skipped_and_the_run_says_so(
 @pytest.mark.slow
 def test_ablation_runs_each_effect_alone_and_all_together(mini: Path, tmp_path: Path, run_egvs) -> None:
     named = ("--set", "effects.rain.rate_mm_h=50", "--set", "effects.dropout.share=0.25")
-    code, printed, said = run_egvs("effects", mini, *named, "--ablation", "--out", tmp_path)
-    assert code == 0, said
+    code, printed, errors = run_egvs("effects", mini, *named, "--ablation", "--out", tmp_path)
+    assert code == 0, errors
     assert "rain" in printed and "dropout" in printed and "all" in printed
     changes = run_ablation(egvs.load(mini, named[1::2]), tmp_path)
     scores = {change.effect: dict(zip(change.sites, change.scores, strict=True)) for change in changes}
@@ -159,14 +157,14 @@ def test_ablation_runs_each_effect_alone_and_all_together(mini: Path, tmp_path: 
     ("arguments", "message"),
     [(["--ablation"], "without a scenario"), (["{mini}", "--ablation"], "names no effect")],
 )
-def test_an_ablation_of_nothing_is_refused(mini: Path, run_egvs, arguments: list[str], message: str) -> None:
-    code, _, said = run_egvs("effects", *(a.format(mini=mini) for a in arguments))
+def test_rejects_ablation_without_effects(mini: Path, run_egvs, arguments: list[str], message: str) -> None:
+    code, _, errors = run_egvs("effects", *(a.format(mini=mini) for a in arguments))
     assert code == 2
-    assert message in said
+    assert message in errors
 
 
 @pytest.mark.slow
-def test_a_scenario_may_extend_another(mini: Path, tmp_path: Path, run_egvs) -> None:
+def test_scenario_can_extend_another(mini: Path, tmp_path: Path, run_egvs) -> None:
     wet = tmp_path / "wet"
     wet.mkdir()
     (wet / "scenario.toml").write_text('extends = "../mini"\n\n[effects.rain]\nrate_mm_h = 20\n\n[score]\ngamma = 3\n')
@@ -177,36 +175,38 @@ def test_a_scenario_may_extend_another(mini: Path, tmp_path: Path, run_egvs) -> 
     assert run_egvs("run", wet, "--out", out)[0] == 0
     assert run_egvs("verify", out)[0] == 0
     (mini / "scenario.toml").write_text('extends = "../wet"\n' + (mini / "scenario.toml").read_text())
-    code, _, said = run_egvs("run", wet, "--out", out)
-    assert (code, "extends itself" in said) == (2, True)
+    code, _, errors = run_egvs("run", wet, "--out", out)
+    assert (code, "extends itself" in errors) == (2, True)
     (wet / "scenario.toml").write_text('extends = "../nowhere"\n')
     assert run_egvs("run", wet, "--out", out)[0] == 2
 
 
-def test_what_an_effect_costs_is_with_less_without(mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where it is named, the scenario's seconds less those without it; else those with it less the scenario's."""
+def test_cost_of_effect_is_difference_with_and_without_it(
+    mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """For named effects: the scenario less without it; for others: with it less the scenario."""
     scenario = egvs.load(mini, ["effects.rain.rate_mm_h=20"])
     rows = [
         {"setting": name, "seconds": seconds, "error": 0.1, "tau": 0.9, "regret": 0.0}
         for name, seconds in (("scenario", 5.0), ("without rain", 4.0), ("with divergence", 12.0), ("gamma 2", 5.0))
     ]
-    about = {"inputs": files.hash_json(scenario_dependencies(scenario))}
-    monkeypatch.setattr(effect_study, "read_accuracy", lambda _: (rows, about))
-    found = effect_study.effect_costs(scenario, tmp_path)
-    assert found is not None
-    assert {name: price.seconds for name, price in found.items()} == {"rain": 1.0, "divergence": 7.0}
+    metadata = {"inputs": files.hash_json(scenario_dependencies(scenario))}
+    monkeypatch.setattr(effect_study, "read_accuracy", lambda _: (rows, metadata))
+    statuses = effect_study.effect_costs(scenario, tmp_path)
+    assert statuses is not None
+    assert {name: price.seconds for name, price in statuses.items()} == {"rain": 1.0, "divergence": 7.0}
 
 
-def test_an_effect_that_lacks_something_is_refused(mini: Path) -> None:
-    found = states(mini, "effects.range_limit={}", "effects.pedestrians_bicycles.pedestrians_per_h=100")
-    assert found["range_limit"][0] == "refused"
-    assert "rated_range_m is missing" in found["range_limit"][1]
-    assert found["pedestrians_bicycles"][0] == "refused"
-    assert "finished FCD file" in found["pedestrians_bicycles"][1]
+def test_effect_with_missing_input_is_refused(mini: Path) -> None:
+    statuses = states(mini, "effects.range_limit={}", "effects.pedestrians_bicycles.pedestrians_per_h=100")
+    assert statuses["range_limit"][0] == "refused"
+    assert "rated_range_m is missing" in statuses["range_limit"][1]
+    assert statuses["pedestrians_bicycles"][0] == "refused"
+    assert "finished FCD file" in statuses["pedestrians_bicycles"][1]
 
 
 @pytest.mark.slow
-def test_effects_that_a_study_left_out_are_named(mini: Path, tmp_path: Path, run_egvs) -> None:
+def test_effects_that_the_study_skipped_are_named(mini: Path, tmp_path: Path, run_egvs) -> None:
     words = ("--out", tmp_path / "out", "--set", "effects.rain.rate_mm_h=20")
     assert run_egvs("accuracy", mini, "--budget", "0.001s", *words)[0] == 0
     code, printed, _ = run_egvs("effects", mini, *words)

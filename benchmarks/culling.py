@@ -1,7 +1,7 @@
-"""What does leaving out what no beam can meet save?
+"""Savings by leaving out triangles and beams that cannot meet.
 
-The static world of the shipped junction, and a city of nine of them, held whole and held only as far as a beam can meet
-it; and no static geometry at all. All ways are timed in turn, and the bytes of their scans are compared.
+Compares casters with all triangles of the static world and with only those that a beam can meet, for the shipped
+junction, for nine copies of it, and for an empty world. All are timed in turns; the bytes of their scans must be equal.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ SCENARIO = Path(__file__).resolve().parent.parent / "scenarios" / "nishishinjuku
 REPEATS = 7
 
 
-def in_turn(*works: Callable[[], Any]) -> list[float]:
-    """Median seconds of each, one after the other in each round; each was called once before."""
+def interleaved_medians(*works: Callable[[], Any]) -> list[float]:
+    """Return the median seconds of each call, measured in turns after one call each."""
     times: list[list[float]] = [[] for _ in works]
     for work in works:
         work()
@@ -37,8 +37,8 @@ def in_turn(*works: Callable[[], Any]) -> list[float]:
     return [statistics.median(taken) for taken in times]
 
 
-def city(world: World, spacing_m: float = 700.0) -> World:
-    """The world nine times, side by side; the first stays where it is."""
+def nine_copies(world: World, spacing_m: float = 700.0) -> World:
+    """Return the world and eight copies around it."""
     steps = sorted(((x, y, 0) for x in (-1, 0, 1) for y in (-1, 0, 1)), key=np.linalg.norm)
     vertices = np.concatenate([world.vertices_m + spacing_m * np.array(step) for step in steps])
     faces = np.concatenate([world.faces + i * len(world.vertices_m) for i in range(9)]).astype(np.int32)
@@ -46,11 +46,16 @@ def city(world: World, spacing_m: float = 700.0) -> World:
 
 
 def rows() -> list[tuple[str, str, str, bool]]:
-    """What was saved, the ratio, what is wanted, and whether it is so."""
-    return [*_pair("junction", lambda world: world), *_pair("city of nine", city), *_beams(), *_flat()]
+    """Return name, ratio, limit, and whether the limit holds."""
+    return [
+        *_world_rows("junction", lambda world: world),
+        *_world_rows("city of nine", nine_copies),
+        *_beam_rows(),
+        *_flat_box_rows(),
+    ]
 
 
-def _beams() -> list[tuple[str, str, str, bool]]:
+def _beam_rows() -> list[tuple[str, str, str, bool]]:
     """Only beams that can meet the region of interest are cast."""
     scenario = egvs.load(SCENARIO)
     roi, scene = scenario.roi.box, egvs.build_scene(scenario)
@@ -63,20 +68,20 @@ def _beams() -> list[tuple[str, str, str, bool]]:
     for start, scan in zip(starts, scans, strict=True):
         ranges = np.minimum(caster.first_hits(start, directions, range_m)[0], range_m)
         same &= (directions * ranges[:, None])[scan.beam].tobytes() == scan.ends_m.tobytes()
-    took = in_turn(
+    seconds = interleaved_medians(
         lambda: [
             caster.first_hits(start, directions[scan.beam], range_m) for start, scan in zip(starts, scans, strict=True)
         ],
         lambda: [caster.first_hits(start, directions, range_m) for start in starts],
     )
-    part = sum(len(scan.beam) for scan in scans) / (len(directions) * len(scans))
+    share = sum(len(scan.beam) for scan in scans) / (len(directions) * len(scans))
     return [
-        ("beams that can meet the region", f"{part:.0%}", "same bytes", same),
-        ("  casting these / all", f"{took[0] / took[1]:.2f}", "1", took[0] <= took[1]),
+        ("beams that can meet the region", f"{share:.0%}", "same bytes", same),
+        ("  casting these / all", f"{seconds[0] / seconds[1]:.2f}", "1", seconds[0] <= seconds[1]),
     ]
 
 
-def _flat() -> list[tuple[str, str, str, bool]]:
+def _flat_box_rows() -> list[tuple[str, str, str, bool]]:
     """Flat boxes take the flat path."""
     grid = egvs.load(SCENARIO).roi.grid
     rng, n = np.random.default_rng(5), 20_000
@@ -85,42 +90,44 @@ def _flat() -> list[tuple[str, str, str, bool]]:
     flat = FrameBoxes(np.arange(n) // 20, np.column_stack([centres, rng.uniform(-3, 3, n), np.zeros(n), sizes]))
     tipped = FrameBoxes(flat.frame, flat.values + np.array([0, 0, 0, 0, 1e-15, 0, 0, 0]))
     same = np.array_equal(count_occupancy(flat, grid, n // 20), count_occupancy(tipped, grid, n // 20))
-    took = in_turn(lambda: count_occupancy(flat, grid, n // 20), lambda: count_occupancy(tipped, grid, n // 20))
+    seconds = interleaved_medians(
+        lambda: count_occupancy(flat, grid, n // 20), lambda: count_occupancy(tipped, grid, n // 20)
+    )
     return [
         (
             "flat boxes: flat path / separating axes",
-            f"{took[0] / took[1]:.3f}",
+            f"{seconds[0] / seconds[1]:.3f}",
             "1, same counts",
-            same and took[0] <= took[1],
+            same and seconds[0] <= seconds[1],
         )
     ]
 
 
-def _pair(name: str, grown: Callable[[World], World]) -> list[tuple[str, str, str, bool]]:
+def _world_rows(name: str, enlarge: Callable[[World], World]) -> list[tuple[str, str, str, bool]]:
     scenario = egvs.load(SCENARIO)
     roi, scene = scenario.roi.box, egvs.build_scene(scenario)
-    world = grown(scene.world)
+    world = enlarge(scene.world)
     sites = np.array([site.pose.position_m for site in scene.sites])
     nothing = World(np.empty((0, 3)), np.empty((0, 3), np.int32), np.empty(0, np.int32), ())
     sensor = scene.sensor(scene.sites[0].sensor)
     directions, range_m = sensor.directions(), sensor.range_m
-    held, whole, empty = Caster(world, roi, sites, range_m), Caster(world, roi), Caster(nothing, roi)
+    culled, complete, empty = Caster(world, roi, sites, range_m), Caster(world, roi), Caster(nothing, roi)
 
     def cast(caster: Caster) -> list[bytes]:
         scans = (caster.scan(site.pose.position_m, directions, range_m) for site in scene.sites)
         return [scan.ends_m.tobytes() + scan.returned.tobytes() for scan in scans]
 
-    same = cast(held) == cast(whole)
-    build = in_turn(
+    same = cast(culled) == cast(complete)
+    build = interleaved_medians(
         lambda: Caster(world, roi, sites, range_m), lambda: Caster(world, roi), lambda: Caster(nothing, roi)
     )
-    casting = in_turn(lambda: cast(held), lambda: cast(whole), lambda: cast(empty))
-    part = len(held._triangles) / len(whole._triangles)
+    casting = interleaved_medians(lambda: cast(culled), lambda: cast(complete), lambda: cast(empty))
+    share = len(culled._triangles) / len(complete._triangles)
     return [
-        (f"{name}: triangles that a beam can meet", f"{part:.0%} of {len(whole._triangles)}", "same bytes", same),
-        ("  building, with / without leaving out", f"{build[0] / build[1]:.2f}", "1.1", build[0] <= 1.1 * build[1]),
+        (f"{name}: triangles that a beam can meet", f"{share:.0%} of {len(complete._triangles)}", "same bytes", same),
+        ("  building, with / without culling", f"{build[0] / build[1]:.2f}", "1.1", build[0] <= 1.1 * build[1]),
         (
-            "  casting 13 sites, with / without leaving out",
+            "  casting 13 sites, with / without culling",
             f"{casting[0] / casting[1]:.2f}",
             "1.1",
             casting[0] <= 1.1 * casting[1],

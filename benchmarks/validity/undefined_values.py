@@ -1,4 +1,4 @@
-"""What is not defined: sites that a score or a measure says nothing of, and pools that so have no coefficient."""
+"""Undefined values: sites without a value of a score or measure, and pools without a coefficient."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from benchmarks.validity.tables import Cell, Column, Table
 
 
 def table(each: Sequence[Pools], records: Sequence[Record]) -> Table:
-    """Every coefficient of the pools that is from fewer sites than others, or is not there; scores not worked out."""
+    """Return every coefficient that is undefined or excludes sites, and scores that could not be computed."""
     rows: list[list[Cell]] = []
     for pools in each:
         for measure in measures_of(pools.detector):
             for pool in (name for name in (TRAINING, HELD_OUT) if name in pools.studies):
                 for score in candidates(pools, measure):
-                    its = pools.rho(pool, score, measure)
-                    if its.dropped or its.why:
+                    rho = pools.rho(pool, score, measure)
+                    if rho.dropped or rho.why:
                         rows.append([
-                            pools.detector, WORDS[measure], pool, score, its.sites, ", ".join(its.dropped) or None,
-                            its.why or None,
+                            pools.detector, WORDS[measure], pool, score, rho.sites, ", ".join(rho.dropped) or None,
+                            rho.why or None,
                         ])  # fmt: skip
     rows += [[None, None, record.junction, None, None, None, what] for record in records for what in record.skipped]
     head = [Column("detector"), Column("measure"), Column("junctions"), Column("score"), Column("sites used", "whole"),
