@@ -254,7 +254,7 @@ def test_an_effect_that_periods_forbid_is_not_advised(split: Path) -> None:
     assert (found.state, found.why) == (
         "off",
         'cannot act here: method = "frames" replays all periods alike, whatever their weights;'
-        ' method = "independent" takes the mix',
+        ' Use method = "independent", which weights the periods.',
     )
 
 
