@@ -251,9 +251,7 @@ def test_a_table_that_is_not_there_or_no_text_is_told(mini: Path) -> None:
 
 def test_too_many_beams_are_refused(mini: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EGVS_MAX_BEAMS", "3")
-    with pytest.raises(
-        InputError, match=r"has more than 3 beams\. The limit is 3 beams; set EGVS_MAX_BEAMS to raise"
-    ):
+    with pytest.raises(InputError, match=r"has more than 3 beams\. The limit is 3 beams; set EGVS_MAX_BEAMS to raise"):
         scenario_sensor("small", egvs.load(with_table(mini)), "here")
 
 
