@@ -103,10 +103,8 @@ class PeriodConfig(StrictModel):
                 for key in (*TRAFFIC_SOURCES, "routes", "counts"):
                     values.pop(key, None)
                 values[source] = getattr(self, source)
-        for key in ("routes", "counts", "vehicles", "begin_s"):
-            value = getattr(self, key)
-            if value is not None and value != ():
-                values[key] = value
+        own = {key: getattr(self, key) for key in ("routes", "counts", "vehicles", "begin_s")}
+        values |= {key: value for key, value in own.items() if value not in (None, ())}
         if self.routes and not self.counts:
             values.pop("counts", None)
         if self.counts and not self.routes:

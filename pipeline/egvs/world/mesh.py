@@ -71,12 +71,11 @@ class World:
         starts = np.ones(len(solid), dtype=bool)
         starts[1:] = (np.diff(solid) != 0) | (np.diff(low[order]) != 0) | (np.diff(high[order]) != 0)
         first = np.flatnonzero(starts)
-        balance = np.empty(0, dtype=np.int64)
-        if len(first):
-            balance = np.add.reduceat(direction[order], first)
         is_closed = np.zeros(len(self.solids), dtype=bool)
         is_closed[self.solid_of_face] = True
-        is_closed[solid[first[balance != 0]]] = False
+        if len(first):
+            is_unbalanced = np.add.reduceat(direction[order], first) != 0
+            is_closed[solid[first[is_unbalanced]]] = False
         return is_closed
 
     @cached_property
@@ -177,8 +176,7 @@ def _check_indices(path: Path, what: str, indices: NDArray[np.int32], count: int
     """Raise an InputError unless all indices are below ``count``."""
     wrong = indices[(indices < 0) | (indices >= count)]
     if len(wrong):
-        problem = f"expected a {what} from 0 to {count - 1}, got {wrong[0]} in a triangle"
-        raise InputError(path, problem, _RUN_STATICS)
+        raise InputError(path, f"expected a {what} from 0 to {count - 1}, got {wrong[0]} in a triangle", _RUN_STATICS)
 
 
 def _to_line(value: Any) -> str:
