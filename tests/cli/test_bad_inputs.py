@@ -131,7 +131,7 @@ BAD: dict[str, tuple[Change, str]] = {
     ),
     "network that is none": (
         put("net.net.xml", "<routes/>", traffic(NET), edit("frame_period_s = 0.5", "")),
-        r"root is <routes>",
+        r"expected the root <net>, got <routes>",
     ),
     "period no multiple of the step": (
         put(
@@ -179,7 +179,7 @@ BAD: dict[str, tuple[Change, str]] = {
     ),
     "mesh that is none": (
         put("m.stl", "solid nothing", add('\n[[statics.meshes]]\nfile = "m.stl"\n')),
-        r"m.stl: (cannot be|holds no)",
+        r"m.stl: (cannot be|the file has no triangles)",
     ),
     # sites and sensors
     "sites missing": (remove("sites.csv"), r"sites.file = 'sites.csv': no such file"),
@@ -376,7 +376,7 @@ def test_sites_without_end_are_refused(mini: Path, run_egvs, spacing: str, rule:
     said = " ".join("".join(refused(run_egvs, "check", mini, "--set", asked)).split())
     told = f"more than 100,000 candidates (spacing_m = {spacing}). Use a wider spacing, or fewer heights and pitches"
     assert told in said
-    assert "EGVS_MAX_SITES=... raises that" in said
+    assert "set EGVS_MAX_SITES to raise it" in said
 
 
 def spoil_parquet(path: Path) -> None:
