@@ -230,7 +230,7 @@ BAD: dict[str, tuple[Change, str]] = {
     "a column twice": (sites("a,1,12,3,2", head="site,x_m,y_m,z_m,x_m"), r"the column 'x_m' occurs twice"),
     "too many beams": (
         edit("azimuth_step_deg = 1.0", "azimuth_step_deg = 1e-7"),
-        r"8 rings every 1e-07 degrees are more than",
+        r"8 rings every 1e-07 degrees has more than",
     ),
     "ROI beyond the Earth": (edit("center_m = [20, 0, 2.5]", "center_m = [1e300, 0, 2.5]"), r"roi.center_m.0: 1e\+300"),
     "endless traffic": (edit("frame_period_s = 0.5", "frame_period_s = 1e12"), r"seconds of traffic: at most"),
