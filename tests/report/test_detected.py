@@ -103,8 +103,9 @@ def test_a_damaged_validation_is_named(mini, tmp_path, run_egvs):
     (out / "correlation.parquet").write_bytes(b"PAR1")
     code, _, error = run_egvs("run", mini, "--out", out)
     assert code == 2
-    assert "correlation.parquet: does not match its checksum in validation.sha256; remove it, or" in error
+    assert "correlation.parquet: does not match its checksum in validation.sha256. Remove it, or" in error
     (out / "validation.sha256").unlink()  # as an earlier version left none
     code, _, error = run_egvs("run", mini, "--out", out)
     assert code == 2
-    assert "correlation.parquet: is not what egvs validate writes; remove it, or run egvs validate again" in error
+    assert "correlation.parquet: is not a validation (" in error
+    assert "Remove it, or run egvs validate again." in error

@@ -655,8 +655,9 @@ def test_a_damaged_study_is_named(mini, tmp_path, run_egvs):
     )
     code, _, error = run_egvs("run", mini, "--out", out)
     assert code == 2
-    assert "accuracy.parquet: does not match its checksum in accuracy.sha256; remove it, or run" in error
+    assert "accuracy.parquet: does not match its checksum in accuracy.sha256. Remove it, or run" in error
     (out / "accuracy.sha256").unlink()  # as an earlier version left none
     code, _, error = run_egvs("run", mini, "--out", out)
     assert code == 2
-    assert "accuracy.parquet: is no accuracy study; remove it, or run egvs accuracy again" in error
+    assert "accuracy.parquet: is not an accuracy study (" in error
+    assert "Remove it, or run egvs accuracy again." in error
