@@ -89,7 +89,9 @@ def scored(scenario: Scenario, out: Path, parameters: dict[str, Any] | None) -> 
     ignored = [0] * len(scans)
     if occlusion is not None and occlusion.method == "frames":
         replay = read_replay(trajectories, tpog.grid, occlusion.frames)
-        ignored = [replay.count_boxes_around(tpog.grid.to_grid_m(np.array(scan.site.pose.position_m))) for scan in scans]
+        ignored = [
+            replay.count_boxes_around(tpog.grid.to_grid_m(np.array(scan.site.pose.position_m))) for scan in scans
+        ]
     return Setting([scan.site.name for scan in scans], np.array(egvs), seconds, ignored)
 
 

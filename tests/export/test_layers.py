@@ -66,4 +66,4 @@ def test_rejects_a_damaged_plan(planned: Path, tmp_path: Path, run_egvs: Call) -
     path.write_bytes(path.read_bytes()[:-9])
     code, _, err = run_egvs("export", planned, "--to", "csv", "--out", tmp_path / "a")
     assert code == 2
-    assert "placement.parquet: does not match its checksum in placement.sha256; remove it, or run egvs" in err
+    assert "placement.parquet: does not match its checksum in placement.sha256. Remove it, or run egvs" in err

@@ -297,7 +297,7 @@ def test_rejects_invalid_box(name, bad, tmp_path):
     columns = {"frame": [6, 7], **others} | {c: [row[c] for row in rows] for c in COLUMNS}
     parquet.write_artefact(tmp_path / "trajectories.parquet", "trajectories", columns, {"schema": 1, "frames": 8})
     with pytest.raises(
-        InputError, match=r"trajectories.parquet: frame 7: a box with .*; finite values, sizes of at least 0.001 m"
+        InputError, match=r"trajectories.parquet: frame 7: expected finite values and sizes from 0.001 m"
     ) as caught:
         list(read_boxes(tmp_path / "trajectories.parquet", grid_of()))
     assert f"{name} = {bad:g}" in str(caught.value)

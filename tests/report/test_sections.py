@@ -114,11 +114,12 @@ def test_rejects_a_damaged_validation(mini, tmp_path, run_egvs):
     (out / "correlation.parquet").write_bytes(b"PAR1")
     code, _, error = run_egvs("run", mini, "--out", out)
     assert code == 2
-    assert "correlation.parquet: does not match its checksum in validation.sha256; remove it, or" in error
+    assert "correlation.parquet: does not match its checksum in validation.sha256. Remove it, or" in error
     (out / "validation.sha256").unlink()  # as an earlier version left none
     code, _, error = run_egvs("run", mini, "--out", out)
     assert code == 2
-    assert "correlation.parquet: is not what egvs validate writes; remove it, or run egvs validate again" in error
+    assert "correlation.parquet: is not a validation (" in error
+    assert "Remove it, or run egvs validate again." in error
 
 
 EGVS = egvs_setting(2.0, 0.25)
@@ -243,8 +244,9 @@ def test_rejects_a_damaged_study(mini, tmp_path, run_egvs):
     )
     code, _, error = run_egvs("run", mini, "--out", out)
     assert code == 2
-    assert "accuracy.parquet: does not match its checksum in accuracy.sha256; remove it, or run" in error
+    assert "accuracy.parquet: does not match its checksum in accuracy.sha256. Remove it, or run" in error
     (out / "accuracy.sha256").unlink()  # as an earlier version left none
     code, _, error = run_egvs("run", mini, "--out", out)
     assert code == 2
-    assert "accuracy.parquet: is no accuracy study; remove it, or run egvs accuracy again" in error
+    assert "accuracy.parquet: is not an accuracy study (" in error
+    assert "Remove it, or run egvs accuracy again." in error

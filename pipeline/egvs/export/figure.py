@@ -25,7 +25,7 @@ from egvs.report.figures import column_entropy
 from egvs.report.maps import Backdrop, SiteViewFigure
 from egvs.report.ranking import RankedSite, Ranking
 from egvs.report.svg_figures import Bar, Box, FigureStyle, bar_chart, extent
-from egvs.stages.site_scoring import empty_scans
+from egvs.stages.site_scans import empty_scans
 
 FIGURES = ("ranking", "map", "tpog", "seen", "missed")
 SITE_FIGURES = ("seen", "missed")

@@ -28,7 +28,7 @@ from egvs.export.finished_run import ExportCrs, FinishedRun
 from egvs.export.layers import raster_qml
 from egvs.report import colours
 from egvs.report.figures import column_entropy
-from egvs.stages.site_scoring import empty_scans
+from egvs.stages.site_scans import empty_scans
 
 CellValues = NDArray[np.float64]
 

@@ -384,7 +384,7 @@ def _effect_quality_settings(scenario: Scenario) -> Iterator[Setting]:
         parameters = named.model_dump(mode="json", exclude_unset=True)
         for key, values in effect.QUALITY.items():
             try:
-                registry.find_effect_class(name).Model.of({**parameters, key: values[0]})
+                registry.find_effect_class(name).Model.from_dict({**parameters, key: values[0]})
             except ValidationError:  # the effect uses another method, without this parameter
                 continue
             current = getattr(effect.parameters, key)
