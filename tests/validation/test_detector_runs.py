@@ -149,12 +149,12 @@ from pathlib import Path
 from egvs import load
 from egvs.validation import held_out_traffic
 from egvs.validation.detector_runs import SiteDetectionTask, run_detectors
-from tests.validation.stub_detectors import Odd
+from tests.validation.stub_detectors import FailingDetector
 
 if __name__ == "__main__":
     mini, folder = map(Path, sys.argv[1:])
     record = held_out_traffic.prepare_held_out_traffic(load(mini), folder / "unseen", 10)
-    run_detectors(record.scene.sites, SiteDetectionTask(record, {"odd": Odd(folder=folder)}), jobs=2)
+    run_detectors(record.scene.sites, SiteDetectionTask(record, {"odd": FailingDetector(folder=folder)}), jobs=2)
 """
 
 
