@@ -210,7 +210,7 @@ def test_the_whole_study_is_the_same_bytes_twice_and_says_what_it_went_without(
         out, err = capsys.readouterr()
         assert code == 0, err
         assert "ingolstadt: training, small, 10 frames 2 s apart, points from 10" in out
-        assert "3 parts; looking from all sites takes some 0 minutes on 1 cores" in out
+        assert "3 parts; detectors take about 0 minutes on 1 cores" in out
     assert out.count(": saved before") == 3
     made = sorted(path.relative_to(docs[0]) for path in docs[0].rglob("*") if path.is_file())
     assert {str(path) for path in made if path.suffix not in (".png", ".csv")} == {
