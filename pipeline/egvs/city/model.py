@@ -46,10 +46,10 @@ class CityModel(StrictModel):
 
     name: Name = Field("", min_length=0, validate_default=False, description="Defaults to the folder's name")
     description: str = ""
-    attribution: str = Field("", description="Whose map this is; shown with results")
+    attribution: str = Field("", description="Attribution of the map, shown with results")
     seed: int = Field(0, ge=0, le=2**63 - 1, description="Seed of the traffic simulation")
     traffic: TrafficConfig = Field(description="The traffic of all junctions, as in a scenario")
-    effects: EffectsConfig = Field(EffectsConfig(), description="Effects that add traffic: people on foot, on bicycles")
+    effects: EffectsConfig = Field(EffectsConfig(), description="Effects that add traffic: pedestrians and bicycles")
 
 
 @dataclass(frozen=True)

@@ -87,6 +87,16 @@ def run(
     -------
     RunRecord
         Contents of ``run.json``.
+
+    Examples
+    --------
+    >>> import egvs
+    >>> scenario = egvs.load("scenarios/roundabout", ["traffic.frames=100"])
+    >>> record = egvs.run(scenario, "runs/example")
+    >>> list(record.stages)
+    ['check', 'statics', 'scan', 'traffic', 'tpog', 'score', 'report']
+    >>> egvs.read_scores("runs/example/scores.parquet").num_rows == len(egvs.build_scene(scenario).sites)
+    True
     """
     folder = Path(out) if out is not None else default_folder(scenario)
     check_no_overwrite(scenario, folder)

@@ -29,7 +29,7 @@ from egvs.scenario.traffic_config import TrafficConfig
 
 
 class CrsConfig(StrictModel):
-    """Where the world frame is on the Earth. By default, the ``<location>`` of the SUMO network says so."""
+    """Position of the world frame on the Earth. By default, that of the ``<location>`` in the SUMO network."""
 
     epsg: int | None = Field(
         None, ge=1, description="EPSG code of a projected coordinate reference system in metres, e.g. 25832"
@@ -251,7 +251,7 @@ class ScanConfig(StrictModel):
     """Empty scans: scans of the static world without traffic."""
 
     keep: bool = Field(
-        True, description="Write scans.parquet; with false, scans are not stored (for thousands of sites)"
+        True, description="Write scans.parquet; with false, scans are not saved (for thousands of sites)"
     )
 
 
