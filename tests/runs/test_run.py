@@ -311,7 +311,7 @@ def test_ranking_fits_terminal_width(mini: Path, tmp_path: Path, width: int, by:
     assert "…" not in text
     assert all(len(line) <= width for line in text.splitlines())
     if by == "egvs" or width > 130:
-        assert all(f"{egvs:.1f}" in text for run_egvs in table["egvs"].to_pylist())
+        assert all(f"{value:.1f}" in text for value in table["egvs"].to_pylist())
     told = (lambda value: f"{value:.2f}") if by == "points_on_target" else (lambda value: f"{value:.1%}")
     assert by == "egvs" or all(told(value) in text for value in table[by].to_pylist())
 
@@ -353,13 +353,13 @@ def test_prints_best_sites_and_counts_others(mini: Path, tmp_path: Path, run_egv
     rows = [f"p{i:02d},{2 + i},12,{3 + i / 8}" for i in range(9)]
     (mini / "sites.csv").write_text("\n".join(["site,x_m,y_m,z_m", *rows]) + "\n")
     code, whole, _ = run_egvs("run", mini, "--out", tmp_path / "out")
-    assert (code, "more: without --top" in whole) == (0, False)
+    assert (code, "without --top" in whole) == (0, False)
     ranked = [line.split()[1] for line in whole.splitlines() if re.match(r"\s*\d+\s+p\d\d", line)]
     assert len(ranked) == 9
     for verb in ("run", "score"):
         code, printed, _ = run_egvs(verb, mini, "--out", tmp_path / "out", "--top", 4)
         assert code == 0
         assert [line.split()[1] for line in printed.splitlines() if re.match(r"\s*\d+\s+p\d\d", line)] == ranked[:4]
-        assert "... and 5 more: without --top, in " in printed
-    assert "more: without" not in run_egvs("score", mini, "--out", tmp_path / "out", "--top", 9)[1]
+        assert "... and 5 more, listed in " in printed
+    assert "without --top" not in run_egvs("score", mini, "--out", tmp_path / "out", "--top", 9)[1]
     assert run_egvs("run", mini, "--top", 0)[0] == 2

@@ -452,14 +452,14 @@ def test_a_run_says_what_it_fetched(done: tuple[egvs.Scenario, Path], tmp_path: 
 
 
 CHANGED_LINES = {
-    "kernels/march.py": {"score", "report"},
-    "kernels/rays.py": {"check", "scan", "score", "report"},
-    "kernels/solids.py": {"check", "scan", "tpog", "score", "report"},
-    "sensing/sensors.py": {"check", "scan", "score"},
+    "kernels/traversal.py": {"score", "report"},
+    "kernels/ray_triangle.py": {"check", "scan", "score", "report"},
+    "kernels/occupancy.py": {"check", "scan", "tpog", "score", "report"},
+    "sensors/sensor.py": {"check", "scan", "score"},
     "stages/traffic.py": {"traffic"},
     "world/mesh.py": {"check", "statics", "scan", "tpog", "score", "report"},
-    "effects/score/rain.py": {"check", "score", "report"},
-    "effects/score/fog.py": set(),
+    "effects/rain.py": {"check", "score", "report"},
+    "effects/fog.py": set(),
     "formats/csv_points.py": {"scan"},
     "formats/pcd.py": set(),
     "studies/accuracy.py": set(),

@@ -114,7 +114,7 @@ def test_run_with_periods_is_reproducible_and_reported(split: Path, tmp_path: Pa
     code, printed, told = run_egvs("run", split, "--out", tmp_path / "out")
     assert code == 0
     (night,) = (line for line in told.splitlines() if line.split()[0] == "night")
-    assert night.split("   ")[-1].startswith("frames 16; vehicles 2 fewest, 2 most, 2 different; rows 32;")
+    assert night.split("   ")[-1].startswith("16 frames; 2 vehicles at a time, 2 in all;")
     assert "standard errors from day: 4 blocks of 6 frames" in told
     assert "rank and share of the best in each period; in the mix: day 71.4%, night 28.6%" in printed
     assert "scores_by_period.parquet" in printed
@@ -307,7 +307,7 @@ def test_the_world_frame_counts_where_a_period_alone_is_a_finished_file(
             'name = ".."',
             r"traffic\.periods\.1\.name: expected a name, got '\.\.'. Use a name .*not only dots",
         ),
-        ('name = "night"', f'name = "{"n" * 81}"', r"traffic\.periods\.1\.name: 'n+'; string should have at most 80"),
+        ('name = "night"', f'name = "{"n" * 81}"', r"traffic\.periods\.1\.name: .*at most 80 characters, got 'n+'"),
         ('name = "night"', 'name = "a\\u0000b"', r"traffic\.periods\.1\.name: expected a name, got 'a.*b'"),
         ("length_s = 8", "length_s = 8.1", "period 'night': length_s = 8.1 is not a multiple of 0.5 s"),
         ("length_s = 8", "length_s = 9", "tpog.blocks = 4 does not divide traffic.frames = 18 of the period 'night'"),
