@@ -134,7 +134,7 @@ BAD: dict[str, tuple[Change, str]] = {
     ),
     "network that is none": (
         put("net.net.xml", "<routes/>", traffic(NET), edit("frame_period_s = 0.5", "")),
-        r"expected the root <net>, got <routes>",
+        r"expected the root element <net>, got <routes>",
     ),
     "period no multiple of the step": (
         put(
@@ -152,7 +152,7 @@ BAD: dict[str, tuple[Change, str]] = {
     # statics
     "statics missing": (remove("statics.geojson"), r"statics.footprints = 'statics.geojson': no such file"),
     "statics no JSON": (put("statics.geojson", "{"), r"statics.geojson: is not valid JSON"),
-    "statics no collection": (put("statics.geojson", "[]"), r"got no list of features"),
+    "statics no collection": (put("statics.geojson", "[]"), r"got no features list"),
     "statics without height": (
         statics(feature({"type": "Point", "coordinates": [1, 1]}, radius_m=1)),
         r"height_m is missing",
@@ -342,7 +342,7 @@ COMMANDS = {
     ),
     "beams without end": (
         ["check", "{mini}", "--set", "sensors.small.azimuth_step_deg=1e-300"],
-        r"8 rings every 1e-300 degrees are more than 3,000,000 beams.* EGVS_MAX_BEAMS to raise it",
+        r"8 rings every 1e-300 degrees make more than 3,000,000 beams.* EGVS_MAX_BEAMS to raise it",
     ),
     "a number of thousands of digits": (
         ["check", "{mini}", "--set", f"seed={'9' * 5000}"],

@@ -124,8 +124,11 @@ def test_sorts_packages_without_name(site: Path) -> None:
 @pytest.mark.parametrize(
     ("there", "message"),
     [
-        ({"plug_x": None}, r"^it needs plug_x, which is not installed: pip install 'egvs\[some\]'$"),
-        ({"sklearn": None, "torch": None}, r"^it needs scikit-learn, PyTorch, which are not installed: pip install"),
+        ({"plug_x": None}, r"^it needs plug_x, which is not installed. Run pip install 'egvs\[some\]'$"),
+        (
+            {"sklearn": None, "torch": None},
+            r"^it needs scikit-learn, PyTorch, which are not installed. Run pip install",
+        ),
     ],
 )
 def test_message_of_missing_extra_tells_what_to_install(

@@ -110,7 +110,7 @@ def test_saved_poses_are_a_file_of_sites(mini: Path) -> None:
 @pytest.mark.parametrize("content", ["site,x_m,y_m,z_m\nmine,1,2,3\n", "", "\x00\xff", '"site'])
 def test_users_file_is_not_changed(mini: Path, content: str) -> None:
     (mini / SAVED_SITES).write_text(content)
-    with pytest.raises(InputError, match="was not written by egvs explore, and is not changed"):
+    with pytest.raises(InputError, match="was not written by egvs explore, so it is not overwritten"):
         save_pose(mini / SAVED_SITES, SITE, CANDIDATES)
     assert (mini / SAVED_SITES).read_text() == content
     assert unused_file_name(mini) == "kept_sites-2.csv"

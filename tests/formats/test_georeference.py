@@ -129,7 +129,7 @@ def test_utm_epsg_of_a_location(lon: float, lat: float, code: int) -> None:
 @pytest.mark.parametrize("projection", ["EPSG:2053", "+proj=tmerc +lon_0=9 +axis=wsu +ellps=WGS84 +units=m +no_defs"])
 def test_rejects_projection_whose_axes_point_west_and_south(projection: str) -> None:
     with pytest.raises(
-        InputError, match=r"s: crs: .* counts in metre to the west and south.* metres to the east and north"
+        InputError, match=r"s: crs: .* has axes in metre to the west and south.* metres to the east and north"
     ):
         WorldFrame.from_projection(projection, (0.0, 0.0), "s: crs")
 
@@ -210,7 +210,7 @@ def test_declared_projection_is_the_world_frame_where_its_position_is_unknown() 
         (LOCATED, DEGREES[:, ::-1], "EPSG:4326", "They would be near it as latitude and longitude, in the wrong order"),
         (LOCATED, CORNERS - np.array(FRAME.offset_m), WORLD,
          r"are 5,661 km from the region of interest as metres of the world frame. "
-         r'They would be near it as eastings and northings of EPSG:32632. Set "crs" in the file'),
+         r'Read as eastings and northings of EPSG:32632, they would be near it. Set "crs" in the file'),
         (LOCATED, CORNERS, "EPSG:25832", "They would be near it as metres of the world frame"),
         (LOCATED, CORNERS + 1e5, WORLD, "are 141 km .* as metres of the world frame"),
         (UNLOCATED, CORNERS + 1e5, WORLD, "are 141 km .* as metres of the world frame"),

@@ -109,7 +109,7 @@ def test_ignores_deleted_objects(tmp_path: Path, mark: str) -> None:
         ),
         (osm_xml(NODE).replace("<osm", '<!DOCTYPE osm [<!ENTITY a SYSTEM "file:///etc/passwd">]><osm'), "XML entities"),
         (osm_xml(NODE).replace("</osm>", ""), "is not well-formed XML: no element found"),
-        ("<gpx/>", "expected the root <osm>, got <gpx>"),
+        ("<gpx/>", "expected the root element <osm>, got <gpx>"),
         (osm_xml(""), "has no nodes"),
         (osm_xml('<node id="1" lat="1" lon="2" action="delete"/>'), "has no nodes"),
         (osm_xml(NODE).replace(' version="0.6"', ""), "cannot be read as OpenStreetMap data .*version"),

@@ -58,13 +58,13 @@ def test_rejects_unsupported_encoding(tmp_path: Path, declared: str) -> None:
 
 def test_rejects_bytes_that_are_no_text(tmp_path: Path) -> None:
     data = b'<?xml version="1.0" encoding="Shift_JIS"?><net><e name="\x81"/></net>'
-    with pytest.raises(InputError, match=r"a.xml: cannot be read \(it is no cp932 text: byte \d+ is 0x81\)"):
+    with pytest.raises(InputError, match=r"a.xml: cannot be read \(it is not cp932 text: byte \d+ is 0x81\)"):
         names(tmp_path, data)
 
 
 def hostile() -> Iterator[tuple[str, bytes, str]]:
     """Yield name, content and message of files that would take much memory."""
-    element = "has an element, or a text, of more than 1 MB. The limit is 1 MB; set EGVS_MAX_ELEMENT_MB to raise it"
+    element = "has an element or text of more than 1 MB. The limit is 1 MB; set EGVS_MAX_ELEMENT_MB to raise it"
     yield "text of the root", b"<net>" + ONE_MB * 3 + b"</net>", element
     yield "text between children", b"<net><e/>" + ONE_MB * 3 + b"<e/></net>", element
     yield "rows in one step", b"<net><e>" + b"<v a='1'/>" * 150_000 + b"</e></net>", element

@@ -94,7 +94,7 @@ def test_rejects_artefact_that_no_stage_wrote(runs, tmp_path: Path, run_egvs) ->
     for name in ("trajectories.parquet", "statics.ply"):
         shutil.copyfile(made / name, fresh / name)
     code, _, error = run_egvs("tpog", scenario.folder, "--out", fresh)
-    what = "was made by no stage in run.json. Call egvs run to make it again."
+    what = "was not created by any stage in run.json. Run egvs run again to create it."
     assert (code, error) == (2, f"egvs: {fresh / 'trajectories.parquet'}: {what}\n")
     assert not (fresh / "tpog.parquet").exists()
 

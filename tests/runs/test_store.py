@@ -361,13 +361,13 @@ def test_what_cannot_be_asked_of_the_store_is_named(
 ) -> None:
     for words in (("--clear", "--prune"), ("--clear", "--prune", "--max", "2G")):
         code, _, said = run_egvs("store", *words)
-        assert (code, "--clear: given together with --prune" in said) == (2, True), said
+        assert (code, "--clear: cannot be combined with --prune" in said) == (2, True), said
     assert run_egvs("store", "--clear", "--max", "2G")[0] == 2
     (tmp_path / "file").write_text("")
     for place, words, message in (
         (tmp_path / "file", (), f"{tmp_path / 'file'}: is a file"),
         (tmp_path / "file", ("--clear",), "is a file"),
-        ("", ("--clear",), "EGVS_STORE: empty, so that there is no store"),
+        ("", ("--clear",), "EGVS_STORE: is empty, so there is no store"),
         ("", ("--prune",), "there is no store"),
     ):
         monkeypatch.setenv("EGVS_STORE", str(place))

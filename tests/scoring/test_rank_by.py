@@ -174,7 +174,7 @@ def test_warns_of_unknown_standard_errors(mini: Path, tmp_path: Path) -> None:
     sets = ["score.rank_by=seen_well", "score.others=[]"]
     record = egvs.run(loading.load(mini, sets), tmp_path / "run", jobs=1)
     (doubt,) = (it for it in collect_warnings([record.stages["score"].summary]) if it.rule == "no standard error")
-    assert "all vehicles in the region are in one of 4 groups of frames" in doubt.problem
+    assert "all vehicles in the region are in one of 4 blocks of frames" in doubt.problem
 
 
 def test_only_scores_over_vehicles_read_trajectories(mini: Path, tmp_path: Path) -> None:

@@ -269,7 +269,7 @@ def test_las_without_crs_is_in_metres(mini: Path) -> None:
 def test_rejects_scan_far_from_the_region(mini: Path) -> None:
     utm = np.add(POINTS, (550_700, 5_635_200, 210))
     write_las(mini / "m.las", utm, None)
-    message = "They would be near it as eastings and northings of EPSG:32632. Save the points"
+    message = "Read as eastings and northings of EPSG:32632, they would be near it. Save the points"
     with pytest.raises(InputError, match=rf"site pole_a: points: .*m.las: coordinates .*{message}"):
         scan_file(mini, "m.las")
     write_las(mini / "m.las", utm, "EPSG:25833")

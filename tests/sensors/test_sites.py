@@ -204,7 +204,7 @@ PLACE = "site,x_m,y_m\np,0,0\n"
             {"aim": "roi", "pitch_deg": '"aim"'},
             r"row p: pitch_deg: .*'aim', but .*yaw_deg, 30",
         ),
-        (ROW, {"aim_m": "[0, 0, 1]"}, r"row p: aim: \(0, 0, 1\) is straight above or below the sensor"),
+        (ROW, {"aim_m": "[0, 0, 1]"}, r"row p: aim: \(0, 0, 1\) is directly above or below the sensor"),
         (ROW, {"aim": "roi", "sensor": "VLP-33"}, r"row p: sensor: unknown sensor 'VLP-33'. Did you mean VLP-32C"),
         ("site,x_m,y_m,z_m,aim_x_m\np,0,0,6,5\n", {}, r"row p: aim: one of aim_x_m and aim_y_m is missing"),
         ("site,x_m,y_m,z_m,aim\np,0,0,6,ROI\n", {}, r"row p: aim: .*'roi', got 'ROI'.*aim_x_m and aim_y_m"),
@@ -278,7 +278,7 @@ def test_rejects_heights_with_a_rule(mini: Path) -> None:
 
 def test_rejects_target_out_of_reach_of_the_middle_ray() -> None:
     up = Sensor("up", (30.0,), (0.0,), 1, 100.0, "")
-    with pytest.raises(InputError, match=r"up cannot be tilted so that its middle ray meets \(0.1, 0, 0\)"):
+    with pytest.raises(InputError, match=r"up cannot be pitched so that its central ray meets \(0.1, 0, 0\)"):
         sites.aiming_angles("here", (0, 0, 6), (0.1, 0, 0), 0.0, up)
     assert sensor.CATALOGUE["OS1-128"].middle_deg == (0.0, 0.0)
 

@@ -303,9 +303,7 @@ def effects(
     if not ablation:
         return
     if not loaded.effects.named:
-        raise InputError(
-            "--ablation", "the scenario names no effect", "Name one, e.g. --set effects.rain.rate_mm_h=20."
-        )
+        raise InputError("--ablation", "the scenario has no effects", "Add one, e.g. --set effects.rain.rate_mm_h=20.")
     with ProgressDisplay() as screen:
         changes = effect_study.run_ablation(loaded, folder, jobs=jobs, progress=screen.progress)
     run_tables.print_ablation(changes)
@@ -494,7 +492,7 @@ def store(
     from egvs.runs.store import Store
 
     if clear and prune:
-        raise InputError("--clear", "given together with --prune", "Use --clear to remove all entries.")
+        raise InputError("--clear", "cannot be combined with --prune", "Use --clear alone to remove all entries.")
     if max_size is not None and not prune:
         raise InputError("--max", "used without --prune", "Run egvs store --prune --max 2G.")
     cache = Store.default()

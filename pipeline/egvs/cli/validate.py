@@ -62,7 +62,7 @@ def validate(
 
     if detections is not None or keep:
         option = "--keep" if keep else "--detections"
-        raise InputError(option, "not available with a plan", f"Leave out {option}, or --plan and --plan-from.")
+        raise InputError(option, "not available with a plan", f"Omit {option}, or omit --plan and --plan-from.")
     with ProgressDisplay("validate") as screen:
         plan_result = plan_validation.validate_plan(
             loaded, folder, plan_from or folder, frames=frames, detectors=detectors, jobs=jobs,
@@ -130,7 +130,7 @@ def train(
     try:
         from egvs.validation.training import train
     except ImportError as error:
-        raise MissingBackendError(f"training cannot start: {error}; pip install 'egvs[train]'") from None
+        raise MissingBackendError(f"training cannot start: {error}. Run pip install 'egvs[train]'") from None
 
     if convention not in ("ground", "sensor"):
         raise InputError("--convention", f"expected ground or sensor, got {convention!r}", "Use --convention ground.")

@@ -73,11 +73,7 @@ class MissingExtraError(MissingBackendError):
 
 def format_problem(where: str, problem: str, hint: str = "") -> str:
     """Return ``WHERE: PROBLEM. HINT``."""
-    if not hint:
-        return f"{where}: {problem}"
-    if hint[0].isupper():
-        return f"{where}: {problem}. {hint}"
-    return f"{where}: {problem}; {hint}"
+    return f"{where}: {problem}. {hint}" if hint else f"{where}: {problem}"
 
 
 def truncate_text(text: str) -> str:

@@ -38,7 +38,7 @@ DECODED_ENCODINGS = frozenset(
 """Python's names of the encodings that are decoded here."""
 
 _ENCODING_HINT = (
-    "Save it in UTF-8, UTF-16, Shift_JIS, EUC-JP, ISO-8859-x, windows-125x, GB18030, Big5 or EUC-KR, and declare that."
+    "Save it in UTF-8, UTF-16, Shift_JIS, EUC-JP, ISO-8859-x, windows-125x, GB18030, Big5 or EUC-KR, and declare it."
 )
 _WHATWG_SUPERSETS = {"shift_jis": "cp932", "gb2312": "gb18030", "gbk": "gb18030"}
 """Declared encodings that in practice, and in the WHATWG's Encoding Standard, mean a superset."""
@@ -153,7 +153,7 @@ def iter_elements(
         try:
             _, top = next(events)
             if root and top.tag != root:
-                raise InputError(where, f"expected the root <{root}>, got <{top.tag}>", "Check which file is named.")
+                raise InputError(where, f"expected the root element <{root}>, got <{top.tag}>", "Check the file name.")
             if on_root is not None:
                 on_root(top)
             depth = 0
@@ -168,7 +168,7 @@ def iter_elements(
         except ParseError as error:
             raise InputError(where, f"is not well-formed XML: {error}", COMPLETE_FILE) from None
         except DefusedXmlException:
-            problem = "declares XML entities or a document type, which are refused"
+            problem = "declares XML entities or a document type, which are not allowed"
             raise InputError(where, problem, "Remove <!DOCTYPE ...> from the file.") from None
 
 
@@ -246,6 +246,6 @@ class _ElementMeter:
         chunk = self._file.read(size)
         self.bytes_since_child += len(chunk)
         if self.bytes_since_child > self._max_mb * limits.MB + size:
-            problem = f"has an element, or a text, of more than {self._max_mb:,} MB"
+            problem = f"has an element or text of more than {self._max_mb:,} MB"
             raise InputError(self._where, problem, limits.ELEMENT.hint)
         return chunk

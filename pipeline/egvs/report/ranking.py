@@ -219,7 +219,7 @@ class Ranking:
         """Read ``scores.parquet``; InputError if it has no site."""
         sites = tuple(sorted(RankedSite.read(path), key=lambda site: site.rank))
         if not sites:
-            raise InputError(path, "expected at least one site, got none", "Run the score stage again")
+            raise InputError(path, "expected at least one site, got none", "Run the score stage again.")
         best = tuple(site for site in sites if site.rank == 1)
         near = (1 - CLOSE_SHARE) * best[0].score
         return cls(sites, best, tuple(site for site in sites if site.rank > 1 and site.score >= near > 0))

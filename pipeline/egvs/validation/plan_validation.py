@@ -290,7 +290,7 @@ def _other_world_warnings(plan: FusedPlan, record: HeldOutTraffic) -> list[Diagn
     """Return a warning if the plan was computed in another static world than the present one."""
     if plan.statics == record.keys["statics"]:
         return []
-    problem = "the plan was computed in another static world than this validation"
+    problem = "the plan was computed with a different static world"
     return [Diagnostic("plan", plan.path.name, problem, "Run egvs place again.")]
 
 
