@@ -264,7 +264,10 @@ BAD: dict[str, tuple[Change, str]] = {
         put("sites.csv", "site,x_m,y_m,z_m\na,10,12,3\n", POINTS),
         r"points = 'cloud.csv': no such file",
     ),
-    "points for two sites": (put("cloud.csv", "x_m,y_m,z_m\n1,1,0\n", POINTS), r"one measured scan for 2 sites"),
+    "points for two sites": (
+        put("cloud.csv", "x_m,y_m,z_m\n1,1,0\n", POINTS),
+        r"one measured scan is given for 2 sites",
+    ),
     "points without z": (put("cloud.csv", "x_m,y_m\n1,1\n", POINTS, ONE_SITE), r"cloud.csv.*z_m"),
     "points of an unknown kind": (
         put("cloud.abc", "1", edit('sensor = "small"', 'sensor = "small"\npoints = "cloud.abc"'), ONE_SITE),

@@ -198,7 +198,7 @@ def test_rejects_more_objects_than_the_limit(tmp_path: Path, monkeypatch: pytest
     pbf = pbf_of(SMALL, tmp_path / "a.osm.pbf")
     for path in (SMALL, pbf):
         message = (
-            rf"{path.name}: has more than 10 objects\. Use a part of the map\. The limit is 10 objects; set "
+            rf"{path.name}: has more than 10 objects\. Use a smaller extract\. The limit is 10 objects; set "
             rf"EGVS_MAX_MAP_OBJECTS"
         )
         with pytest.raises(InputError, match=message):

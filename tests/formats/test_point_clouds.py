@@ -334,7 +334,7 @@ def test_rejects_laz_that_asks_for_more_memory_than_the_limit(tmp_path: Path) ->
     points_at = struct.unpack_from("<I", path.read_bytes(), 96)[0]
     overwrite(path, points_at + 8 + 30 + 4 + 7 * 4, b"\xff\xff\xff\xf0")
     message = (
-        r"the decompressor was ended by signal 6: .*too much memory\)\. The limit is 2,000 MB; set EGVS_MAX_READER_MB"
+        r"the decompressor was killed by signal 6: .*too much memory\)\. The limit is 2,000 MB; set EGVS_MAX_READER_MB"
     )
     with pytest.raises(InputError, match=message):
         read_points(path, "")

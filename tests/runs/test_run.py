@@ -213,7 +213,7 @@ def test_verify_rejects_unfinished_run(done: tuple[Path, Path]) -> None:
 
 def test_rejects_second_run_in_same_folder(done: tuple[Path, Path]) -> None:
     mini, out = done
-    with lock_run_folder(out), pytest.raises(RunError, match="another run is at work"):
+    with lock_run_folder(out), pytest.raises(RunError, match="another run is using this folder"):
         egvs.run(egvs.load(mini), out)
 
 

@@ -123,7 +123,7 @@ def test_run_with_periods_is_reproducible_and_reported(split: Path, tmp_path: Pa
     assert "night<br>(28.6%)" in page
     assert ">40 frames<small>one every 0.5 s, 20 s in total, in 2 periods" in page
     assert "<dt>day</dt><dd>24 frames; 2 vehicles at a time, 2 in total;" in page
-    assert page.index("<h2>By period") < page.index("<h2>Where the sites stand")
+    assert page.index("<h2>By period") < page.index("<h2>Where the sites are")
     ranking = PeriodRanking.read(tmp_path / "out")
     assert ranking is not None
     assert (ranking.periods, ranking.frames) == (("day", "night"), 40)

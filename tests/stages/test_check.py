@@ -305,7 +305,7 @@ def test_check_command_without_findings_writes_nothing(street: Path, run_egvs) -
     code, printed, _ = run_egvs("check", street)
     assert (code, printed.splitlines()) == (
         0,
-        ["no errors and no warnings", "checked 2 sites, 3 solids and 2 lanes"],
+        ["no errors or warnings", "checked 2 sites, 3 solids and 2 lanes"],
     )
     assert sorted(street.rglob("*")) == before
 

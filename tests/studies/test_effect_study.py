@@ -155,7 +155,7 @@ def test_ablation_runs_each_effect_alone_and_all_together(mini: Path, tmp_path: 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [(["--ablation"], "without a scenario"), (["{mini}", "--ablation"], "names no effect")],
+    [(["--ablation"], "without a scenario"), (["{mini}", "--ablation"], "has no effects")],
 )
 def test_rejects_ablation_without_effects(mini: Path, run_egvs, arguments: list[str], message: str) -> None:
     code, _, errors = run_egvs("effects", *(a.format(mini=mini) for a in arguments))

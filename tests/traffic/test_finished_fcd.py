@@ -166,8 +166,7 @@ def test_names_all_types_without_size(mini: Path, tmp_path: Path, run_egvs) -> N
     code, _, output = run_egvs("run", mini, "--out", tmp_path)
     assert code == 2
     assert (
-        "traffic.kinds: the sizes of some vehicle types of fcd.csv are unknown: 'lorry', 'tram'. Add a kind of each name"
-        in output
+        "traffic.kinds: unknown sizes of vehicle types of fcd.csv: 'lorry', 'tram'. Add a kind of each name" in output
     )
     assert "vtypes (known: car)" in output
     head, _, _ = fcd().rpartition(";car;")
@@ -218,7 +217,7 @@ def test_check_reports_missing_sizes(mini: Path, run_egvs) -> None:
     set_types(mini, "tram", "car", "lorry", "DEFAULT_VEHTYPE")
     code, output, _ = run_egvs("check", mini)
     assert code == 2
-    assert "the sizes of some vehicle types of fcd.csv are unknown: 'lorry', 'tram'" in output
+    assert "unknown sizes of vehicle types of fcd.csv: 'lorry', 'tram'" in output
 
 
 @pytest.mark.slow

@@ -68,7 +68,7 @@ def _statics_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterato
 def _scan_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[str]:
     yield f"{_count(rest.pop('sites'), 'site')} scanned"
     if not rest.pop("kept", True):
-        yield "scans not kept"
+        yield "scans not saved"
     elif "beams" in rest:
         yield f"{rest.pop('returns'):,} returns from {rest.pop('beams'):,} beams towards the region"
 
@@ -78,7 +78,7 @@ def _traffic_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterato
     if "vehicles" in rest:
         yield describe_vehicles(rest.pop("vehicles"))
         yield f"mean speed {3.6 * rest.pop('mean_speed_m_s'):.0f} km/h"
-        yield f"{rest.pop('share_standing'):.0%} of the time standing, {rest.pop('longest_standing_s'):g} s at most"
+        yield f"standing {rest.pop('share_standing'):.0%} of the time, for at most {rest.pop('longest_standing_s'):g} s"
         yield f"vehicles overlap in {_count(rest.pop('frames_with_overlap'), 'frame')}"
     if rest.get("collisions") is not None:
         yield _count(rest.pop("collisions"), "collision")
@@ -90,7 +90,7 @@ def _traffic_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterato
 
 
 def _tpog_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[str]:
-    yield f"{_count(rest.pop('occupied_voxels'), 'voxel')} occupied at some time"
+    yield f"{_count(rest.pop('occupied_voxels'), 'voxel')} occupied at least once"
     yield f"{rest.pop('static_voxels'):,} filled by static solids"
     yield f"{rest.pop('boxes_in_roi'):.1f} vehicles in the region on average"
     memory = rest.pop("memory_frames")

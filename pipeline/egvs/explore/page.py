@@ -257,7 +257,7 @@ class Page:
             buttons={
                 "Save this pose": self._save_pose,
                 "Link to this view": self._show_link,
-                "Picture (PNG)": self._send_picture,
+                "Download picture (PNG)": self._send_picture,
             },
             note=controls.describe_drawn_triangles(self.world.drawn, self.world.triangles),
         )
@@ -357,7 +357,7 @@ class Page:
                 drawing.draw_plan(scene, self.plan, site.name, self.zero_m, self._select)
             if view.is_dark != view_before.is_dark:
                 self.world.set_dark(view.is_dark)
-            self.label.text = f"{site.name}: not possible here"
+            self.label.text = f"{site.name}: cannot be mounted here"
             if self.rating.is_feasible:
                 self.label.text = f"{site.name}  rank {self.rating.rank}"
             legend = None

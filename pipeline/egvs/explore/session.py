@@ -266,7 +266,7 @@ class Session:
         self.scene.sensor(site.sensor)
         if site.points is not None and site != candidate:
             problem = "its empty scan was measured, so scans from other poses are unknown"
-            hint = "Go back to the candidate."
+            hint = "Reset it to the candidate."
             finding = Diagnostic("measured scan", f"site {name}", problem, hint, is_error=True)
             return PoseScore(site, {}, 0, (finding,))
         findings = self._check(site)

@@ -48,7 +48,7 @@ LAYERS = {
 T = TypeVar("T")
 D = TypeVar("D")
 _POSE_PARTS = ("x", "y", "z", "yaw", "tilt", "roll")
-_WHOLE_NUMBER = "a whole number from 0"
+_WHOLE_NUMBER = "a whole number of at least 0"
 
 
 def save_pose(path: Path, site: Site, candidates: Collection[str]) -> str:
@@ -207,7 +207,7 @@ def decode_view(
     if sensor != site.sensor:
         session.scene.sensor(sensor, f"{where}: sensor")
         site = replace(site, sensor=sensor)
-    gamma = reader.number("gamma", None, float, "a number from 0")
+    gamma = reader.number("gamma", None, float, "a number of at least 0")
     rank_by = reader.text("score", initial.settings.rank_by)
     settings = Settings(gamma, rank_by, reader.effects(initial.settings.effects))
     view = View(

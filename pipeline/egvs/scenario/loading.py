@@ -134,7 +134,7 @@ def _suggest_key(location: Sequence[str | int], top: type[BaseModel]) -> str:
         if part in fields:
             fields = _table_fields(fields[str(part)].annotation)
     similar = difflib.get_close_matches(key, sorted(fields), 1, 0.5)
-    return f"Did you mean {similar[0]}?" if similar else f"Known keys: {', '.join(sorted(fields))}"
+    return f"Did you mean {similar[0]}?" if similar else f"Known keys are {', '.join(sorted(fields))}."
 
 
 def _table_fields(annotation: Any) -> dict[str, FieldInfo]:
@@ -332,10 +332,10 @@ def json_schema() -> str:
 def _suggest_scenario(folder: Path) -> str:
     """Return a hint at the scenario that may be meant by another folder."""
     if (folder / "city.toml").is_file():
-        return f"This is a city. Use egvs city run {folder}, or one of its junctions, {folder / 'junctions'}/ID"
+        return f"This is a city. Use egvs city run {folder}, or one of its junctions, {folder / 'junctions'}/ID."
     if (folder / "run.json").is_file():
-        return "This is the folder of a run. Name the folder of its scenario"
-    return f"Name a folder with a {SCENARIO_FILE}, or the file"
+        return "This is a run folder. Give the scenario's folder."
+    return f"Give a folder with a {SCENARIO_FILE}, or the file."
 
 
 def _apply_override(values: dict[str, Any], override: str) -> dict[str, Any]:
@@ -370,5 +370,6 @@ def _find_row(rows: list[Any], name_or_number: str, where: str) -> Any:
     if name_or_number.isdecimal() and int(name_or_number) < len(rows):
         return rows[int(name_or_number)]
     names = [str(row["name"]) for row in rows if isinstance(row, dict) and "name" in row]
-    hint = f"Use {', '.join([*names, 'or a number'])} from 0 to {len(rows) - 1}."
+    choices = f"one of {', '.join(names)}, or " if names else ""
+    hint = f"Use {choices}a number from 0 to {len(rows) - 1}."
     raise InputError(where, f"there is no row {name_or_number!r}", hint)

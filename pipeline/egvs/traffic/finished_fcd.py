@@ -187,7 +187,7 @@ def check_types(scenario: Scenario, types: Collection[str], declared: Mapping[st
     missing = sorted(set(types) - known - _DEFAULT_TYPES)
     if missing:
         names = ", ".join(map(repr, missing))
-        problem = f"the sizes of some vehicle types of {scenario.traffic.fcd} are unknown: {names}"
+        problem = f"unknown sizes of vehicle types of {scenario.traffic.fcd}: {names}"
         hint = (
             "Add a kind of each name with length_m, width_m and height_m, or the SUMO file with their <vType> to vtypes"
             f" (known: {', '.join(sorted(known))})."
