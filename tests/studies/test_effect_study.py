@@ -99,7 +99,7 @@ def test_trees_and_long_trucks_call_for_their_effects(mini: Path, tmp_path: Path
         "1 of 2 tree crowns may stand between a site and the region",
     )
     assert statuses["articulated"].state == "called for"
-    assert statuses["articulated"].change.startswith("100.0% of the boxes in the last run get parts")
+    assert statuses["articulated"].change.startswith("100.0% of the boxes in the last run would be split into parts")
 
 
 @pytest.mark.slow

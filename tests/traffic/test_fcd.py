@@ -267,7 +267,8 @@ def test_rejects_row_group_above_limit(tmp_path, monkeypatch):
     columns |= {"timestep_time": np.zeros(n), "vehicle_id": ["v"] * n, "vehicle_type": ["car"] * n}
     pq.write_table(pa.table(columns), tmp_path / "f.parquet")
     with pytest.raises(
-        InputError, match=r"f.parquet: has a row group of 1 MB, unpacked\. The limit is 1 MB; set EGVS_MAX_UNPACKED"
+        InputError,
+        match=r"f.parquet: has a row group of 1 MB after decompression\. The limit is 1 MB; set EGVS_MAX_UNPACKED",
     ):
         read_all(tmp_path / "f.parquet")
 

@@ -171,7 +171,7 @@ def read_junction_rows(path: Path, required: Sequence[str]) -> Iterator[tuple[st
     """
     hint = f"Use the columns {', '.join(required)}, separated by commas."
     if not path.is_file():
-        raise InputError(path, "no such file", f"Give a CSV table of junctions. {hint}.")
+        raise InputError(path, "no such file", f"Give a CSV table of junctions. {hint}")
     data = limits.read_bytes(path, limits.DOCUMENT)
     names = set[str]()
     try:

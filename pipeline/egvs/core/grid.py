@@ -100,7 +100,7 @@ class Grid:
         nx, ny, nz = shape
         if nx * ny * nz > VOXELS.maximum:
             total = f"{' x '.join(map(_format_number, shape))} = {_format_number(nx * ny * nz)} voxels"
-            hint = f"Use larger voxels or a smaller region. {VOXELS.hint}."
+            hint = f"Use larger voxels or a smaller region. {VOXELS.hint}"
             raise InputError(f"{where}.voxel_m", f"{voxel_m:g} m gives {total}", hint)
         return cls(roi.origin_m, float(voxel_m), (nx, ny, nz))
 

@@ -173,7 +173,7 @@ def _selected_sites(run: FinishedRun, sites: Collection[str]) -> Collection[str]
 
 def unknown_site(name: str, known: Sequence[str]) -> InputError:
     """Return an error for a site that a run does not have."""
-    listed = ", ".join(known[:10]) + (", ..." if len(known) > 10 else "")
+    listed = ", ".join(known[:10]) + (" and others" if len(known) > 10 else "")
     return InputError("--site", f"this run has no site {name!r}", f"Choose one of {listed}.")
 
 

@@ -333,7 +333,7 @@ class Georeference:
         distances_m = {words: self.distance_m(points) for words, points in self._alternatives(xy)}
         nearest = min(distances_m, key=lambda words: distances_m[words], default="")
         if distances_m.get(nearest, np.inf) <= FAR_M:
-            hint = f"Read as {nearest}, they would be near it. {hint}."
+            hint = f"Read as {nearest}, they would be near it. {hint}"
         raise InputError(where, problem, hint)
 
     def _alternatives(self, xy: FloatArray) -> Iterator[tuple[str, FloatArray]]:

@@ -75,7 +75,7 @@ def _check_gltf_size(path: Path, where: str, data: bytes) -> None:
 
     external = [path.parent / uri for uri in _external_uris(document)]
     total = sum(file.stat().st_size for file in external if file.is_file())
-    limits.FILE.check_bytes(where, total, "names larger files")
+    limits.FILE.check_bytes(where, total, "refers to larger files")
 
 
 def _accessor_count(accessor: dict[str, Any]) -> int:

@@ -114,7 +114,7 @@ def read_line(file: IO[bytes], where: object) -> bytes:
     """Return the next line of a file; InputError when it is too long."""
     limit = limits.ELEMENT.maximum * limits.MB
     line = file.readline(limit + 1)
-    limits.ELEMENT.check_bytes(where, len(line), "has a line without end")
+    limits.ELEMENT.check_bytes(where, len(line), "has an unterminated line")
     return line
 
 
@@ -190,7 +190,7 @@ def scan_attribute_values(path: Path, attribute: str) -> Iterator[bytes]:
             # A value, or the attribute's name, may continue in the next chunk.
             begin = data.rfind(start, end)
             rest = data[-len(start) :] if begin < 0 else data[max(begin - 1, 0) :]
-            limits.ELEMENT.check_bytes(path, len(rest), "has a value without end")
+            limits.ELEMENT.check_bytes(path, len(rest), "has an unterminated value")
 
 
 def file_encoding(path: Path, name: Path | None = None) -> str:
@@ -211,7 +211,7 @@ def copy_as_utf8(path: Path, to: Path) -> None:
         start = text.read(_HEAD_BYTES)
         while b"?>" not in start and (more := text.read(_HEAD_BYTES)):
             start += more
-            limits.ELEMENT.check_bytes(path, len(start), "has an XML declaration without end")
+            limits.ELEMENT.check_bytes(path, len(start), "has an unterminated XML declaration")
         copy.write(start.partition(b"?>")[2])
         while chunk := text.read(1 << 20):
             copy.write(chunk)
@@ -229,7 +229,7 @@ class _BoundedReader(io.RawIOBase):
     def readinto(self, buffer: Any) -> int:
         chunk = self._file.read(len(buffer))
         self._bytes += len(chunk)
-        problem = f"holds more than {limits.UNPACKED.maximum:,} MB, unpacked"
+        problem = f"holds more than {limits.UNPACKED.maximum:,} MB after decompression"
         limits.UNPACKED.check_bytes(self._where, self._bytes, problem)
         buffer[: len(chunk)] = chunk
         return len(chunk)

@@ -98,7 +98,7 @@ def _check_header(path: Path, names: list[str]) -> None:
                 raise InputError(path, f"the columns are separated by {separator!r}", hint)
     duplicates = sorted({name for name in names if names.count(name) > 1})
     if duplicates:
-        raise InputError(path, f"the column {duplicates[0]!r} occurs twice", "Name each column once.")
+        raise InputError(path, f"the column {duplicates[0]!r} occurs twice", "Use each column name once.")
 
 
 def read_geojson(path: Path, world: Georeference) -> Iterator[SiteRow]:

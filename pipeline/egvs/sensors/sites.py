@@ -190,7 +190,7 @@ def _site_rows(scenario: Scenario, path: Path) -> Iterator[SiteRow]:
 def _check_site_count(count: float, where: object, reason: str) -> None:
     if not count <= limits.SITES.maximum:
         problem = f"there are more than {limits.SITES.maximum:,} candidates ({reason})"
-        raise InputError(where, problem, f"Use a wider spacing, or fewer heights and pitches. {limits.SITES.hint}.")
+        raise InputError(where, problem, f"Use a wider spacing, or fewer heights and pitches. {limits.SITES.hint}")
 
 
 def _group_errors(errors: list[InputError]) -> Iterator[Diagnostic]:
@@ -223,7 +223,7 @@ def _check_keep_visibility(scenario: Scenario, sites: Mapping[str, Site]) -> Non
         return
     for name in kept:
         if name not in sites:
-            hint = f"Name one of {', '.join(sites)}, or use 'all'."
+            hint = f"Use one of {', '.join(sites)}, or 'all'."
             raise InputError(f"{scenario.file}: score.keep_visibility", f"there is no site {name!r}", hint)
 
 

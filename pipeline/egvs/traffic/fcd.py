@@ -214,7 +214,7 @@ def _check_rows(metadata: Any, path: Path) -> None:
     """Raise an InputError if a Parquet file declares more rows than it can contain."""
     groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
     largest = max((group.total_byte_size for group in groups), default=0)
-    limits.UNPACKED.check_bytes(path, largest, f"has a row group of {largest / limits.MB:,.0f} MB, unpacked")
+    limits.UNPACKED.check_bytes(path, largest, f"has a row group of {largest / limits.MB:,.0f} MB after decompression")
     packed = sum(group.column(i).total_compressed_size for group in groups for i in range(group.num_columns))
     if metadata.num_rows > _MAX_ROWS_PER_BYTE * packed:
         raise InputError(path, f"declares {metadata.num_rows:,} rows in {packed:,} bytes", _COMPLETE_FILE)

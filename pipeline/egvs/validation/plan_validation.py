@@ -273,7 +273,7 @@ def _check_plan_scenario(path: Path, plan_scenario: object, scenario: Scenario) 
         raise InputError(
             path,
             f"expected a plan for {scenario.name}, got a plan for {name!r}",
-            "Name the folder of another run with --plan-from.",
+            "Give the folder of another run with --plan-from.",
         )
 
 
