@@ -55,5 +55,5 @@ def test_shows_junction_without_score() -> None:
 def test_headline_for_no_gain_ties_and_single_junction() -> None:
     assert page.format_headline([make_result("a", 1, 0.0)]) == "No site sees any traffic"
     tie = [make_result("a", 1, 5.0), make_result("b", 1, 5.0)]
-    assert page.format_headline(tie) == "2 of 2 junctions share the first place"
+    assert page.format_headline(tie) == "2 of 2 junctions share first place"
     assert page.format_headline([make_result("a", 1, 5.0)]) == "a, the only junction: scores 5 bit"

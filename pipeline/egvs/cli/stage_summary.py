@@ -19,7 +19,7 @@ _OMITTED_KEYS = frozenset(
 """Entries of a summary that are printed elsewhere, or that only ``run.json`` holds."""
 
 _STAGE_NAMES = {"tpog": "occupancy"}
-"""Stages that are called otherwise than their command."""
+"""Stages whose name differs from their command."""
 
 
 def stage_lines(stage: str, state: str, record: StageRecord) -> Iterator[str]:
@@ -59,6 +59,8 @@ def _check_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[
 
 def _statics_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[str]:
     yield f"{rest.pop('triangles'):,} triangles in {_count(summary['solids'], 'solid')}"
+    if built := rest.pop("built", None):
+        yield ", ".join(f"{kind.replace('_', ' ')} ({count:,})" for kind, count in built.items())
     if repaired := rest.pop("mended", None):
         yield "repaired: " + _describe_counts(repaired)
     if ignored := rest.pop("left_out", None):
@@ -108,6 +110,8 @@ def _score_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[
         yield f"best: {', '.join(best)}"
     if by.name == "egvs":
         yield f"upper limit {float(limit):,.0f} bit"
+    if gamma := rest.pop("gamma_auto", None):
+        yield f"gamma {gamma:g} (auto)"
     if errors := rest.pop("standard_errors_from", None):
         yield f"standard errors from {errors}"
 
