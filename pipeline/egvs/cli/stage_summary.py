@@ -58,9 +58,10 @@ def _check_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[
 
 
 def _statics_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[str]:
-    yield f"{rest.pop('triangles'):,} triangles in {_count(summary['solids'], 'solid')}"
+    solids = _count(summary["solids"], "solid")
     if built := rest.pop("built", None):
-        yield ", ".join(f"{kind.replace('_', ' ')} ({count:,})" for kind, count in built.items())
+        solids += ": " + ", ".join(f"{kind.replace('_', ' ')} ({count:,})" for kind, count in built.items())
+    yield f"{rest.pop('triangles'):,} triangles in {solids}"
     if repaired := rest.pop("mended", None):
         yield "repaired: " + _describe_counts(repaired)
     if ignored := rest.pop("left_out", None):
