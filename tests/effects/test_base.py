@@ -452,20 +452,20 @@ def test_foliage_combines_with_rain(mini: Path, tmp_path: Path) -> None:
 
 
 BAD_SCAN = {
-    f"{DIVERGENCE}5": "effects.divergence.sub_beams: 5",
-    "effects.divergence.divergence_mrad=[-1, 2]": "effects.divergence.divergence_mrad.0: -1",
+    f"{DIVERGENCE}5": "effects.divergence.sub_beams: expected 1, 7 or 19, got 5",
+    "effects.divergence.divergence_mrad=[-1, 2]": "effects.divergence.divergence_mrad.0: expected a value greater than or equal to 0, got -1",
     "effects.divergence.divergence_mrad=[1]": "effects.divergence.divergence_mrad",
     "effects.divergence.subbeams=7": "Did you mean sub_beams",
-    f"{SWAY}-1": "effects.mount_sway.tilt_deg: -1",
+    f"{SWAY}-1": "effects.mount_sway.tilt_deg: expected a value greater than or equal to 0, got -1",
     f"{SWAY}nan": "effects.mount_sway.tilt_deg",
     "effects.mount_sway.samples=9": "effects.mount_sway.tilt_deg: this key is required",
-    "effects.mount_sway={tilt_deg = 1, samples = 5}": "effects.mount_sway.samples: 5",
-    f"{FOLIAGE}-0.1": "effects.foliage.leaf_area_density: -0.1",
+    "effects.mount_sway={tilt_deg = 1, samples = 5}": "effects.mount_sway.samples: expected 1, 4, 9 or 16, got 5",
+    f"{FOLIAGE}-0.1": "effects.foliage.leaf_area_density: expected a value greater than or equal to 0, got -0.1",
     f"{FOLIAGE}inf": "effects.foliage.leaf_area_density",
     "effects.foliage.season='spring'": "effects.foliage.season",
     "effects.foliage.season=1.5": "effects.foliage.season",
-    "effects.foliage.projection=0": "effects.foliage.projection: 0",
-    "effects.foliage.step_m=0": "effects.foliage.step_m: 0",
+    "effects.foliage.projection=0": "effects.foliage.projection: expected a value greater than 0, got 0",
+    "effects.foliage.step_m=0": "effects.foliage.step_m: expected a value greater than or equal to 0.01, got 0",
 }
 
 
@@ -565,12 +565,15 @@ def test_rejects_traffic_effects_that_do_not_fit_network_or_fleet(tmp_path, lane
 
 BAD_TRAFFIC = {
     "slope takes nothing": ("effects.slope.grade=1", r"effects\.slope\.grade: unknown key"),
-    "a negative rate": ("effects.pedestrians_bicycles.pedestrians_per_h=-1", r"pedestrians_per_h: -1"),
+    "a negative rate": (
+        "effects.pedestrians_bicycles.pedestrians_per_h=-1",
+        r"pedestrians_per_h: expected a value greater than or equal to 0, got -1",
+    ),
     "a flat person": ("effects.pedestrians_bicycles.pedestrian_m=[0.8,0.6,0]", r"pedestrian_m"),
     "no parts": ("effects.articulated.kinds.car.parts_m=[]", r"articulated\.kinds\.car\.parts_m"),
     "too many hinges": (
         "effects.articulated.kinds.car={parts_m=[2,2],hinges_m=[2,3]}",
-        r"hinges_m has 2 values for 2 parts, 1",
+        r"expected 1 hinges_m for 2 parts, or none, got 2",
     ),
     "a wrong word": ("effects.articulated.kind=1", r"articulated\.kind: unknown key. Did you mean kinds\?"),
     "people beside a finished file": (

@@ -359,7 +359,7 @@ def test_message_without_laspy_tells_how_to_install_it(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "laspy", None)
-    with pytest.raises(InputError, match=r"needs laspy, which is not installed\. Install it: pip install egvs\[las\]"):
+    with pytest.raises(InputError, match=r"needs laspy, which is not installed\. Run pip install 'egvs\[las\]'"):
         read_points(put(tmp_path, name, b"LASF"), "")
 
 
@@ -369,7 +369,7 @@ def test_message_without_lazrs_tells_how_to_install_it(tmp_path: Path, monkeypat
 
     path, _ = las(tmp_path, "a.laz")
     monkeypatch.setattr(laspy.LazBackend, "detect_available", lambda: ())
-    with pytest.raises(InputError, match=r"needs lazrs, which is not installed\. Install it: pip install egvs\[las\]"):
+    with pytest.raises(InputError, match=r"needs lazrs, which is not installed\. Run pip install 'egvs\[las\]'"):
         read_points(path, "")
 
 
@@ -428,7 +428,7 @@ CSV = "x_m,y_m,z_m\n1,2,3\n"
         ("a.pcd", "VERSION\x00\x80 7\n" + ASCII_PCD, r"a\.pcd: line 1: expected text, got .VERSION.x00.x80 7."),
         ("a.pcd", ASCII_PCD.replace("FIELDS x y z\n", ""), "the PCD header has no FIELDS line"),
         ("a.pcd", ASCII_PCD.replace("x y z", "x y zz"),
-         "expected one field 'z', got the fields x y zz. Write one field each for x, y and z"),
+         "expected one field 'z', got the fields x y zz. Write one field for each of x, y and z"),
         ("a.pcd", ASCII_PCD.replace("x y z", "x x z"), "expected one field 'x', got the fields x x z"),
         ("a.pcd", ASCII_PCD.replace("TYPE", "COUNT 1 2 1\nTYPE"), "expected one field 'y'"),
         ("a.pcd", ASCII_PCD.replace("8 8 8", "8 8"), "SIZE: expected 3 values, one per field, got 2"),
@@ -439,7 +439,7 @@ CSV = "x_m,y_m,z_m\n1,2,3\n"
         ("a.pcd", ASCII_PCD.replace("POINTS 2", "POINTS -2"), "POINTS: expected a whole number, got '-2'"),
         ("a.pcd", ASCII_PCD.replace("POINTS 2", "POINTS " + "9" * 5000),
          r"POINTS: expected a whole number, got '9+ .* 9+'"),
-        ("a.pcd", ASCII_PCD.replace("POINTS 2\n", "").replace("WIDTH 2\n", ""), "no line POINTS"),
+        ("a.pcd", ASCII_PCD.replace("POINTS 2\n", "").replace("WIDTH 2\n", ""), "no POINTS line"),
         ("a.pcd", ASCII_PCD.replace(" 2\n", " 0\n"),
          "the header declares 0 points. Use a file with at least one return"),
         ("a.pcd", ASCII_PCD.replace("ascii", "zip"), "DATA: expected ascii, binary or binary_compressed, got 'zip'"),
@@ -460,7 +460,7 @@ CSV = "x_m,y_m,z_m\n1,2,3\n"
         ("a.pcd", BINARY + bytes(23), r"the header declares 2 points of 12 bytes \(24 bytes\), got 23 bytes"),
         ("a.pcd", BINARY + bytes(25), r"\(24 bytes\), got 25 bytes"),
         ("a.pcd", ASCII_PCD.replace("DATA ascii", "DATA " + "x" * 900), "DATA: .* got 'x{60}'"),
-        ("a.pcd", PACKED + bytes(7), r"the file ends before its points \(7 bytes of them\)"),
+        ("a.pcd", PACKED + bytes(7), r"the file ends before its points \(only 7 bytes of data\)"),
         ("a.pcd", PACKED + struct.pack("<II", 1, 12) + b"\0",
          "the header declares 24 bytes of points, got 12 bytes after decompression"),
         ("a.pcd", PACKED + packed(bytes(24))[:-1], "expected 5 bytes of packed points, got 4 bytes"),
@@ -634,13 +634,13 @@ def read(path, where):
 @pytest.mark.parametrize(
     ("body", "problem"),
     [
-        ("raise RuntimeError('boom')", r"ended with RuntimeError\('boom'\)"),
-        ("raise SystemExit(0)", r"ended with SystemExit\(0\)"),
+        ("raise RuntimeError('boom')", r"raised RuntimeError\('boom'\)"),
+        ("raise SystemExit(0)", r"raised SystemExit\(0\)"),
         ("return None", "returns NoneType"),
         ("return [[1.0, 2.0, 3.0]]", "returns list"),
-        ("return np.array([['a', 'b', 'c']])", "returns an array of <U1"),
-        ("return np.ones((5, 2))", r"returns an array of float64 of the shape \(5, 2\)"),
-        ("return np.ones(3)", r"returns an array of float64 of the shape \(3,\)"),
+        ("return np.array([['a', 'b', 'c']])", "returns a <U1 array"),
+        ("return np.ones((5, 2))", r"returns a float64 array of shape \(5, 2\)"),
+        ("return np.ones(3)", r"returns a float64 array of shape \(3,\)"),
     ],
 )
 def test_message_names_failing_reader_and_file(site: Path, body: str, problem: str) -> None:  # noqa: F811

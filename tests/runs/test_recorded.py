@@ -73,8 +73,8 @@ def test_rejects_artefact_with_flipped_bit(runs, out: Path, name: str, verb: str
         said = answer(verb, runs[0], out)
         now, known = (files.hash_file(path / name)[:12] for path in (out, runs[1]))
         altered = (
-            f"{out / name}: was altered or replaced (sha256 {now}, in run.json {known}). Call egvs run to "
-            f"make it again."
+            f"{out / name}: was altered or replaced (sha256 {now}, in run.json {known}). Run egvs run "
+            f"again to create it."
         )
         assert said == altered
         assert contents(out) == before, "a refused verb wrote something"

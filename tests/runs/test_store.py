@@ -400,7 +400,7 @@ def test_the_command_line_lists_prunes_and_clears(done: tuple[egvs.Scenario, Pat
     largest = max(entry.bytes for entry in Store(store).entries())
     assert run_egvs("store", "--prune", "--max", f"{largest / 1e3}K")[0] == 0
     assert 0 < len(assert_whole(store)) < 6
-    assert "0 entries, 0 B are left" in run_egvs("store", "--clear")[1]
+    assert "0 entries, 0 B remain" in run_egvs("store", "--clear")[1]
     cases = ((("--max", "2G"), "without --prune"), (("--prune", "--max", "much"), "expected a size, got 'much'"))
     for words, message in cases:
         code, _, said = run_egvs("store", *words)
@@ -440,7 +440,7 @@ def test_a_run_does_not_go_into_the_store(
     (store := tmp_path / "runs" / ".store").mkdir(parents=True)
     (tmp_path / "runs" / "link").symlink_to(store)
     code, _, said = run_egvs(verb, mini, "--out", f"runs/{name}")
-    assert (code, said.count("the store (runs/.store), or lies in it")) == (2, 1), said
+    assert (code, said.count("the store (runs/.store) or inside it")) == (2, 1), said
     assert not list(store.iterdir())
 
 

@@ -218,7 +218,7 @@ def test_warns_of_undefined_target_scores(mini: Path, tmp_path: Path) -> None:
     values = read_scores(tmp_path / "run" / "scores.parquet")["expected_detections"].to_pylist()
     assert read_tpog(tmp_path / "run" / "tpog.parquet").counts.any()
     nobody = "no vehicle has its centre in the region of interest in the 40 frames examined"
-    assert [it.problem for it in told] == [f"{nobody}: expected_detections is NaN"]
+    assert [it.problem for it in told] == [f"{nobody}: no value for expected_detections"]
     assert math.isnan(values[0])
 
 

@@ -215,7 +215,7 @@ def test_rejects_kind_without_trips(tmp_path):
     with pytest.raises(InputError, match=r"kind 'boat' \(vClass ship\) cannot make any trip of at least 300 m"):
         demand.origin_destination_pairs(roads, car(name="boat", vclass="ship"), drawn(min_trip_m=300), rng, "place")
     roads = network.Network(tuple(e for e in roads.edges if e.id == "in"), ())
-    with pytest.raises(InputError, match=r"kind 'bus' \(vClass bus\) may use no lane"):
+    with pytest.raises(InputError, match=r"no lane of the network allows kind 'bus' \(vClass bus\)"):
         demand.origin_destination_pairs(roads, car(name="bus", vclass="bus"), drawn(), rng, "place")
 
 

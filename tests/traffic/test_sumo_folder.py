@@ -94,7 +94,12 @@ BAD = {
         InputError,
         r"kind 'car' has the unknown vClass 'saucer'",
     ),
-    "trips too long": (nothing, {"network": "net.xml", "min_trip_m": 5000}, InputError, r"no trip of at least 5000 m"),
+    "trips too long": (
+        nothing,
+        {"network": "net.xml", "min_trip_m": 5000},
+        InputError,
+        r"cannot make any trip of at least 5000 m",
+    ),
     "routes off the network": (
         write("r.xml", CAR_ROUTE),
         {"network": "net.xml", "routes": ["r.xml"]},
