@@ -453,7 +453,7 @@ def test_foliage_combines_with_rain(mini: Path, tmp_path: Path) -> None:
 
 BAD_SCAN = {
     f"{DIVERGENCE}5": "effects.divergence.sub_beams: expected 1, 7 or 19, got 5",
-    "effects.divergence.divergence_mrad=[-1, 2]": "divergence_mrad.0: expected a value greater than or equal to 0, got -1",
+    "effects.divergence.divergence_mrad=[-1, 2]": "mrad.0: expected a value greater than or equal to 0, got -1",
     "effects.divergence.divergence_mrad=[1]": "effects.divergence.divergence_mrad",
     "effects.divergence.subbeams=7": "Did you mean sub_beams",
     f"{SWAY}-1": "effects.mount_sway.tilt_deg: expected a value greater than or equal to 0, got -1",
