@@ -59,7 +59,7 @@ def test_this_program_has_priority_then_packages_by_name(site: Path) -> None:
 
 def test_message_of_unknown_name_lists_known_ones(site: Path) -> None:
     install(site, "one", "a = plug_a", {})
-    with pytest.raises(InputError, match=r"^egvs\.test_group: knows no 'c'\. Choose one of a\.$"):
+    with pytest.raises(InputError, match=r"^egvs\.test_group: unknown name 'c'\. Choose one of a\.$"):
         plugins.load_plugin(GROUP, "c")
     with pytest.raises(InputError, match="Choose one of none"):
         plugins.load_plugin("egvs.nobody", "c")

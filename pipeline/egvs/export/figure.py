@@ -104,7 +104,7 @@ def _check_arguments(what: str, site: str | None, kind: str, out: Path | None) -
     if out is not None and out.suffix != f".{kind}":
         raise InputError("--out", f"expected a name ending in .{kind}, got {str(out)!r}", "Change it, or --format.")
     if kind != "svg":
-        plugins.require_libraries(f"a figure as {kind}", "figure", "cairosvg")
+        plugins.require_libraries(f"a {kind} figure", "figure", "cairosvg")
 
 
 def _find_site(ranking: Ranking, name: str | None) -> RankedSite:
