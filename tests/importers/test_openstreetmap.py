@@ -404,7 +404,7 @@ BLOCK = (
         ([("</osm>", "")], "is not well-formed XML"),
         ([("^.*", "")], "is not well-formed XML"),
         ([("^.*", '{"elements": []}')], "is not well-formed XML"),
-        ([("^.*", '<gpx version="1.1"></gpx>')], "expected the root <osm>, got <gpx>"),
+        ([("^.*", '<gpx version="1.1"></gpx>')], "expected the root element <osm>, got <gpx>"),
         ([("^.*", '<osm version="0.6"></osm>')], "has no nodes"),
         ([("<osm ", '<!DOCTYPE osm [<!ENTITY a "b">]><osm ')], "entities"),
         ([('"52.0000000"', '"52 N"')], "node 1: lat: expected degrees from -90 to 90, got '52 N'"),

@@ -145,7 +145,7 @@ def test_interrupted_run_records_one_scenario(done: tuple[Path, Path], monkeypat
             run.run(other, out)
     record = json.loads((out / "run.json").read_text())
     assert (record["scenario"]["statics"]["ground"], list(record["stages"])) == (False, ["check", "statics", "scan"])
-    with pytest.raises(InputError, match="the stage traffic is not done"):
+    with pytest.raises(InputError, match="the stage traffic has not been run"):
         verification.verify(out)
     again = states(egvs.load(mini, ["statics.ground=false"]), out)
     assert (again["statics"], again["scan"], again["traffic"]) == ("skipped", "skipped", "fetched")
@@ -207,20 +207,20 @@ def test_verify_rejects_unfinished_run(done: tuple[Path, Path]) -> None:
     record = json.loads((out / "run.json").read_text())
     del record["stages"]["score"]
     (out / "run.json").write_text(json.dumps(add_checksum(record)))
-    with pytest.raises(InputError, match="the stage score is not done"):
+    with pytest.raises(InputError, match="the stage score has not been run"):
         verification.verify(out)
 
 
 def test_rejects_second_run_in_same_folder(done: tuple[Path, Path]) -> None:
     mini, out = done
-    with lock_run_folder(out), pytest.raises(RunError, match="another run is at work"):
+    with lock_run_folder(out), pytest.raises(RunError, match="another run is using this folder"):
         egvs.run(egvs.load(mini), out)
 
 
 def test_rejects_file_that_is_no_record(done: tuple[Path, Path]) -> None:
     mini, out = done
     (out / "run.json").write_text("[]")
-    with pytest.raises(InputError, match="is not the record of a run"):
+    with pytest.raises(InputError, match="is not a run record"):
         egvs.run(egvs.load(mini), out)
 
 
@@ -251,7 +251,7 @@ def test_single_stage_drops_stages_of_other_settings(done: tuple[Path, Path], ru
     mini, out = done
     assert run_egvs("score", mini, "--out", out, "--set", "score.gamma=7", "--set", "sites.yaw_deg=5")[0] == 0
     code, _, said = run_egvs("verify", out)
-    assert (code, "the stage check is not done" in said) == (2, True), said
+    assert (code, "the stage check has not been run" in said) == (2, True), said
     assert run_egvs("run", mini, "--out", out)[0] == 0
     assert run_egvs("verify", out)[0] == 0
 
@@ -341,7 +341,7 @@ def test_record_of_earlier_version_has_no_stages(done: tuple[Path, Path]) -> Non
         del stage["files"]
     del record["own_sha256"]
     (out / "run.json").write_text(json.dumps(record | {"effects": []}))
-    with pytest.raises(InputError, match="the stage check is not done"):
+    with pytest.raises(InputError, match="the stage check has not been run"):
         verification.verify(out)
     assert set(states(egvs.load(mini), out).values()) == {"fetched"}
     assert verification.verify(out) == []

@@ -27,7 +27,7 @@ from egvs.core import files, limits, reading
 from egvs.core.errors import InputError, MissingBackendError
 from egvs.core.grid import Grid
 
-_REMAKE_HINT = "Make the file again."
+_REMAKE_HINT = "Create the file again."
 
 
 SCHEMA_VERSION = 1
@@ -40,7 +40,7 @@ def schema_folder() -> Path:
     for candidate in (package / "data_schemas", package.parent.parent / "data_schemas"):
         if candidate.is_dir():
             return candidate
-    raise MissingBackendError(f"{package.parent}: the folder data_schemas is missing. Install egvs again")
+    raise MissingBackendError(f"{package.parent}: the folder data_schemas is missing. Reinstall egvs")
 
 
 @cache

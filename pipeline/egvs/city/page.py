@@ -221,7 +221,7 @@ def format_headline(results: Sequence[JunctionResult]) -> str:
         return f"{name}, the only junction: {first.best.by.sentence(first.score)}"
     n_best = sum(result.rank == 1 for result in results)
     if n_best > 1:
-        return f"{n_best} of {len(results)} junctions share the first place"
+        return f"{n_best} of {len(results)} junctions share first place"
     return f"Of {len(results)} junctions, a first sensor has the largest gain at {name}"
 
 

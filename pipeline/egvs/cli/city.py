@@ -39,13 +39,13 @@ CitySet = Annotated[
     typer.Option(
         "--set",
         metavar="KEY=VALUE",
-        help="Override one key of every junction, e.g. score.gamma=2 (not of the traffic).",
+        help="Override a key of every junction, e.g. score.gamma=2; not for traffic (repeatable).",
     ),
 ]
 
 
 def new(
-    folder: Annotated[Path, typer.Argument(metavar="CITY", help="The city's folder, which is created.")],
+    folder: Annotated[Path, typer.Argument(metavar="CITY", help="Folder of the new city.")],
     osm: Annotated[
         Path, typer.Option(metavar="FILE", help="An OpenStreetMap extract (.osm, .osm.xml, .osm.pbf, also gzipped).")
     ],
@@ -177,7 +177,7 @@ def _print_traffic(folder: Path, result: CityTraffic) -> None:
     most = max(result.rows, key=lambda name: result.rows[name])
     out.print(f"rows: {result.rows[most]:,} at {most} (the most), {result.rows[fewest]:,} at {fewest} (the fewest)")
     if not result.is_new:
-        out.print("nothing to do: neither the traffic nor a region changed")
+        out.print("nothing to do: neither the traffic nor any region has changed")
     out.print(str(folder / "traffic"))
 
 
@@ -263,7 +263,7 @@ def print_plan(placed: CityPlacement) -> None:
     out.print(
         f"{len(plan.sensors)} sensors at {len(plan.by_junction)} of {plan.junctions} junctions{cost}: "
         f"{label.label} {label.value(plan.joint)}, {share:.1%} of the score of all {plan.candidates:,} candidates "
-        f"together; proved: at least {proved:.2f} % of the best possible"
+        f"together; proved: at least {proved:.2f} % of the best possible score"
     )
     for path in placed.files:
         out.print(str(path))

@@ -50,7 +50,7 @@ def print_run(folder: Path, record: RunRecord, *, anything_ran: bool, top: int |
     ]
     out.print(make_table(columns, record.stages))
     if not anything_ran:
-        out.print("nothing to do: no input of any stage changed since the last run")
+        out.print("nothing to do: no stage input has changed since the last run")
 
 
 def _artefact_paths(folder: Path, record: RunRecord, stage: str) -> list[str]:
@@ -80,7 +80,7 @@ def _print_scores(out: Console, folder: Path, record: RunRecord, top: int | None
     for line in _outcome_sentences(folder, record, sites):
         out.print(line)
     if top is not None and len(sites) > top:
-        out.print(f"... and {len(sites) - top} more, listed in {folder / 'scores.parquet'} and without --top")
+        out.print(f"... and {len(sites) - top} more; omit --top, or see {folder / 'scores.parquet'}")
     if len({site.pole for site in sites}) < len(sites):
         out.print(poles_table(sites, top))
     by_period = PeriodRanking.read(folder)
@@ -157,7 +157,7 @@ def ranking_table(sites: Sequence[RankedSite], width: int = WIDE, top: int | Non
     shown = by_rank[:top]
     caption = None
     if not all(site.is_separable for site in shown):
-        chance = f"the chance that it truly scores higher is below {DISTINCT_PROBABILITY:.0%}"
+        chance = f"the probability that it truly scores higher is below {DISTINCT_PROBABILITY:.0%}"
         caption = f"~ not separable from the next site: {chance}"
     return make_table(columns, shown, width=width, caption=caption)
 
@@ -202,7 +202,7 @@ def poles_table(sites: Sequence[RankedSite], top: int | None = None) -> Table:
         Column("beats worst by", lambda pole: "-" if pole.gain is None else f"{pole.gain:.1%}"),
     ]
     poles = group_by_pole(sorted(sites, key=lambda site: site.rank))
-    return make_table(columns, poles[:top], title="best candidate of each pole")
+    return make_table(columns, poles[:top], title="best candidate on each pole")
 
 
 def period_table(by_period: PeriodRanking, top: int | None = None) -> Table:
@@ -234,7 +234,7 @@ def print_verification(folder: Path, differences: list[str]) -> None:
     for line in differences:
         out.print(f"{folder}: {line}")
     if not differences:
-        out.print(f"{folder}: every artefact is unaltered, and a second run produces the same bytes")
+        out.print(f"{folder}: all artefacts are unaltered, and a second run reproduces them byte for byte")
 
 
 def print_check(checked: CheckReport) -> None:
@@ -251,7 +251,7 @@ def print_check(checked: CheckReport) -> None:
                 if finding.rule == rule:
                     out.print(f"    {finding}")
     if not checked.findings:
-        out.print("no errors and no warnings")
+        out.print("no errors or warnings")
     out.print(f"checked {checked.sites} sites, {checked.solids} solids and {checked.lanes} lanes")
 
 
@@ -265,7 +265,7 @@ def print_new_scenario(scenario: NewScenario) -> None:
     hourly = description["assumed_traffic"]["vehicles_per_hour"]
     out.print(
         f"warning: the traffic is assumed ({hourly:,} vehicles an hour) and affects the ranking. "
-        f"Enter counted traffic under [traffic] of {scenario.folder / 'scenario.toml'} before you rely on it."
+        f"Enter counted traffic under [traffic] in {scenario.folder / 'scenario.toml'} before you rely on the ranking."
     )
     out.print(f"next: egvs run {scenario.folder}")
 
@@ -331,7 +331,7 @@ def _format_cost(cost: EffectCost | None) -> str:
 def _format_cost_change(cost: EffectCost | None) -> str:
     if cost is None:
         return ""
-    best = "same best site" if cost.regret == 0 else f"another best site, regret {cost.regret:.2%}"
+    best = "same best site" if cost.regret == 0 else f"different best site, regret {cost.regret:.2%}"
     return f"scores by up to {cost.change:.1%}; {best}; tau {cost.tau:.2f}"
 
 
@@ -343,7 +343,7 @@ def print_ablation(changes: Sequence[EffectChange]) -> None:
         Column[int]("plain, bit", lambda row: _format_plain(plain, row)),
     ]
     columns += [Column(change.effect, partial(_format_change, plain, change)) for change in changes[1:]]
-    title = "change of each site's score against the plain scene (rank, where it changes)"
+    title = "change in each site's score compared with the plain scene (and rank, where it changes)"
     rows = [*range(len(plain.sites)), _SECONDS_ROW]
     out = console(_LIST_FILE_WIDTH, soft_wrap=False)
     out.print(make_table(columns, rows, title=title, truncate=True))
@@ -392,7 +392,7 @@ def print_store(store: Store) -> None:
 
 def print_removed(store: Store, removed: list[StoreEntry]) -> None:
     """Print what was removed from the store, and what is left."""
-    print(f"{store.folder}: removed {_format_total(removed)}; {_format_total(store.entries())} are left")
+    print(f"{store.folder}: removed {_format_total(removed)}; {_format_total(store.entries())} remain")
 
 
 def _format_total(entries: list[StoreEntry]) -> str:

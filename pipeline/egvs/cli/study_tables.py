@@ -34,15 +34,15 @@ def print_study(study: AccuracyStudy, command: str) -> None:
     approximations = [row for row in study.rows if row.kind != "measures"]
     measures = [row for row in study.rows if row.kind == "measures"]
 
-    title = "settings that approximate the same number, against the reference"
+    title = "settings that approximate the same number, compared with the reference"
     out.print(_settings_table(title, approximations, has_errors=True, is_wide=is_wide))
-    out.print(f"reference: {_describe_reference(study)}. * on the front of time and error, = recommended")
+    out.print(f"reference: {_describe_reference(study)}. * on the Pareto front of time and error, = recommended")
     out.print(f"seconds are medians; stages were repeated {study.repeated} times to measure them\n")
     if measures:
-        title = "settings that measure something else, against the scenario on the same traffic"
+        title = "settings that measure something else, compared with the scenario on the same traffic"
         out.print(_settings_table(title, measures, has_errors=False, is_wide=is_wide))
     if not is_wide:
-        out.print("seconds by stage, memory and disk: in a wider window, or in accuracy.parquet")
+        out.print("for seconds by stage, memory and disk, widen the window or see accuracy.parquet")
 
     for reason in dict.fromkeys(study.skipped.values()):
         names = [name for name, skip_reason in study.skipped.items() if skip_reason == reason]
@@ -52,7 +52,7 @@ def print_study(study: AccuracyStudy, command: str) -> None:
     for better, worse, probability, frames in study.neighbours[:3]:
         needed = "no feasible amount of traffic would tell them apart"
         if frames < _MAX_FRAMES:
-            needed = f"about {frames:,.0f} frames tell them apart"
+            needed = f"about {frames:,.0f} frames would tell them apart"
         out.print(f"{better} above {worse}: probability {probability:.0%}; {needed}")
     out.print(_describe_recommendation(study, command))
     for path in study.files:
@@ -123,7 +123,7 @@ def _print_seeds(out: Console, seeds: SeedComparison) -> None:
     ]
     title = f"{seeds.seeds} independent runs of {seeds.frames} frames, bit"
     out.print(make_table(columns, range(len(seeds.sites)), title=title, truncate=True))
-    out.print(f"90 % intervals contain the score of all runs together in {seeds.covered:.1%} of cases")
+    out.print(f"90 % intervals contain the pooled score of all runs in {seeds.covered:.1%} of cases")
 
 
 def _describe_recommendation(study: AccuracyStudy, command: str) -> str:
@@ -135,11 +135,11 @@ def _describe_recommendation(study: AccuracyStudy, command: str) -> str:
     best = study.best
     if best is None and len(candidates) == 1:
         error = f"{candidates[0].judged:.2%}"
-        return f"the budget was enough for the scenario's own setting only, with an error of {error}: increase --budget"
+        return f"the budget only covered the scenario's own setting, with an error of {error}: increase --budget"
     if best is None:
         nearest = min(candidates, key=lambda row: row.judged)
         error = f"{nearest.judged:.2%}"
-        return f"no setting is within {study.tolerance:.2%}; the nearest is {nearest.setting!r}, with {error}"
+        return f"no setting is within {study.tolerance:.2%}; the closest is {nearest.setting!r}, with {error}"
 
     standard_error = "unknown" if math.isnan(best.error_se) else f"{best.error_se:.2%}"
     note = ""

@@ -120,7 +120,7 @@ def print_validation(scenario: Scenario, out: Path, validation: Validation) -> N
 
 def _print_sample(detection: Any) -> None:
     """Print the size of the held-out traffic."""
-    print(f"{detection.objects} vehicles in {detection.frames} frames of held-out traffic; ± is a standard error")
+    print(f"{detection.objects} vehicles in {detection.frames} frames of held-out traffic; ± gives the standard error")
 
 
 def _print_agreement(validation: Validation, scenario_score: ScoreName, detectors: Sequence[str]) -> None:
@@ -171,7 +171,7 @@ def print_plan_validation(validation: PlanValidation) -> None:
         detector_rows = [row for row in rows if row.detection.detector == detector]
         print_table(columns, detector_rows, file_width=_FILE_WIDTH)
     _print_sample(rows[0].detection)
-    print(f"fused clouds of the plan by {validation.plan.score} in {validation.plan.path}; gain: over one sensor less")
+    print(f"fused clouds of the plan by {validation.plan.score} in {validation.plan.path}; gain: over one sensor fewer")
     for warning in validation.warnings:
         print(f"warning: {warning}")
     print(validation.path)

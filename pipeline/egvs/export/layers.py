@@ -281,7 +281,7 @@ def city_layers(folder: Path) -> tuple[list[Layer], list[str]]:
     rows, metadata = parquet.read_artefact(folder / results.JUNCTIONS_TABLE, "city")
     if metadata["inputs"] != results.hash_scores(folder, _junction_names(folder)):
         problem = "the scores of a junction have changed since the city run"
-        raise InputError(folder / results.JUNCTIONS_TABLE, problem, "Run egvs city run again")
+        raise InputError(folder / results.JUNCTIONS_TABLE, problem, "Run egvs city run again.")
     layers, notes = [Layer(JUNCTIONS, point_geometries(rows), to_plain_table(rows), "gain")], list[str]()
     scores = results.read_city_scores(folder)
     planned = results.read_plan(folder, _junction_names(folder))

@@ -28,7 +28,7 @@ from egvs.formats.point_clouds import stack_xyz
 
 _CHUNK = 1_000_000
 _CANNOT_READ = "cannot be read as LAS"
-_INSTALL_HINT = "Install it: pip install egvs[las]."
+_INSTALL_HINT = "Run pip install 'egvs[las]'."
 _ROOT = Path(__file__).resolve().parents[2]
 """Folder of the package ``egvs``, which the other process must find."""
 
@@ -102,7 +102,7 @@ def _read_in_other_process(path: Path, where: str, declared: int) -> FloatArray:
         errors.seek(0)
         lines = errors.read(100_000).decode("utf-8", "replace").strip().splitlines()
     if code < 0:
-        problem = f"{_CANNOT_READ} (the decompressor was ended by signal {-code}: it asked for too much memory)"
+        problem = f"{_CANNOT_READ} (the decompressor was killed by signal {-code}: it needed too much memory)"
         raise InputError(where, problem, limits.READER_MEMORY.hint)
     if code or has_more:
         reason = lines[-1] if lines else "more points than its header declares"

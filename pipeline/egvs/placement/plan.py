@@ -498,7 +498,7 @@ def _unmet_zone_error(
         hint = f"Set placement.count to {len(larger.order)}: {names} see enough."
     return InputError(
         f"{scenario.file}: placement.zones",
-        f"no plan of {problem.rules.count} sensors that meets them was found; the nearest, {nearest}, sees "
+        f"no plan of {problem.rules.count} sensors that meets the demands was found; the closest, {nearest}, sees "
         + " and ".join(shares),
         hint,
     )

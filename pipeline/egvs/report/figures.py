@@ -159,7 +159,7 @@ def occupancy_map(tpog: Tpog, ranking: Ranking, backdrop: Backdrop, style: Figur
     alt = (
         f"Occupancy of the region of interest by traffic, seen from above: "
         f"vehicles use {np.count_nonzero(mean) / mean.size:.0%} of its area; "
-        f"the busiest place is near x = {x:.0f} m, y = {y:.0f} m."
+        f"the busiest location is near x = {x:.0f} m, y = {y:.0f} m."
     )
     label = "Occupied voxels in the column"
     if style.width >= _WIDE_FIGURE:

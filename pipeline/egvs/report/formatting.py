@@ -92,18 +92,18 @@ _LABELS = (
         "Sites are ranked by the share of the traffic’s uncertainty in voxels that at least one beam crosses.",
     ),
     ScoreLabel(
-        "coverage", "the coverage", "coverage", "crosses {} of the voxels where traffic ever is",
+        "coverage", "the coverage", "coverage", "crosses {} of the voxels that traffic ever occupies",
         "Sites are ranked by coverage: of the voxels that traffic ever occupies, the share that at least one beam "
         "crosses.",
     ),
     ScoreLabel(
-        "expected_visibility", "the occupancy seen", "visibility", "sees {} of what traffic occupies",
+        "expected_visibility", "the occupancy seen", "visibility", "sees {} of the traffic’s occupancy",
         "Sites are ranked by the occupancy seen: of the summed occupancy probabilities, the share in voxels that at "
         "least one beam crosses.",
     ),
     ScoreLabel(
         "points_on_target", "the points on vehicles", "log points", "has a mean log(1 + points) of {} on vehicles",
-        f"Sites are ranked by the points that they get from vehicles: the mean of log(1 + points). "
+        f"Sites are ranked by their points on vehicles: the mean of log(1 + points). "
         f"{_VEHICLES_NOTE}",
         is_share=False, digits=2,
     ),
@@ -115,7 +115,7 @@ _LABELS = (
     ScoreLabel(
         "expected_detections", "the share of vehicles found", "found", "should find {} of vehicles",
         "Sites are ranked by the share of vehicles that detectors are expected to find, given the points on each "
-        "vehicle, how far they spread over it, its distance, and the distance to the next vehicle. "
+        "vehicle, how widely they are spread over it, its distance, and the distance to the next vehicle. "
         f"{_VEHICLES_NOTE}",
     ),
 )  # fmt: skip

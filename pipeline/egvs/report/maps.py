@@ -228,7 +228,7 @@ def missed_view(
     alt = f"From above: no vehicles for {site.site} to see."
     if blindspots.overall:
         alt = f"From above: {site.site} misses {1.0 - blindspots.overall.share:.1%} of the vehicles; share by cell."
-    bar = ColourBar(0.0, 100.0, "Share of the vehicles that is missed (%)", even=True)
+    bar = ColourBar(0.0, 100.0, "Share of vehicles missed (%)", even=True)
     return plan.svg(parts, alt, bar)
 
 

@@ -55,11 +55,11 @@ _OPTIONAL_FILES = (
 )
 
 _UNMODELLED = (
-    ("the occlusion of vehicles by each other in the EGVS", "moving_occlusion"),
+    ("occlusion between vehicles (in the EGVS)", "moving_occlusion"),
     ("rain", "rain"),
     ("fog", "fog"),
-    ("the attenuation of beams with distance", "range_limit"),
-    ("foliage that lets some light through", "foliage"),
+    ("attenuation of beams with distance", "range_limit"),
+    ("partly transparent foliage", "foliage"),
     ("pedestrians and cyclists", "pedestrians_bicycles"),
     ("dirt and glare", ""),
 )

@@ -219,7 +219,7 @@ class Ranking:
         """Read ``scores.parquet``; InputError if it has no site."""
         sites = tuple(sorted(RankedSite.read(path), key=lambda site: site.rank))
         if not sites:
-            raise InputError(path, "expected at least one site, got none", "Run the score stage again")
+            raise InputError(path, "expected at least one site, got none", "Run the score stage again.")
         best = tuple(site for site in sites if site.rank == 1)
         near = (1 - CLOSE_SHARE) * best[0].score
         return cls(sites, best, tuple(site for site in sites if site.rank > 1 and site.score >= near > 0))
@@ -301,10 +301,10 @@ def headline(ranking: Ranking, has_traffic: bool) -> str:
             return text
         return f"{text}: each {result}"
     if len(best) > 4:
-        return f"{top.site} and {len(best) - 1} others share the first place of {count}: {top.site} {result}"
+        return f"{top.site} and {len(best) - 1} others share first place among {count} sites: {top.site} {result}"
     if len(best) > 1:
         names = join_names([site.site for site in best])
-        return f"{names} share the first place of {count}: {top.site} {result}"
+        return f"{names} share first place among {count} sites: {top.site} {result}"
     text = f"{top.site} is the best of {count} sites"
     return text if by_egvs else f"{text}: it {result}"
 
@@ -321,7 +321,7 @@ def lead(ranking: Ranking) -> str:
     else:
         text = f"They lead the next site, {second.site}, by {gap_text} of their score."
     if not ranking.best[-1].is_separable:  # ``beats_next`` of the last of the best refers to the second
-        text += " This much traffic is not enough to tell which of them is better."
+        text += " There is too little traffic to tell which of them is better."
     if len(ranking.close) > 1:
         names = ", ".join(site.site for site in ranking.close[:4])
         if len(ranking.close) > 4:

@@ -121,7 +121,7 @@ class DetectorSummary:
                 compared += 1
                 agreeing += (egvs > other_egvs) == (detected > other_detected)
         if math.isnan(self.tau.value) or not compared:
-            return f"{_count_sites(len(values))} with values: too few, or too similar, to compare the two orders."
+            return f"{_count_sites(len(values))} with values: too few, or too similar, to compare the two rankings."
         interval = ""
         if not math.isnan(self.tau.low):
             interval = f", 95 % confidence interval {self.tau.low:.2f} to {self.tau.high:.2f}"
@@ -136,7 +136,7 @@ class DetectorSummary:
             return ""
         count = _count_sites(sum(site.value is not None for site in self.sites.values()))
         if math.isnan(self.tau.low):
-            verdict = f"From {count} it cannot be said how certain this is."
+            verdict = f"{count} are too few to say how certain this is."
         elif self.tau.low <= 0.0 <= self.tau.high:
             verdict = f"{count} are too few to tell: the interval includes 0, so the agreement may be chance."
         elif self.tau.low > 0.0:
@@ -274,7 +274,7 @@ def _describe_evidence(noun: str, egvs: str, rho: Mapping[str, Mapping[str, floa
     if all(is_better):
         better = noun
     elif any(is_better):
-        better = "neither of the two"
+        better = "neither of the two consistently"
     else:
         better = "the EGVS"
     values = join_names([f"{recommended[name]:.2f} against {this_egvs[name]:.2f} ({name})" for name in detectors])

@@ -231,7 +231,7 @@ def _check_plugin_parameters(name: str, values: object) -> EffectParameters:
     known = list(dict.fromkeys([*EffectsConfig.BUILT_IN, *plugins.plugin_names(GROUP)]))
     if name not in known:
         similar = difflib.get_close_matches(name, known, 1, 0.4)
-        hint = f"Did you mean {similar[0]}?" if similar else f"Known effects: {', '.join(known)}"
+        hint = f"Did you mean {similar[0]}?" if similar else f"Known effects are {', '.join(known)}."
         raise PydanticCustomError("unknown_effect", "unknown effect", {"name": name, "hint": hint})
     if isinstance(values, EffectParameters):
         return values

@@ -98,13 +98,13 @@ def _check_header(path: Path, names: list[str]) -> None:
                 raise InputError(path, f"the columns are separated by {separator!r}", hint)
     duplicates = sorted({name for name in names if names.count(name) > 1})
     if duplicates:
-        raise InputError(path, f"the column {duplicates[0]!r} occurs twice", "Name each column once.")
+        raise InputError(path, f"the column {duplicates[0]!r} occurs twice", "Use each column name once.")
 
 
 def read_geojson(path: Path, world: Georeference) -> Iterator[SiteRow]:
     """Yield the features of a GeoJSON file as rows; InputError with file and feature for a malformed one."""
     expected = "a FeatureCollection of Points"
-    document = read_json(path, expected)
+    document = read_json(path, f"Use {expected}.")
     if not isinstance(document, dict) or not isinstance(document.get("features"), list):
         raise InputError(path, f"expected {expected}, got {reprlib.repr(document)[:120]}")
     coordinates = geojson_coordinates(document["features"])
@@ -129,7 +129,7 @@ def _feature_columns(where: str, feature: Any, reading: CoordinateReading) -> di
         if value is None:
             continue
         if isinstance(value, str) and key != "site":
-            raise InputError(f"{where}: {key}", f"expected a number as coordinate, got the text {value!r}")
+            raise InputError(f"{where}: {key}", f"expected a numeric coordinate, got the text {value!r}")
         if reading.convert is not None and _coordinates_match(row.get(key), value):
             continue  # a GIS carried the unrounded value along as a property: keep it
         if row.get(key, value) not in (None, value):
@@ -264,7 +264,7 @@ def user_columns(where: str, row: Mapping[str, Any], known: Collection[str]) -> 
     misspelling = find_misspelling(row, known)
     if misspelling is not None:
         name, meant = misspelling
-        hint = f"Did you mean {meant}? A column of your own may have any name that is less similar."
+        hint = f"Did you mean {meant}? A custom column needs a less similar name."
         raise InputError(where, f"unknown column {name!r}", hint)
     columns: dict[str, ColumnValue] = {}
     for name, value in row.items():

@@ -152,7 +152,7 @@ def run_accuracy_study(
         If the options do not fit the scenario, or intermediate results were altered.
     """
     if not 1e-6 <= options.tolerance <= 1:
-        raise InputError("--tolerance", f"expected a share from 1e-6 to 1, got {options.tolerance:g}", "Try 0.02")
+        raise InputError("--tolerance", f"expected 1e-6 to 1, got {options.tolerance:g}", "Use 0.02, for example.")
     check_no_overwrite(load(path, overrides), out, (measurement.STUDY_FOLDER,))
     with lock_run_folder(out):
         runner = SettingRunner(path, overrides, out, options.jobs, progress)
@@ -170,7 +170,7 @@ def run_accuracy_study(
 def _check_traffic(scenario: Scenario, seeds: int) -> None:
     """Reject scenarios and numbers of seeds that tell nothing about standard errors."""
     if seeds and scenario.is_recorded:
-        problem = "the traffic is a finished file, the same for each seed"
+        problem = "the traffic is a finished file, so it is the same for every seed"
         raise InputError("--seeds", problem, "Use network or sumocfg in [traffic].")
     if seeds and scenario.score.rank_by != "egvs":
         problem = f"seeds are compared by EGVS only, but score.rank_by is {scenario.score.rank_by!r}"

@@ -54,7 +54,7 @@ _MAX_ROWS_PER_BYTE = 10
 """Positions and angles that change take at least a bit per row."""
 
 EXPECTED_FCD = (
-    "Use FCD with the attributes id, x, y, angle and type (--fcd-output.attributes id,x,y,z,angle,slope,type,speed)."
+    "Use FCD data with the attributes id, x, y, angle, type (--fcd-output.attributes id,x,y,z,angle,slope,type,speed)."
 )
 
 _GEO_HINT = "Set traffic.fcd_geo = true for longitude and latitude (--fcd-output.geo); without it, x and y are metres."
@@ -214,7 +214,7 @@ def _check_rows(metadata: Any, path: Path) -> None:
     """Raise an InputError if a Parquet file declares more rows than it can contain."""
     groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
     largest = max((group.total_byte_size for group in groups), default=0)
-    limits.UNPACKED.check_bytes(path, largest, f"has a row group of {largest / limits.MB:,.0f} MB, unpacked")
+    limits.UNPACKED.check_bytes(path, largest, f"has a row group of {largest / limits.MB:,.0f} MB after decompression")
     packed = sum(group.column(i).total_compressed_size for group in groups for i in range(group.num_columns))
     if metadata.num_rows > _MAX_ROWS_PER_BYTE * packed:
         raise InputError(path, f"declares {metadata.num_rows:,} rows in {packed:,} bytes", _COMPLETE_FILE)
@@ -460,7 +460,7 @@ class _FrameBuffer:
         if self.window.complete:
             return
         if self.first_ms is None:
-            raise InputError(self.where, "the file has no vehicle", EXPECTED_FCD)
+            raise InputError(self.where, "the file contains no vehicles", EXPECTED_FCD)
         check_span(self.window, self.last_ms - self.first_ms, self.step_ms, self.time_steps, self.where)
 
 
@@ -492,7 +492,7 @@ def check_span(
     period_s = window.period_ms / 1000
     if step_ms and window.period_ms % step_ms:
         problem = f"the time steps of {file} are {step_ms / 1000:g} s apart"
-        raise InputError(f"{where}: frame_period_s = {period_s:g}", problem, "Use a multiple of them.")
+        raise InputError(f"{where}: frame_period_s = {period_s:g}", problem, "Use a multiple of that.")
     available = max(0, duration_ms // window.period_ms + 1)
     if available < window.count:
         problem = (

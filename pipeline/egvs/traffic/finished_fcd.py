@@ -73,7 +73,7 @@ def read_fcd_metadata(path: Path) -> FcdMetadata | None:
     raw = fcd.fcd_metadata(path) if path.is_file() else None
     if raw is None:
         return None
-    hint = "Use an unaltered file; create it again."
+    hint = "Use the original file, or create it again."
     try:
         values: Any = reading.parse_json(raw)
     except (ValueError, RecursionError) as error:
@@ -187,7 +187,7 @@ def check_types(scenario: Scenario, types: Collection[str], declared: Mapping[st
     missing = sorted(set(types) - known - _DEFAULT_TYPES)
     if missing:
         names = ", ".join(map(repr, missing))
-        problem = f"the size of vehicle types of {scenario.traffic.fcd} is unknown: {names}"
+        problem = f"unknown sizes of vehicle types of {scenario.traffic.fcd}: {names}"
         hint = (
             "Add a kind of each name with length_m, width_m and height_m, or the SUMO file with their <vType> to vtypes"
             f" (known: {', '.join(sorted(known))})."
@@ -308,7 +308,7 @@ def survey_fcd(path: Path, until_ms: int | None = None) -> FcdSurvey:
         if until_ms is not None and last_ms > first_ms + until_ms:
             break
     if first_ms is None:
-        raise InputError(path, "the file has no vehicle", fcd.EXPECTED_FCD)
+        raise InputError(path, "the file contains no vehicles", fcd.EXPECTED_FCD)
     return FcdSurvey(last_ms - first_ms, time_steps, step_ms, frozenset(types))
 
 

@@ -129,8 +129,8 @@ def record_traffic(
         When ``traci`` is given for a finished file, or an extension does not support the scenario.
     """
     if scenario.traffic.fcd is not None and traci is not None:
-        hint = "Name a network or a sumocfg in [traffic] instead."
-        raise InputError("--traci", "the scenario names a finished FCD file", hint)
+        hint = "Set network or sumocfg in [traffic] instead."
+        raise InputError("--traci", "the scenario uses a finished FCD file", hint)
     for extension in extensions:
         error = extension.scenario_error(scenario)
         if error is not None:
@@ -172,7 +172,7 @@ def _record_simulated(
             sizes |= extension.sizes()
         duration_s = round(simulate(prepared, progress), 3)
     except sumo.SumoInputError as error:
-        hint = "Correct these files, of which SUMO read copies."
+        hint = "Correct these files; SUMO read copies of them."
         raise InputError(where, f"SUMO cannot run {sources}: {error}", hint) from None
     else:
         collisions = _read_collisions(prepared)
@@ -298,10 +298,10 @@ def _check_clock(connection: Any, timing: Timing, address: str) -> None:
     now_ms = round(connection.simulation.getTime() * 1000)
     first_frame = f"the first frame at {timing.first_ms / 1000:g} s"
     if now_ms > timing.first_ms:
-        hint = "Restart it, or set a longer traffic.warmup_s"
-        raise RunError(f"{where}: SUMO is at {now_ms / 1000:g} s already, after {first_frame}. {hint}")
+        hint = "Restart it, or set a longer traffic.warmup_s."
+        raise RunError(f"{where}: SUMO is already at {now_ms / 1000:g} s, after {first_frame}. {hint}")
     if (timing.first_ms - now_ms) % timing.step_ms:
-        raise RunError(f"{where}: steps of {step_s:g} s from {now_ms / 1000:g} s on do not reach {first_frame}")
+        raise RunError(f"{where}: steps of {step_s:g} s from {now_ms / 1000:g} s on do not hit {first_frame}")
 
 
 class _FcdRow(NamedTuple):
@@ -474,7 +474,7 @@ def _collision_warning(collisions: dict[tuple[str, str], Collision], scenario: S
         locations.append(f"{number} at {location}{distance}")
     pairs = "a pair" if len(collisions) == 1 else f"{len(collisions)} pairs"
     problem = f"{pairs} of vehicles collided and drove through each other: {', '.join(locations)}"
-    hint = "Check right of way, signals, and the space for waiting on the junctions there, in sumo-gui."
+    hint = "In sumo-gui, check right of way, signals and the waiting space on the junctions there."
     return [Diagnostic("collisions", sumo_folder.traffic_location(scenario), problem, hint)]
 
 

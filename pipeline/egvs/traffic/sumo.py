@@ -64,7 +64,7 @@ def sumo_binary(name: str) -> Path:
     with _preserve_proj_data():
         program = shutil.which(sumolib.checkBinary(name))
     if program is None:
-        raise MissingBackendError(f"SUMO's program {name!r} was not found. Set SUMO_HOME, or pip install eclipse-sumo")
+        raise MissingBackendError(f"SUMO's {name!r} was not found. Set SUMO_HOME, or run pip install eclipse-sumo")
     return Path(program)
 
 
@@ -291,7 +291,7 @@ def connect_traci(host: str, port: int) -> Iterator[Any]:
     where = f"--traci {host}:{port}"
     connection = _connect(host, port)
     if connection is None:
-        raise InputError(where, "no SUMO answers there", "Start one with --remote-port first.")
+        raise InputError(where, "no SUMO simulation answers there", "Start SUMO with --remote-port first.")
     try:
         try:
             connection.getVersion()

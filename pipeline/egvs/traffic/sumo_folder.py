@@ -326,7 +326,7 @@ def _make_empty(folder: Path, inputs: Iterable[Path]) -> None:
     for path in inputs:
         if path.resolve().is_relative_to(folder.resolve()):
             hint = "Use another --out, or move the file."
-            raise InputError(path, "an input file is in the folder that is emptied for SUMO", hint)
+            raise InputError(path, "an input file is in a folder that egvs empties for SUMO", hint)
     if folder.is_symlink():
         folder.unlink()
     elif folder.exists():
@@ -418,7 +418,7 @@ def _convert_osm_once(path: Path, _content: str) -> bytes:
         try:
             sumo.run_netconvert(["--osm-files", MAP_FILE, *_OSM_FLAGS], folder, NETWORK_FILE)
         except sumo.SumoInputError as error:
-            problem = f"no network can be made of this map: {error}"
+            problem = f"no network can be built from this map: {error}"
             raise InputError(path, problem, "Download the map again, in full.") from None
         return (folder / NETWORK_FILE).read_bytes()
 

@@ -158,7 +158,7 @@ def boxes_from_bumpers(
     duplicates = np.flatnonzero((np.diff(frame) == 0) & (np.diff(code) == 0))
     if duplicates.size:
         row = duplicates[0]
-        problem = f"vehicle {names[code[row]]!r} is twice in frame {frame[row]}"
+        problem = f"vehicle {names[code[row]]!r} occurs twice in frame {frame[row]}"
         raise InputError(where, problem, "Write one row per vehicle and frame.")
 
     kinds = sorted({sizes[name].vclass for name in types})

@@ -252,16 +252,16 @@ def read_body(path: Path, where: str) -> tuple[MeshPart, ...]:
     mesh = meshes.load_mesh(path, where)
     if len(mesh.faces) > MAX_TRIANGLES:
         problem = f"expected at most {MAX_TRIANGLES:,} triangles, got {len(mesh.faces):,}"
-        raise InputError(where, problem, "Simplify the mesh")
+        raise InputError(where, problem, "Simplify the mesh.")
     triangles = np.asarray(mesh.vertices, dtype=np.float64)[mesh.faces]
     if not np.isfinite(triangles).all():
-        raise InputError(where, "a corner of a triangle is not finite", "Use finite coordinates")
+        raise InputError(where, "a triangle has a non-finite vertex", "Use finite coordinates.")
     low = triangles.min(axis=(0, 1))
     high = triangles.max(axis=(0, 1))
     flat_axes = ["xyz"[axis] for axis in range(3) if not high[axis] > low[axis]]
     if flat_axes:
         problem = f"the mesh has no extent along {', '.join(flat_axes)}"
-        raise InputError(where, problem, "Use a mesh with a length, a width and a height")
+        raise InputError(where, problem, "Use a mesh with a length, a width and a height.")
 
     unit = np.clip((triangles - low) / (high - low), 0.0, 1.0) - 0.5
     unit = unit[np.lexsort(np.floor(unit.mean(axis=1) * 4).T)]  # neighbours share a part, so that its box is small
@@ -324,7 +324,7 @@ def check_no_measured_scan(site: Site) -> None:
     """Raise an InputError for a site with a measured scan, which does not contain the beams without a return."""
     if site.points is not None:
         problem = f"its empty scan was measured ({site.points}), and does not contain the beams without a return"
-        raise InputError(f"site {site.name}", problem, "Use a site without points, so that its empty scan is simulated")
+        raise InputError(f"site {site.name}", problem, "Use a site without points; its empty scan is simulated.")
 
 
 @dataclass(frozen=True)

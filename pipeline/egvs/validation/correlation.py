@@ -345,7 +345,7 @@ class Correlation:
             warnings.append(Diagnostic("correlation", location, problem, ""))
         if self.why:
             missing = "no interval" if math.isfinite(self.value) else "no correlation"
-            hint = "Use more sites, or sites that differ more"
+            hint = "Use more sites, or sites that differ more."
             warnings.append(Diagnostic("correlation", location, f"{missing}: {self.why}", hint))
         return warnings
 

@@ -152,7 +152,7 @@ def frame_blocks(frames: int, blocks: int = BLOCKS) -> IntArray:
     """
     if frames < blocks:
         problem = f"expected at least {blocks} frames, got {frames}"
-        raise InputError("--frames", problem, f"Standard errors are computed from {blocks} blocks of frames")
+        raise InputError("--frames", problem, f"Standard errors are computed from {blocks} blocks of frames.")
     return np.arange(frames, dtype=np.int64) * blocks // frames
 
 
@@ -326,7 +326,7 @@ def _check_detections(frame: IntArray, boxes: FloatArray, scores: FloatArray) ->
         name = (*BOX_COLUMNS, "score")[column]
         expected = "a length of at least 0" if 3 <= column < 6 else "a finite number"
         problem = f"{name}: expected {expected}, got {values[row, column]:g}"
-        raise InputError(where, problem, "Correct the output of the detector")
+        raise InputError(where, problem, "Correct the output of the detector.")
 
 
 @dataclass(frozen=True)
@@ -403,7 +403,7 @@ class Evaluation:
                 problem = f"all {subset.label} are in one of {len(counts)} blocks of frames: no standard error"
             else:
                 continue
-            warnings.append(Diagnostic("average precision", location, problem, "Use more frames"))
+            warnings.append(Diagnostic("average precision", location, problem, "Use more frames."))
         return warnings
 
 

@@ -108,7 +108,7 @@ class TrainingJunction:
             if self._is_free(pose, sensor):
                 return pose
         problem = "there is no free position for a pole around the region"
-        raise InputError(f"{scene.scenario.file}: roi", problem, "Use a region with space beside its roads")
+        raise InputError(f"{scene.scenario.file}: roi", problem, "Use a region with space beside its roads.")
 
     def _is_free(self, pose: Pose, sensor: Sensor) -> bool:
         scene = self.record.scene
