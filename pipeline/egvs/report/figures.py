@@ -132,8 +132,9 @@ def draw_figures(work: StageContext, ranking: Ranking, choosable: Sequence[Ranke
     """Draw the figures of a run; views are made of the ``choosable`` sites."""
     backdrop = make_backdrop(work, ranking, tpog)
     scorer = Scorer(work.scene, tpog, work.folder.trajectories)
-    occupancy = occupancy_map(tpog, ranking, backdrop) if tpog.counts.any() else ""
-    views = None
+    occupancy, views = "", None
+    if tpog.counts.any():
+        occupancy = occupancy_map(tpog, ranking, backdrop)
     if len(scorer.field.cells):
         views = site_views(work, ranking, choosable, scorer, backdrop)
     return Figures(occupancy, sites_map(tpog, ranking, backdrop), views, backdrop)

@@ -164,7 +164,8 @@ class MapFrame:
         style: FigureStyle = PAGE_STYLE,
     ) -> None:
         self.box, self.prefix, self.width, self.north, self.style = box, prefix, width, north, style
-        self._x_ticks = round_values(box[0], box[2], 9 if width > 600 else 6)
+        max_x_ticks = 9 if width > 600 else 6
+        self._x_ticks = round_values(box[0], box[2], max_x_ticks)
         self._y_ticks = round_values(box[1], box[3], 6)
         self._y_tick_width = 7.0 * max(len(tick.text) for tick in self._y_ticks)
         self.left = 34.0 + self._y_tick_width
@@ -218,7 +219,13 @@ class MapFrame:
             A colour bar below the map.
         """
         base = self.top + self.frame_height
-        height = base + 40.0 + (56.0 if bar else 0.0)
+        height = base + 40.0
+        colour_bar = north_arrow = ""
+        if bar:
+            height += 56.0
+            colour_bar = bar.svg(self.prefix, self.left, base + 46.0, self.frame_width, self.style)
+        if self.north:
+            north_arrow = self._north_arrow()
         position = f'x="{self.left:.1f}" y="{self.top:.1f}"'
         frame = f'<rect {position} width="{self.frame_width:.1f}" height="{self.frame_height:.1f}"/>'
         clip = f'<clipPath id="{self.prefix}-clip">{frame}</clipPath>'
@@ -226,8 +233,8 @@ class MapFrame:
         lines = [
             svg_start(self.width, height, alt, self.style),
             f'<defs>{clip}</defs>{self._axes(base)}\n<g clip-path="url(#{self.prefix}-clip)">{drawing}</g>',
-            self._north_arrow() if self.north else "",
-            bar.svg(self.prefix, self.left, base + 46.0, self.frame_width, self.style) if bar else "",
+            north_arrow,
+            colour_bar,
             "</svg>",
         ]
         return "\n".join(lines)
@@ -308,7 +315,9 @@ class ColourBar:
         for value in sorted({tick.value for tick in ticks}, reverse=True):
             text = f"{value:,.6g}"
             share = (value - self.low) / span
-            tick_x = x + width * (share if self.even else math.sqrt(share))
+            if not self.even:
+                share = math.sqrt(share)
+            tick_x = x + width * share
             if all(abs(tick_x - other.value) > 5.0 * (len(text) + len(other.text)) for other in placed):
                 placed.append(Tick(tick_x, text))
         return placed
@@ -365,7 +374,9 @@ def sensor_count_chart(steps: Sequence[CurveStep], alt: str) -> str:
         y = base - height * value / 100.0 / top
         parts.append(f'<path class="grid" d="M{_CURVE_LEFT:.1f} {y:.1f}h{width:.1f}"/>')
         parts.append(_text(_CURVE_LEFT - 8, y + 4, f"{value:g} %", "end"))
-    label_step = 1 if len(steps) <= _MAX_LABELS else 1 + len(steps) // _MAX_LABELS
+    label_step = 1
+    if len(steps) > _MAX_LABELS:
+        label_step += len(steps) // _MAX_LABELS
     for i, step in enumerate(steps):
         x, bar = _CURVE_LEFT + i * spacing, height * step.share / top
         bound = base - height * step.bound / top
