@@ -202,9 +202,8 @@ def mark_pareto_front(rows: list[SettingResult], tolerance: float) -> list[Setti
         Largest error of the recommended setting.
     """
     candidates = [row for row in rows if row.kind in (APPROXIMATES, SCENARIO)]
-    accurate = sorted(
-        (row for row in candidates if row.judged <= tolerance), key=lambda row: (row.seconds, row.setting)
-    )
+    accurate = [row for row in candidates if row.judged <= tolerance]
+    accurate.sort(key=lambda row: (row.seconds, row.setting))
     recommended = None
     if accurate:
         recommended = _recommended(accurate).setting
