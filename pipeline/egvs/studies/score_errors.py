@@ -101,6 +101,9 @@ def compare_setting(
     error_rms = error
     if 0 < error < math.inf:
         error_rms = error * float(np.sqrt(np.mean((changes / error) ** 2)))
+    judged = error
+    if could_last_longer:
+        judged = max(error, error_se)
     return SettingResult(
         setting=setting.name,
         kind=setting.kind,
@@ -121,7 +124,7 @@ def compare_setting(
         error_se=error_se,
         error_rms=error_rms,
         own_change=float(relative_errors(shares, np.array(baseline.shares)).max(initial=0.0)),
-        judged=max(error, error_se) if could_last_longer else error,
+        judged=judged,
         tau=rank_agreement(shares, reference_shares, "tau"),
         rho=rank_agreement(shares, reference_shares, "rho"),
         best_kept=best_sites(shares, 1) == best_sites(reference_shares, 1),
