@@ -180,7 +180,10 @@ def print_comparison(comparison: Comparison, top: int | None = None) -> None:
 
 def _fit_to_width(runs: Sequence[ComparedRun], width: int) -> list[Sequence[ComparedRun]]:
     """Divide runs into tables that fit the width; the first run is in each table, to compare others with it."""
-    widest_run = max(sum(_column_width(column) for column in _run_columns(run, width)) for run in runs)
+    widest_run = 0
+    for run in runs:
+        widths = [max(len(column.title), 8) + _COLUMN_GAP for column in _run_columns(run, width)]
+        widest_run = max(widest_run, sum(widths))
     sites = [site for run in runs for site in run.sites.values()]
     used = 0
     if sites:
@@ -194,10 +197,6 @@ def _fit_to_width(runs: Sequence[ComparedRun], width: int) -> list[Sequence[Comp
     first, others = runs[:1], runs[1:]
     step = runs_per_table - 1
     return [(*first, *others[start : start + step]) for start in range(0, len(others), step)]
-
-
-def _column_width(column: Column[Any]) -> int:
-    return max(len(column.title), 8) + _COLUMN_GAP
 
 
 def _run_columns(run: ComparedRun, width: int) -> list[Column[str]]:

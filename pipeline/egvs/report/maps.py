@@ -121,7 +121,8 @@ def site_map(
     plan = _sites_frame(extent(grid, sites), "sites", style)
     stacks = _stack_sites(sites)
     crowded = is_crowded(sites)
-    low, high = min(site.score for site in sites), max(site.score for site in sites)
+    scores = [site.score for site in sites]
+    low, high = min(scores), max(scores)
     street_names, street_boxes = _street_names(plan, backdrop.roads.names, sites)
     radius = 8.5
     labelled = stacks
@@ -205,10 +206,9 @@ def site_view(
 def scan_view(grid: Grid, image: IndexedImage, view: SiteViewFigure, prefix: str, alt: str) -> str:
     """Return where the beams of an empty scan end, from above; ``image`` covers the box of the view."""
     plan = site_view_frame(view.box, prefix)
-    images = [
-        plan.image(plan.full_extent, image.uri(colours.DOT_PALETTES[theme]), f"field {theme}")
-        for theme in colours.THEMES
-    ]
+    images = []
+    for theme in colours.THEMES:
+        images.append(plan.image(plan.full_extent, image.uri(colours.DOT_PALETTES[theme]), f"field {theme}"))
     outlines = _outline_paths(plan, view.backdrop.outlines)
     return plan.svg([outlines, *images, plan.roi(grid), _sensor_mark(plan, view.site)], alt)
 
@@ -261,10 +261,9 @@ def _field_image(plan: MapFrame, grid: Grid, values: ColumnValues, peak: float) 
     if not peak > 0:
         return ""
     image, rectangle = colours.field_image(values, peak), plan.region(grid)
-    images = [
-        plan.image(rectangle, image.uri(colours.FIELD_PALETTES[theme]), f"field {theme}")
-        for theme in plan.style.image_themes
-    ]
+    images = []
+    for theme in plan.style.image_themes:
+        images.append(plan.image(rectangle, image.uri(colours.FIELD_PALETTES[theme]), f"field {theme}"))
     return "".join(images)
 
 
@@ -302,10 +301,9 @@ def _street_names(plan: MapFrame, names: Sequence[StreetName], sites: Sequence[M
         angle, half = math.atan2(y1 - y0, x1 - x0), 3.3 * len(name.text) + 4.0
         for along in _STREET_NAME_POSITIONS:
             x, y = x0 + along * (x1 - x0), y0 + along * (y1 - y0)
-            boxes = [
-                _square(x + offset * math.cos(angle), y + offset * math.sin(angle), 7.0)
-                for offset in np.arange(-half, half, 7)
-            ]
+            boxes = []
+            for offset in np.arange(-half, half, 7):
+                boxes.append(_square(x + offset * math.cos(angle), y + offset * math.sin(angle), 7.0))
             if all(_is_free(box, plan, [*site_boxes, *covered]) for box in boxes):
                 covered += boxes
                 position = f'transform="translate({x:.1f} {y:.1f}) rotate({math.degrees(angle):.1f})" dy="4"'
@@ -423,11 +421,9 @@ def _label_spots(plan: MapFrame, spots: Sequence[LabelSpot], circles: Sequence[B
     covered, drawn = list(circles), []
     for spot in spots:
         near = spot.radius + _LABEL_GAP
-        options = [
-            (distance, _label_box(spot, distance, side))
-            for distance in (near, near + 12, near + 26, near + 42)
-            for side in _LABEL_SIDES
-        ]
+        options = []
+        for distance in (near, near + 12, near + 26, near + 42):
+            options += [(distance, _label_box(spot, distance, side)) for side in _LABEL_SIDES]
         inside = [option for option in options if _within(option[1], plan)] or options
         distance, box = min(inside, key=lambda option: sum(_overlap(option[1], other) for other in covered))
         covered.append(box)

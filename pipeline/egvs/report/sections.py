@@ -417,11 +417,15 @@ class PlacementSummary:
     @property
     def share(self) -> float:
         """Joint score as a share of that of all candidates together."""
-        return self.joint / self.together if self.together else 0.0
+        if not self.together:
+            return 0.0
+        return self.joint / self.together
 
     def lost(self, pick: PlanRow) -> float:
         """Return the share of the joint score that is lost if a sensor fails."""
-        return pick.loss / self.joint if self.joint else 0.0
+        if not self.joint:
+            return 0.0
+        return pick.loss / self.joint
 
 
 def _curve(rows: Sequence[Mapping[str, Any]], together: float) -> tuple[CurveRow, ...]:

@@ -296,10 +296,9 @@ class ColourBar:
         axis = style.shape("axis")
         position = f'x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="12"'
         bar = f'<rect {axis} style="fill:url(#{prefix}-scale)" {position}/>'
-        ticks = [
-            f'<path {axis} d="M{tick_x:.1f} {y + 12:.1f}v4"/>{_text(tick_x, y + 28, text)}'
-            for tick_x, text in self._ticks(x, width)
-        ]
+        ticks = []
+        for tick_x, text in self._ticks(x, width):
+            ticks.append(f'<path {axis} d="M{tick_x:.1f} {y + 12:.1f}v4"/>{_text(tick_x, y + 28, text)}')
         note = "" if self.even else " · square-root scale"
         position = f'x="{x + width / 2:.1f}" y="{y + 44:.1f}"'
         title = f'<text class="title" {position} text-anchor="middle">{escape(self.label)}{note}</text>'
@@ -426,7 +425,8 @@ def bar_chart(bars: Sequence[Bar], label: str, alt: str, factor: float = 1.0, st
     left = 16.0 + 7.0 * max(len(name) for name in names)
     width, height = style.width - left - _BARS_MARGIN, _BAR_SPACING * len(bars)
     most = max(bar.value + (bar.se or 0.0) for bar in bars) or 1.0
-    low, high = min(bar.value for bar in bars), max(bar.value for bar in bars)
+    values = [bar.value for bar in bars]
+    low, high = min(values), max(values)
     base = _BARS_TOP + height
     parts = [svg_start(style.width, base + _BARS_BOTTOM, alt, style)]
     for value, text in round_values(0.0, most * factor, max(2, int(width // 70))):

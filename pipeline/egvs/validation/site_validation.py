@@ -225,9 +225,9 @@ def _site_metadata(
     metadata["stages"] = _stage_keys(scenario, run.folder / "scores")
     metadata["own_score"] = {"score": egvs.score, "parameters": egvs.parameters}
     if external:
-        metadata["given"] = {
-            site: {name: boxes.digest for name, boxes in by_detector.items()} for site, by_detector in external.items()
-        }
+        metadata["given"] = {}
+    for site, by_detector in external.items():
+        metadata["given"][site] = {name: boxes.digest for name, boxes in by_detector.items()}
     return metadata
 
 
