@@ -54,11 +54,6 @@ def column_names(artefact: str) -> tuple[str, ...]:
     return tuple(column["name"] for column in _table_schema(artefact)["fields"])
 
 
-def allows_extra_columns(artefact: str) -> bool:
-    """Whether an artefact may have columns that its schema does not name (``"partial"`` in Table Schema)."""
-    return "partial" in _table_schema(artefact).get("fieldsMatch", ())
-
-
 @cache
 def arrow_schema(artefact: str, optional: tuple[str, ...] = ()) -> pa.Schema:
     """Return the Arrow schema of an artefact: its required columns, and those named in ``optional``; no nulls."""
@@ -229,7 +224,7 @@ def _check_columns(path: Path, artefact: str, schema: pa.Schema) -> None:
         if index < 0 and column.name in required:
             raise InputError(path, f"the column {column.name!r} is missing", hint)
     unknown = sorted(set(schema.names) - set(known.names))
-    if unknown and not allows_extra_columns(artefact):
+    if unknown and "partial" not in _table_schema(artefact).get("fieldsMatch", ()):
         raise InputError(path, f"unknown columns {', '.join(unknown)}", hint)
 
 

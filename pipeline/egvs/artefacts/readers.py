@@ -314,10 +314,7 @@ class PeriodRanking:
         sites = []
         for row in sorted(read_scores(run_folder.scores).to_pylist(), key=lambda row: int(row["rank"])):
             sites.append(SitePeriodRanks(row["site"], row["rank"], tuple(ranks[row["site"]])))
-        total_weight = sum(period.weight for period in periods)
-        return cls(
-            tuple(period.name for period in periods),
-            tuple(period.weight / total_weight for period in periods),
-            sum(period.frames for period in periods),
-            tuple(sites),
-        )
+        names = tuple(period.name for period in periods)
+        weights = [period.weight for period in periods]
+        shares = tuple(weight / sum(weights) for weight in weights)
+        return cls(names, shares, sum(period.frames for period in periods), tuple(sites))

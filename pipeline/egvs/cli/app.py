@@ -467,7 +467,9 @@ def new(
     from egvs.cli import run_tables
     from egvs.importers import openstreetmap
 
-    location = cli_options.latitude_and_longitude(at) if at is not None else None
+    location = None
+    if at is not None:
+        location = cli_options.latitude_and_longitude(at)
     surroundings_m: float | None = openstreetmap.SURROUNDINGS_M
     if surroundings is not None:
         surroundings_m = cli_options.radius_m(surroundings)

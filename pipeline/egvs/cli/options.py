@@ -42,10 +42,11 @@ def duration_s(text: str, option: str = "--budget") -> float:
 def heights_m(text: str) -> tuple[float, float]:
     """Return the two heights of ``--heights LOW,HIGH`` in metres."""
     match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?),([0-9]+(?:\.[0-9]+)?)", text)
-    low, high = (float(match[1]), float(match[2])) if match else (0.0, 0.0)
-    if not 0 < low <= high <= 100:
-        raise InputError("--heights", f"expected LOW,HIGH in metres, got {text!r}", "Use heights such as 2,7.")
-    return low, high
+    if match:
+        low, high = float(match[1]), float(match[2])
+        if 0 < low <= high <= 100:
+            return low, high
+    raise InputError("--heights", f"expected LOW,HIGH in metres, got {text!r}", "Use heights such as 2,7.")
 
 
 def model_file(path: Path) -> Path:

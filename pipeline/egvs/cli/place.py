@@ -89,7 +89,7 @@ def _sensor_table(placed: Placement) -> Table:
     from egvs.cli.console import Column, make_table
 
     columns: list[Column[PlannedSensor]] = [
-        Column("", lambda row: f"{row.order}*" if row.forced else str(row.order)),
+        Column("", lambda row: row.marked_order),
         Column("site", lambda row: row.site, "left"),
         Column("z m", lambda row: f"{row.z_m:g}"),
         Column("yaw deg", lambda row: f"{row.yaw_deg:.1f}"),
@@ -165,9 +165,11 @@ def _describe_proof(placed: Placement) -> str:
 
 def describe_refinement(placed: Placement, summary: RefinementSummary) -> str:
     """Return what the refinement of poses changed."""
-    change = f" ({placed.joint / summary.joint_before - 1.0:+.1%})" if summary.joint_before > 0 else ""
-    cost = f", for {placed.cost:g}" if placed.cost else ""
-    objective = ""
+    change = cost = objective = ""
+    if summary.joint_before > 0:
+        change = f" ({placed.joint / summary.joint_before - 1.0:+.1%})"
+    if placed.cost:
+        cost = f", for {placed.cost:g}"
     if (summary.value_before, summary.value_after) != (summary.joint_before, placed.joint):
         objective = f"; objective {summary.value_before:.6g} before, {summary.value_after:.6g} after"
     return (

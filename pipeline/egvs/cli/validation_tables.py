@@ -74,9 +74,10 @@ def _format_source(entry: ScoreEntry) -> str:
 
 def _format_sweep(entry: ScoreEntry) -> str:
     """Return the values of each parameter that the validation tries."""
+    if entry.score is None:
+        return ""
     parts = []
-    sweep = {} if entry.score is None else entry.score.sweep
-    for name, values in sweep.items():
+    for name, values in entry.score.sweep.items():
         parts.append(f"{name} {', '.join(map(_format_parameter, values))}")
     return "; ".join(parts)
 
@@ -163,7 +164,7 @@ def print_plan_validation(validation: PlanValidation) -> None:
             measures, gain_measure = _POINT_COLUMNS, "seen_20"
         columns: list[Column[Any]] = [
             Column(detector, lambda row: str(len(row.sites))),
-            Column("with", lambda row: f"+ {row.sites[-1]}" if len(row.sites) > 1 else row.sites[0], "left"),
+            Column("with", _format_last_site, "left"),
         ]
         for title, measure in measures.items():
             columns.append(Column(title, partial(_format_measure, measure)))
@@ -175,6 +176,12 @@ def print_plan_validation(validation: PlanValidation) -> None:
     for warning in validation.warnings:
         print(f"warning: {warning}")
     print(validation.path)
+
+
+def _format_last_site(row: Any) -> str:
+    if len(row.sites) == 1:
+        return str(row.sites[0])
+    return f"+ {row.sites[-1]}"
 
 
 def _format_measure(measure: str, row: Any) -> str:

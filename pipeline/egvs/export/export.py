@@ -110,11 +110,15 @@ def export_run(
     """
     file_format = _check_request(to, crs, sites)
     of_city = is_city(folder)
-    if of_city and to == "geotiff":
-        hint = f"Export a junction: {folder / 'junctions' / 'NAME'}."
-        raise InputError("--to geotiff", f"{folder} is the folder of a city", hint)
-    run = open_junction_run(folder) if of_city else FinishedRun.open(folder)
-    title = city_name(folder) if of_city else run.scenario.name
+    if of_city:
+        if to == "geotiff":
+            hint = f"Export a junction: {folder / 'junctions' / 'NAME'}."
+            raise InputError("--to geotiff", f"{folder} is the folder of a city", hint)
+        run = open_junction_run(folder)
+        title = city_name(folder)
+    else:
+        run = FinishedRun.open(folder)
+        title = run.scenario.name
     reference = _export_crs(run, file_format, crs)
     selected = _selected_sites(run, sites)
     target = out or _default_target(folder, file_format, title)
@@ -131,7 +135,9 @@ def export_run(
             progress("layers made", 1, 2)
             written = list(_write_vectors(file_format, layers, reference, temp_folder, target.name, title))
             progress("files written", 2, 2)
-        paths = [target] if file_format.is_one_file else [target / path.name for path in written]
+        paths = [target]
+        if not file_format.is_one_file:
+            paths = [target / path.name for path in written]
         _check_not_existing(paths, out)
         _move_all(written, paths)
     if out is None and not file_format.is_one_file:
@@ -173,7 +179,9 @@ def _selected_sites(run: FinishedRun, sites: Collection[str]) -> Collection[str]
 
 def unknown_site(name: str, known: Sequence[str]) -> InputError:
     """Return an error for a site that a run does not have."""
-    listed = ", ".join(known[:10]) + (" and others" if len(known) > 10 else "")
+    listed = ", ".join(known[:10])
+    if len(known) > 10:
+        listed += " and others"
     return InputError("--site", f"this run has no site {name!r}", f"Choose one of {listed}.")
 
 
@@ -203,7 +211,9 @@ def _check_not_existing(paths: Sequence[Path], out: Path | None) -> None:
         return
     for path in paths:
         if path.exists():
-            hint = "Choose another name." if path == out else "Choose a new folder, or one without these files."
+            hint = "Choose a new folder, or one without these files."
+            if path == out:
+                hint = "Choose another name."
             raise InputError("--out", f"{path} already exists", hint)
 
 

@@ -82,7 +82,9 @@ def draw_figure(
     run = FinishedRun.open(folder)
     ranking = Ranking.read(run.artefact(RunFolder.scores.name))
     selected = _find_site(ranking, site)
-    name = f"{what}_{safe_file_name(selected.site)}" if what in SITE_FIGURES else what
+    name = what
+    if what in SITE_FIGURES:
+        name += f"_{safe_file_name(selected.site)}"
     path = out or folder / EXPORT_FOLDER / f"{name}.{kind}"
     files.check_writable(path)
 

@@ -134,8 +134,10 @@ def height_unit_m(crs: Any, where: str) -> float:
     parse_crs(crs, where)
     parsed = CRS.from_user_input(crs)
     for axis in parsed.axis_info:
-        if axis.direction in ("up", "down"):
-            return float(axis.unit_conversion_factor) * (1.0 if axis.direction == "up" else -1.0)
+        if axis.direction == "up":
+            return float(axis.unit_conversion_factor)
+        if axis.direction == "down":
+            return -float(axis.unit_conversion_factor)
     return float(parsed.axis_info[0].unit_conversion_factor) if parsed.is_projected else 1.0
 
 

@@ -120,7 +120,8 @@ def read_labels(path: Path) -> KittiObjects:
         lines.append(number)
         names.append(words[0])
         boxes.append(values[7:14])
-        scores.append(values[14] if len(words) == _RESULT_VALUES else math.nan)
+        score = values[14] if len(words) == _RESULT_VALUES else math.nan
+        scores.append(score)
     camera = np.array(boxes, dtype=np.float64).reshape(-1, 7)
     return KittiObjects(
         tuple(names), from_camera(camera), np.array(scores, dtype=np.float64), np.array(lines, dtype=np.int64)

@@ -105,7 +105,9 @@ def _read_in_other_process(path: Path, where: str, declared: int) -> FloatArray:
         problem = f"{_CANNOT_READ} (the decompressor was killed by signal {-code}: it needed too much memory)"
         raise InputError(where, problem, limits.READER_MEMORY.hint)
     if code or has_more:
-        reason = lines[-1] if lines else "more points than its header declares"
+        reason = "more points than its header declares"
+        if lines:
+            reason = lines[-1]
         raise InputError(where, f"{_CANNOT_READ} ({reason})", COMPLETE_FILE)
     return points[: filled // points.itemsize // 3]
 
@@ -137,7 +139,9 @@ def crs_of(path: Path, where: str) -> str | None:
         laspy.open(file, closefd=False, read_evlrs=False) as las,
     ):
         crs = las.header.parse_crs()
-        return None if crs is None else str(crs.to_wkt())
+        if crs is None:
+            return None
+        return str(crs.to_wkt())
 
 
 def _check_header(where: str, head: bytes, size: int) -> bool:

@@ -74,7 +74,9 @@ def read(path: Path, where: str) -> FloatArray:
         case other:
             problem = f"DATA: expected ascii, binary or binary_compressed, got {' '.join(other)[:60]!r}"
             raise InputError(where, problem, "Convert the file to one of these.")
-    return points if viewpoint == _IDENTITY else _to_world(points, viewpoint)
+    if viewpoint == _IDENTITY:
+        return points
+    return _to_world(points, viewpoint)
 
 
 def write(path: Path, points_m: FloatArray) -> None:
@@ -235,4 +237,6 @@ def _decompress_lzf(packed: bytes, size: int) -> bytearray | None:
             out += piece
     except IndexError:
         return None
-    return out if at == end and len(out) == size else None
+    if at != end or len(out) != size:
+        return None
+    return out

@@ -47,7 +47,9 @@ class ScoreLabel:
     def title(self) -> str:
         """Head of a column of the report: two lines of HTML."""
         first, _, rest = self.head.partition(" ")
-        second = f"({self.unit})" if self.unit else rest or "of all"
+        second = rest or "of all"
+        if self.unit:
+            second = f"({self.unit})"
         return f"{first[0].upper()}{first[1:]}<br>{second}"
 
     @property
@@ -73,7 +75,9 @@ class ScoreLabel:
 
     def sentence(self, value: float) -> str:
         """Return what a site with this score does, e.g. "should find 87% of vehicles"."""
-        text = f"{value:.0%}" if self.is_share else f"{self.value(value)} {self.unit}".strip()
+        text = f"{self.value(value)} {self.unit}".strip()
+        if self.is_share:
+            text = f"{value:.0%}"
         return self.says.format(text)
 
 

@@ -181,7 +181,9 @@ def companion_score(sites: Sequence[RankedSite]) -> ScoreLabel | None:
     """
     if not sites:
         return None
-    names = (DEFAULT_SCORE, "seen_well") if sites[0].rank_by == "egvs" else ("egvs",)
+    names = ["egvs"]
+    if sites[0].rank_by == "egvs":
+        names = [DEFAULT_SCORE, "seen_well"]
     for name in names:
         if all(site.value_of(name) is not None for site in sites):
             return SCORE_LABELS[name]
@@ -247,7 +249,9 @@ class Ranking:
     @property
     def extremes(self) -> tuple[RankedSite, ...]:
         """The best and the worst site; only one where all have the same score."""
-        return self.sites[:1] if self.is_tie else (self.sites[0], self.last)
+        if self.is_tie:
+            return self.sites[:1]
+        return self.sites[0], self.last
 
     @property
     def has_errors(self) -> bool:
@@ -277,7 +281,9 @@ class Ranking:
     def share_of_best(self, site: RankedSite) -> float:
         """Return the score of a site as a share of the best score; 0 if that is 0."""
         best_score = self.best[0].score
-        return site.score / best_score if best_score > 0 else 0.0
+        if not best_score > 0:
+            return 0.0
+        return site.score / best_score
 
 
 def headline(ranking: Ranking, has_traffic: bool) -> str:
@@ -362,4 +368,6 @@ def site_caption(site: RankedSite, visible_voxels: int, voxels: int) -> str:
 def share_of_limit(site: RankedSite) -> float | None:
     """Return the EGVS as a share of its upper limit; None if there is no finite limit above 0."""
     limit = site.egvs_limit
-    return site.egvs / limit if limit > 0 and math.isfinite(limit) else None
+    if not (limit > 0 and math.isfinite(limit)):
+        return None
+    return site.egvs / limit

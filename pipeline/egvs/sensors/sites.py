@@ -322,7 +322,7 @@ class _SiteBuilder:
                 sensor = self._sensor(sensor_name, f"{where}: sensor")
                 aimed = aiming_angles(where, position_m, aim_m, request.roll_deg, sensor)
             for pitch in pitches:
-                suffix = _name_suffix(z_m if len(heights_m) > 1 else None, pitch if len(pitches) > 1 else None)
+                suffix = _name_suffix(z_m, pitch, with_height=len(heights_m) > 1, with_pitch=len(pitches) > 1)
                 yaw_deg, pitch_deg = self._angles(where, request, pitch, aimed)
                 mounts.append(Mount(suffix, z_m, yaw_deg, pitch_deg))
         return mounts
@@ -341,8 +341,8 @@ class _SiteBuilder:
             return None
         self.used_keys.add("aim" if config.aim is not None else "aim_m")
         center_m = self.scenario.roi.center_m
-        x_m, y_m, *z_m = config.aim_m or center_m
-        return x_m, y_m, z_m[0] if z_m else center_m[2]
+        x_m, y_m, z_m = (*(config.aim_m or center_m), center_m[2])[:3]
+        return x_m, y_m, z_m
 
     def _pitches(self, request: MountRequest, has_aim: bool) -> tuple[Pitch, ...]:
         """The pitch of the row, else the pitches of ``[sites]``, else the aim's pitch, else 0."""
@@ -358,8 +358,10 @@ class _SiteBuilder:
         self, where: str, request: MountRequest, pitch: Pitch, aimed: AimingAngles | None
     ) -> tuple[float, float]:
         """Yaw and pitch of a mount, degrees."""
+        if aimed is not None and pitch == "aim":
+            return aimed.yaw_deg, aimed.pitch_deg
         if aimed is not None:
-            return aimed.yaw_deg, aimed.pitch_deg if pitch == "aim" else float(pitch)
+            return aimed.yaw_deg, float(pitch)
         if pitch == "aim":
             reason = "there is no aim"
             if request.yaw_deg is not None:
@@ -375,17 +377,14 @@ class _SiteBuilder:
         return self._sensors[name]
 
 
-def _name_suffix(z_m: float | None, pitch: Pitch | None) -> str:
-    """Return ``@4.5m-10deg``, ``@aim``; without the height or pitch that is None because all candidates share it."""
-    height = "" if z_m is None else f"{z_m:.10g}m"
-    tilt = ""
-    if pitch == "aim":
-        tilt = "+aim" if height else "aim"
-    elif pitch is not None:
-        tilt = f"{pitch + 0.0:+.10g}deg"
-        if not height:
-            tilt = tilt.removeprefix("+")
-    return f"@{height}{tilt}" if height or tilt else ""
+def _name_suffix(z_m: float, pitch: Pitch, *, with_height: bool, with_pitch: bool) -> str:
+    """Return ``@4.5m-10deg``, ``@4.5m+aim``; without the height or pitch that all candidates share."""
+    suffix = ""
+    if with_height:
+        suffix = f"{z_m:.10g}m"
+    if with_pitch:
+        suffix += "+aim" if pitch == "aim" else f"{pitch + 0.0:+.10g}deg"
+    return "@" + suffix.removeprefix("+") if suffix else ""
 
 
 def aiming_angles(where: str, from_m: Vec3, to_m: Vec3, roll_deg: float, sensor: Sensor) -> AimingAngles:

@@ -215,12 +215,9 @@ class _StudyRun:
         if REFERENCE not in self.scores:
             factor = 1
 
-        rows = [
-            score_errors.compare_setting(
-                self.runner, setting, self.scores, could_last_longer=not self.scenario.is_recorded
-            )
-            for setting in compared
-        ]
+        rows, can_lengthen = [], not self.scenario.is_recorded
+        for setting in compared:
+            rows.append(score_errors.compare_setting(self.runner, setting, self.scores, could_last_longer=can_lengthen))
         rows = score_errors.mark_pareto_front(rows, self.options.tolerance)
         written = self._write(RunFolder(out), rows, factor)
         return AccuracyStudy(

@@ -813,21 +813,19 @@ def count_warnings(counts: Sequence[CountFit], hours: float, where: str) -> list
     where
         The traffic table, for messages.
     """
-    missed = [fit for fit in counts if fit.geh > GOOD_GEH and _exceeds_noise(fit, hours)]
-    if not missed:
-        return []
     descriptions = []
-    for fit in missed:
+    for fit in counts:
+        difference = abs(fit.simulated_per_h - fit.counted_per_h) * hours
+        noise = _NOISE_SIGMAS * math.sqrt(max(fit.counted_per_h * hours, 1.0))
+        if not (fit.geh > GOOD_GEH and difference > noise):
+            continue
         kind = f" ({fit.kind})" if fit.kind else ""
         descriptions.append(f"{fit.place}{kind}: {fit.simulated_per_h:g} instead of {fit.counted_per_h:g}")
+    if not descriptions:
+        return []
     problem = (
-        f"the simulation misses {len(missed)} of {len(counts)} counts (vehicles per hour, simulated vs counted:"
+        f"the simulation misses {len(descriptions)} of {len(counts)} counts (vehicles per hour, simulated vs counted:"
         f" {'; '.join(descriptions)})"
     )
     hint = "Check that the counts are consistent with each other and with the network's lanes and signals."
     return [Diagnostic("counts", f"{where}.counts", problem, hint)]
-
-
-def _exceeds_noise(fit: CountFit, hours: float) -> bool:
-    difference = abs(fit.simulated_per_h - fit.counted_per_h) * hours
-    return difference > _NOISE_SIGMAS * math.sqrt(max(fit.counted_per_h * hours, 1.0))

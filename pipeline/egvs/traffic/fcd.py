@@ -150,7 +150,8 @@ def _read_csv(path: Path, element: str) -> Iterator[pa.RecordBatch]:
         header = xml.read_line(file, path).decode("utf-8").lstrip("\ufeff").strip()
     delimiter = ";" if ";" in header else ","
     columns = _source_columns([name.strip('"') for name in header.split(delimiter)], path, element)
-    types = {source: pa.string() if name in _STRINGS else pa.float64() for name, source in columns.items()}
+    types = dict.fromkeys(columns.values(), pa.float64())
+    types.update((columns[name], pa.string()) for name in _STRINGS)
     convert = csv.ConvertOptions(
         column_types=types,
         include_columns=list(columns.values()),
@@ -265,7 +266,7 @@ def _source_columns(names: list[str], path: Path, element: str) -> dict[str, str
 
 def _checked_tables(batches: Iterable[pa.RecordBatch], path: Path, unit: str) -> Iterator[pa.Table]:
     """Convert batches to :data:`FCD_SCHEMA`; check that numbers are finite and times are in order."""
-    rows_read, last_ms = 0, None
+    rows_read, last_ms = 0, np.iinfo(np.int64).min
     for batch in batches:
         rows = _RowBatch(batch, rows_read, path, unit)
         rows_read += batch.num_rows
@@ -322,8 +323,8 @@ class _RowBatch:
             raise self._error(i, problem, "Round the times; SUMO counts in milliseconds.")
         return rounded.astype(np.int64)
 
-    def check_order(self, time_ms: NDArray[np.int64], last_ms: int | None) -> None:
-        before = np.concatenate([[time_ms[0] if last_ms is None else last_ms], time_ms[:-1]])
+    def check_order(self, time_ms: NDArray[np.int64], last_ms: int) -> None:
+        before = np.concatenate([[last_ms], time_ms[:-1]])
         for i in np.flatnonzero(time_ms < before):
             problem = f"time {time_ms[i] / 1000:g} s comes after {before[i] / 1000:g} s"
             raise self._error(i, problem, "Sort the rows by time.")

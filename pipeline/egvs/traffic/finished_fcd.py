@@ -119,8 +119,11 @@ def kind_sizes(kinds: Collection[VehicleKind]) -> dict[str, VehicleSize]:
 def known_sizes(scenario: Scenario) -> dict[str, VehicleSize]:
     """Return the sizes that are known without starting SUMO: from the scenario, and the metadata of a finished file."""
     traffic = scenario.traffic
-    metadata = None if traffic.fcd is None else read_fcd_metadata(scenario.find(traffic.fcd, "traffic.fcd"))
-    return kind_sizes(traffic.kinds) if metadata is None else metadata.sizes | kind_sizes(traffic.named_kinds)
+    if traffic.fcd is not None:
+        metadata = read_fcd_metadata(scenario.find(traffic.fcd, "traffic.fcd"))
+        if metadata is not None:
+            return metadata.sizes | kind_sizes(traffic.named_kinds)
+    return kind_sizes(traffic.kinds)
 
 
 def sizes_of_types(
@@ -333,7 +336,8 @@ def fcd_window(scenario: Scenario) -> tuple[fcd.FrameWindow, FcdSurvey]:
         problem = f"the duration of {path.name} is {survey.duration_ms / 1000:g} s"
         raise InputError(f"{where}.warmup_s = {traffic.warmup_s:g}", problem, "Use a shorter warm-up.")
     is_complete = survey.metadata is not None
-    window = fcd.FrameWindow(frames, period_ms, skip_ms if is_complete else None, skip_ms, is_complete)
+    first_ms = skip_ms if is_complete else None
+    window = fcd.FrameWindow(frames, period_ms, first_ms, skip_ms, is_complete)
     fcd.check_span(
         window, survey.duration_ms - skip_ms, survey.step_ms, survey.time_steps, where, file=str(traffic.fcd)
     )
@@ -347,4 +351,6 @@ def _cached_survey(path: Path, _modified_ns: int, until_ms: int | None) -> FcdSu
 
 def recorded_frames(scenario: Scenario) -> int:
     """Return the number of frames that a scenario records: ``traffic.frames``, or all of a finished file."""
-    return fcd_window(scenario)[0].count if scenario.traffic.frames is None else scenario.traffic.frames
+    if scenario.traffic.frames is not None:
+        return scenario.traffic.frames
+    return fcd_window(scenario)[0].count

@@ -285,7 +285,9 @@ def record_live(
             if time_ms + timing.step_ms >= timing.end_ms:
                 stopped = {name for name in subscriptions.vehicles() if connection.vehicle.isStopped(name)}
                 observations.stopped_on_purpose |= stopped
-            yield _rows_to_table(time_ms, rows)
+            ids, types, numbers = zip(*rows, strict=True)
+            arrays = [np.full(len(rows), time_ms), pa.array(ids), pa.array(types), *np.array(numbers).T]
+            yield pa.table(arrays, schema=fcd.FCD_SCHEMA)
 
 
 def _check_clock(connection: Any, timing: Timing, address: str) -> None:
@@ -367,12 +369,6 @@ class _Subscriptions:
         return _FcdRow(name, vtype, [float(f"{number:.{sumo_folder.FCD_DIGITS}f}") for number in numbers])
 
 
-def _rows_to_table(time_ms: int, rows: list[_FcdRow]) -> pa.Table:
-    ids, types, numbers = zip(*rows, strict=True)
-    columns = np.array(numbers).T
-    return pa.table([np.full(len(rows), time_ms), pa.array(ids), pa.array(types), *columns], schema=fcd.FCD_SCHEMA)
-
-
 def standing_limit_s(cycle_s: float) -> float:
     """Return how long a vehicle may stand at the end of a recording: two signal cycles, at least three minutes."""
     return max(_MIN_STANDING_LIMIT_S, 2.0 * cycle_s)
@@ -445,8 +441,9 @@ class Collision:
     @property
     def location(self) -> str:
         """The junction or the edge, e.g. ``"junction J1"``."""
-        lane = self.lane
-        return f"junction {lane[1:].rsplit('_', 2)[0]}" if lane.startswith(":") else f"edge {lane.rpartition('_')[0]}"
+        if self.lane.startswith(":"):
+            return f"junction {self.lane[1:].rsplit('_', 2)[0]}"
+        return f"edge {self.lane.rpartition('_')[0]}"
 
 
 def _read_collisions(prepared: SimulationFolder) -> dict[tuple[str, str], Collision]:
@@ -482,7 +479,9 @@ def describe_distance(at_m: tuple[float, float], roi: Roi) -> str:
     """Describe the horizontal distance of a point in the world frame from the region of interest."""
     axes = zip(at_m, roi.origin_m[:2], roi.size_m[:2], strict=True)
     distance_m = math.hypot(*(max(low - x, x - low - size, 0.0) for x, low, size in axes))
-    return f"{distance_m:.0f} m from the region of interest" if distance_m else "in the region of interest"
+    if not distance_m:
+        return "in the region of interest"
+    return f"{distance_m:.0f} m from the region of interest"
 
 
 def _insertion_warning(prepared: SimulationFolder, scenario: Scenario) -> list[Diagnostic]:

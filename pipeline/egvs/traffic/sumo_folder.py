@@ -231,13 +231,15 @@ class SimulationFolder:
         """Options for the outputs of SUMO that are needed."""
         options = {
             "fcd-output": FCD_FILE,
-            "fcd-output.attributes": _FCD_ATTRIBUTES + (",z,slope" if self.roads.has_heights else ""),
+            "fcd-output.attributes": _FCD_ATTRIBUTES,
             "fcd-output.skip-empty": "true",
             "device.fcd.begin": _format_seconds(self.timing.first_ms),
             "device.fcd.period": _format_seconds(self.timing.period_ms),
             "precision": str(FCD_DIGITS),
             "collision-output": COLLISIONS_FILE,
         }
+        if self.roads.has_heights:
+            options["fcd-output.attributes"] += ",z,slope"
         if self.has_extra_traffic or not self.is_generated:  # without it, SUMO writes persons among the vehicles
             options["person-fcd-output"] = PERSONS_FILE
         if not self.has_fixed_count:  # distinguishes an incomplete file from roads without vehicles
@@ -313,7 +315,8 @@ def prepare_simulation(scenario: Scenario, folder: Path, extensions: Iterable[Tr
         options["max-num-vehicles"] = str(vehicles + extra_vehicles)
     if depart_delay_s:
         options["max-depart-delay"] = f"{depart_delay_s:g}"
-    files.write_text(folder / CONFIG_FILE, _config_xml(options))
+    lines = [f"    <{key} value={quoteattr(value)}/>" for key, value in options.items()]
+    files.write_text(folder / CONFIG_FILE, "\n".join(["<configuration>", *lines, "</configuration>", ""]))
     has_fixed_count = vehicles is not None and traffic.hold == "exactly"
     return SimulationFolder(
         folder, tuple(inputs.all()), options, timing, roads, vehicles, is_generated, bool(traffic.counts),
@@ -421,8 +424,3 @@ def _convert_osm_once(path: Path, _content: str) -> bytes:
             problem = f"no network can be built from this map: {error}"
             raise InputError(path, problem, "Download the map again, in full.") from None
         return (folder / NETWORK_FILE).read_bytes()
-
-
-def _config_xml(options: Mapping[str, str]) -> str:
-    lines = [f"    <{key} value={quoteattr(value)}/>" for key, value in options.items()]
-    return "\n".join(["<configuration>", *lines, "</configuration>", ""])

@@ -218,15 +218,13 @@ def read_sumocfg(path: Path) -> DemandFiles:
                     raise InputError(where, f"no such file ({file})", "Use a path relative to the configuration.")
         elif option in ACCEPTED_OPTIONS:
             options[option] = value
-        elif value and not _is_ignored(option):
+        elif option in _IGNORED_OPTIONS or option.startswith(_IGNORED_PREFIXES) or "output" in option:
+            continue  # has no effect on the traffic
+        elif value:
             raise InputError(where, "this SUMO option is not supported", "Remove it; see docs/security.md.")
     if "net-file" not in files:
         raise InputError(path, "has no net-file", "Add <net-file value=.../> to its <input>.")
     return DemandFiles(files, options, begin_s)
-
-
-def _is_ignored(option: str) -> bool:
-    return option in _IGNORED_OPTIONS or option.startswith(_IGNORED_PREFIXES) or "output" in option
 
 
 def _iter_options(path: Path) -> Iterator[tuple[str, str]]:

@@ -9,6 +9,7 @@ the run. Their bytes depend on the scenario and the program only.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -224,9 +225,9 @@ def _site_metadata(
     metadata["stages"] = _stage_keys(scenario, run.folder / "scores")
     metadata["own_score"] = {"score": egvs.score, "parameters": egvs.parameters}
     if external:
-        metadata["given"] = {
-            site: {name: boxes.digest for name, boxes in by_detector.items()} for site, by_detector in external.items()
-        }
+        metadata["given"] = {}
+    for site, by_detector in external.items():
+        metadata["given"][site] = {name: boxes.digest for name, boxes in by_detector.items()}
     return metadata
 
 
@@ -238,17 +239,16 @@ def _stage_keys(scenario: Scenario, folder: Path) -> dict[str, str]:
 
 
 def _write_correlation(path: Path, validation: Validation, metadata: dict[str, Any]) -> None:
-    agreements = validation.agreements
-    columns: dict[str, list[Any]] = {
-        "score": [agreement.score.score for agreement in agreements],
-        "parameters": [agreement.score.parameters for agreement in agreements],
-        "detector": [agreement.detector for agreement in agreements],
-        "measure": [agreement.measure for agreement in agreements],
-        "n": [agreement.by_kind[COEFFICIENT_KINDS[0]].sites for agreement in agreements],
-    }
-    for kind in COEFFICIENT_KINDS:
-        correlations = [agreement.by_kind[kind] for agreement in agreements]
-        columns[kind] = [correlation.value for correlation in correlations]
-        columns[f"{kind}_low"] = [correlation.interval.low for correlation in correlations]
-        columns[f"{kind}_high"] = [correlation.interval.high for correlation in correlations]
+    columns: dict[str, list[Any]] = defaultdict(list)
+    for agreement in validation.agreements:
+        columns["score"].append(agreement.score.score)
+        columns["parameters"].append(agreement.score.parameters)
+        columns["detector"].append(agreement.detector)
+        columns["measure"].append(agreement.measure)
+        columns["n"].append(agreement.by_kind[COEFFICIENT_KINDS[0]].sites)
+        for kind in COEFFICIENT_KINDS:
+            correlation = agreement.by_kind[kind]
+            columns[kind].append(correlation.value)
+            columns[f"{kind}_low"].append(correlation.interval.low)
+            columns[f"{kind}_high"].append(correlation.interval.high)
     parquet.write_artefact(path, "correlation", columns, metadata)

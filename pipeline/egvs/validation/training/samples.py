@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from egvs.artefacts.traffic_frames import NON_VEHICLE_KINDS, TrafficFrame
+from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
 from egvs.sensors import site_feasibility
@@ -193,7 +193,7 @@ class Samples:
         rng = self._rng(1, number)
         frame = junction.frames[int(rng.integers(len(junction.frames)))]
         cloud = simulator.sweep(frame, rng)
-        is_vehicle = np.array([kind not in NON_VEHICLE_KINDS for kind in frame.kinds], dtype=np.bool_)
+        is_vehicle = frame.are_vehicles()
         points_on_box = cloud.points_on(len(frame.boxes))
         window = self._draw_window(junction, frame.boxes[is_vehicle & (points_on_box >= _MIN_POINTS)], rng)
         points = PillarPoints.from_sweeps([cloud.sweep], [simulator.view], origin)
