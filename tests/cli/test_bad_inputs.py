@@ -319,7 +319,7 @@ COMMANDS = {
     "--set unknown": (["run", "{mini}", "--set", "roi.voxel=1"], r"roi.voxel: unknown key. Did you mean voxel_m"),
     "--set of a row that is not there": (
         ["run", "{mini}", "--set", "traffic.kinds.tram.share=1"],
-        r"--set traffic.kinds.tram.share=1: there is no row 'tram'. Use car, a number from 0",
+        r"--set traffic.kinds.tram.share=1: there is no row 'tram'. Use one of car, or a number from 0",
     ),
     "a name of 5,000 characters": (
         ["run", "{mini}", "--set", f'traffic.fcd="{"x" * 5000}"'],

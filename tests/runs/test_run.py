@@ -184,7 +184,7 @@ def test_verify_names_altered_artefact(done: tuple[Path, Path], tmp_path: Path, 
     shutil.copytree(out, moved)
     shutil.copytree(mini, source)
     code, printed, said = run_egvs("verify", moved, "--scenario", source)
-    assert (code, "same bytes" in printed) == (0, True), said + printed
+    assert (code, "byte for byte" in printed) == (0, True), said + printed
     data = bytearray((moved / "tpog.parquet").read_bytes())
     data[len(data) // 2] ^= 1
     (moved / "tpog.parquet").write_bytes(bytes(data))
@@ -353,13 +353,13 @@ def test_prints_best_sites_and_counts_others(mini: Path, tmp_path: Path, run_egv
     rows = [f"p{i:02d},{2 + i},12,{3 + i / 8}" for i in range(9)]
     (mini / "sites.csv").write_text("\n".join(["site,x_m,y_m,z_m", *rows]) + "\n")
     code, whole, _ = run_egvs("run", mini, "--out", tmp_path / "out")
-    assert (code, "without --top" in whole) == (0, False)
+    assert (code, "omit --top" in whole) == (0, False)
     ranked = [line.split()[1] for line in whole.splitlines() if re.match(r"\s*\d+\s+p\d\d", line)]
     assert len(ranked) == 9
     for verb in ("run", "score"):
         code, printed, _ = run_egvs(verb, mini, "--out", tmp_path / "out", "--top", 4)
         assert code == 0
         assert [line.split()[1] for line in printed.splitlines() if re.match(r"\s*\d+\s+p\d\d", line)] == ranked[:4]
-        assert "... and 5 more, listed in " in printed
-    assert "without --top" not in run_egvs("score", mini, "--out", tmp_path / "out", "--top", 9)[1]
+        assert "... and 5 more; omit --top" in printed
+    assert "omit --top" not in run_egvs("score", mini, "--out", tmp_path / "out", "--top", 9)[1]
     assert run_egvs("run", mini, "--top", 0)[0] == 2

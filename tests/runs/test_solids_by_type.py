@@ -50,4 +50,4 @@ def test_poly_xml_gives_ranking_of_footprints(mini: Path, tmp_path: Path, run_eg
     assert found["bare"] != found["hand"], "the building is not in the way of any site"
     record = json.loads((tmp_path / "odd" / "run.json").read_text(encoding="utf-8"))
     assert [w["rule"] for w in record["stages"]["statics"]["summary"]["warnings"]] == ["polygon types"]
-    assert "unknown types of polygons were left out" in (tmp_path / "odd" / "report.html").read_text(encoding="utf-8")
+    assert "polygons of unknown types were left out" in (tmp_path / "odd" / "report.html").read_text(encoding="utf-8")

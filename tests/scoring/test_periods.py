@@ -312,7 +312,7 @@ def test_the_world_frame_counts_where_a_period_alone_is_a_finished_file(
         ("length_s = 8", "length_s = 8.1", "period 'night': length_s = 8.1 is not a multiple of 0.5 s"),
         ("length_s = 8", "length_s = 9", "tpog.blocks = 4 does not divide traffic.frames = 18 of the period 'night'"),
         ("weight = 2.5", "weight = 0", r"traffic\.periods\.0\.weight: expected a value greater than 0, got 0\n$"),
-        ("weight = 2.5", "weight = 2.123456789", "make a mix of .* frames\\. Use weights with fewer digits"),
+        ("weight = 2.5", "weight = 2.123456789", "need a mix of more than .* frames\\. Use weights with fewer digits"),
         ("begin_s = 12", "begin = 12", "begin"),
         ("blocks = 4", "blocks = 40000", "blocks = 40000 gives 80000 blocks in all periods, more than 65535"),
         ("length_s = 8", "length_s = 80", "frames"),

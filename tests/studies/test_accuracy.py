@@ -284,7 +284,7 @@ def test_damaged_intermediate_file_is_named(mini: Path, junction: Path, tmp_path
         path.write_text(content)
     code, printed, errors = run_egvs(*words)
     assert code == 2
-    assert re.search(pattern.replace("*", ".*") + ": is not (as the study wrote it|valid JSON)", errors), errors
+    assert re.search(pattern.replace("*", ".*") + ": (was changed after the study wrote it|is not valid JSON)", errors), errors
     assert "Traceback" not in errors + printed
 
 
@@ -312,7 +312,7 @@ def test_altered_intermediate_scores_are_rejected(mini: Path, tmp_path: Path, ru
         path.write_text(change(path.read_text(errors="replace")))
     code, printed, errors = run_egvs(*words)
     assert code == 2
-    assert "is not as the study wrote it" in errors
+    assert "was changed after the study wrote it" in errors
     assert "Traceback" not in errors + printed
 
 

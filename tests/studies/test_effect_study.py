@@ -107,7 +107,7 @@ def test_effects_are_not_tried_with_traffic_of_another_scenario(mini: Path, tmp_
     out = tmp_path / "out"
     code, printed, _ = run_egvs("effects", mini, "--out", out)
     assert (code, out.exists()) == (0, False)
-    assert f"to measure the expected changes, first: egvs run {mini} --out {out}" in printed
+    assert f"to measure the expected changes, first run: egvs run {mini} --out {out}" in printed
     assert "--set 'effects.moving_occlusion={}' --set 'effects.divergence={}'" in printed
     assert run_egvs("run", mini, "--out", out)[0] == 0
     assert "to measure the expected changes" not in run_egvs("effects", mini, "--out", out)[1]
@@ -211,4 +211,4 @@ def test_effects_that_the_study_skipped_are_named(mini: Path, tmp_path: Path, ru
     assert run_egvs("accuracy", mini, "--budget", "0.001s", *words)[0] == 0
     code, printed, _ = run_egvs("effects", mini, *words)
     assert code == 0
-    assert "what rain cost and change: egvs accuracy" in printed
+    assert "to measure the cost and effect of rain: egvs accuracy" in printed
