@@ -40,8 +40,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from egvs.core import files, limits, reading
-from egvs.core.errors import InputError, MissingBackendError
+from egvs.core.errors import InputError
 from egvs.core.grid import Grid
+from egvs.core.package_data import data_folder
 
 ExtraValues = Mapping[str, str | int | float | bool | None]
 
@@ -90,18 +91,16 @@ SCHEMA_VERSION = 1
 
 
 def schema_folder() -> Path:
-    """The folder ``data_schemas``: beside the package in a checkout, inside it when installed from a wheel."""
-    here = Path(__file__).resolve().parent.parent
-    for candidate in (here / "data_schemas", here.parent.parent / "data_schemas"):
-        if candidate.is_dir():
-            return candidate
-    raise MissingBackendError(f"{here.parent}: the folder data_schemas is missing; install egvs again")
+    """The folder of the Table Schemas, one for each artefact."""
+    return data_folder("data_schemas")
 
 
 @cache
 def _table_schema(artefact: str) -> dict[str, Any]:
     """The Table Schema of an artefact."""
-    declared: dict[str, Any] = json.loads((schema_folder() / f"{artefact}.schema.json").read_text(encoding="utf-8"))
+    declared: dict[str, Any] = json.loads(
+        (schema_folder() / f"{artefact}.schema.json").read_text(encoding="utf-8")
+    )
     return declared
 
 
